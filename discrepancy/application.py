@@ -301,7 +301,7 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
         If the file cannot be read, or the result is not a valid lumped model.
     """
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
-    model_tables: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
+    model_tables = read_toml(file, ModelError, what="lumped model")
     calibrated = {parameter.name: parameter for parameter in patch.parameters}
     for table in model_tables.get("parameter", ()):
         parameter = calibrated.get(table["name"])

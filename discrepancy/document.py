@@ -11,12 +11,13 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchema
 
 from discrepancy.errors import VerdictFileError
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
 from reporting.format_schema import (
@@ -24,8 +25,8 @@ from reporting.format_schema import (
     format_schema,
     summary_of_class,
 )
+from reporting.json_file import JsonDocument, JsonObject, read_json
 from reporting.json_file import plain as json_of
-from reporting.json_file import read_json
 from reporting.provenance import Provenance
 
 PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
@@ -85,7 +86,7 @@ _MEANING_OF_VALUE = {
 """Meaning of each value of the primitives, by its name; the equation of a primitive says more."""
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
-_JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
+_JSON_TYPES: dict[type, str] = {float: "number", int: "integer", str: "string"}
 _NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
 _BEGIN = {
     "type": ["number", "null"],
@@ -125,11 +126,11 @@ def _patch(rows: object) -> ModelPatch:
         raise ValueError(str(cause)) from cause
 
 
-def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
+def _primitive_schema(primitive: type[Primitive]) -> JsonObject:
     """Return the JSON Schema of one kind of primitive, from its own fields."""
     units = PRIMITIVE_UNITS[primitive.kind]
     kind_of_primitive = {"const": primitive.kind, "description": "Kind of the primitive."}
-    columns: dict[str, Any] = {"kind": kind_of_primitive}
+    columns: JsonObject = {"kind": kind_of_primitive}
     for name, kind in primitive.value_types().items():
         if name not in _MEANING_OF_VALUE:
             raise TypeError(
@@ -167,7 +168,13 @@ Patch = Annotated[
     WithJsonSchema(
         {
             "type": "array",
-            "items": {"oneOf": [_primitive_schema(primitive) for primitive in PRIMITIVES.values()]},
+            "items": {
+                "oneOf": [
+                    _primitive_schema(primitive)
+                    for primitive in PRIMITIVES.values()
+                    if primitive not in INSTALLED_LAWS  # editors know the shipped laws only
+                ]
+            },
         }
     ),
 ]
@@ -250,7 +257,7 @@ def document_schema(kind: type, schema: str) -> JsonSchema:
     }
 
 
-def plain_data(value: Any) -> Any:
+def plain_data(value: object) -> JsonDocument:
     """Return a record as plain data for JSON, with nan as None and infinity as "Infinity"."""
 
     def not_finite(number: float) -> str | None:
@@ -297,8 +304,8 @@ def read_document(
     schema: str,
     kind: type[_Record],
     older: Collection[str] = (),
-    upgrade: Callable[[dict[str, Any]], None] | None = None,
-    **absent: Any,
+    upgrade: Callable[[JsonObject], None] | None = None,
+    **absent: JsonDocument,
 ) -> _Record:
     """Read a JSON document as a record, also one of an older schema.
 
@@ -355,7 +362,7 @@ class _InvalidDocumentError(ValueError):
     """Plain data that are not a document; the message is its first fault."""
 
 
-def _record_of(kind: type[_Record], content: dict[str, Any]) -> _Record:
+def _record_of(kind: type[_Record], content: JsonObject) -> _Record:
     """Return plain data as a record of a class.
 
     Raises

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -30,6 +29,7 @@ from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import check_and_prepare, investigate
 from reporting.files import atomic_write_text
+from reporting.json_file import JsonObject
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"
@@ -134,8 +134,23 @@ class SelfCalibration:
         null : bool
             True for campaigns in which nothing was hidden.
         """
-        cases = [case for case in self.cases if (case.hidden == NOTHING) is null]
-        return wilson_interval(sum(case.outcome == outcome for case in cases), len(cases))
+        outcomes = self.outcomes(null=null)
+        return wilson_interval(outcomes.count(outcome), len(outcomes))
+
+    def outcomes(self, *, null: bool) -> list[str]:
+        """Return the outcome of each campaign with a hidden effect, or of each one without.
+
+        Parameters
+        ----------
+        null : bool
+            True for campaigns in which nothing was hidden.
+        """
+        outcomes = []
+        for case in self.cases:
+            hides_nothing = case.hidden == NOTHING
+            if hides_nothing == null:
+                outcomes.append(case.outcome)
+        return outcomes
 
     def coverage(self) -> Proportion:
         """Return the fraction of 90 % intervals of named effects that contain the true value."""
@@ -401,7 +416,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
     return atomic_write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
 
-def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str, Any]:
+def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> JsonObject:
     """Return the proportions of all outcomes as plain data, by outcome.
 
     Parameters
@@ -417,7 +432,7 @@ def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str
     return table
 
 
-def _proportion_table(proportion: Proportion) -> dict[str, Any]:
+def _proportion_table(proportion: Proportion) -> JsonObject:
     """Return a proportion as plain data."""
     return {**plain_data(proportion), "share": plain_data(proportion.value)}
 
@@ -432,8 +447,8 @@ def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[s
     null : bool
         True for campaigns in which nothing was hidden.
     """
-    occurred = {case.outcome for case in self_calibration.cases if (case.hidden == NOTHING) is null}
-    return [name for name in _OUTCOMES_IN_ORDER if name in occurred or name in ("right", "wrong")]
+    shown_outcomes = {"right", "wrong", *self_calibration.outcomes(null=null)}
+    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in shown_outcomes]
 
 
 _OUTCOMES_IN_ORDER = (

@@ -118,6 +118,9 @@ def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
     digest = hashlib.sha256()
     for file in sorted({*files, __file__}):  # this file generates code, too
         digest.update(Path(file).read_bytes())
+    if laws.MODULES[0].__file__ in files:
+        # The numbers of installed laws depend on which of them are installed.
+        digest.update("".join(law.kind for law in laws.INSTALLED_LAWS).encode())
     previous_folder = numba.config.CACHE_DIR
     folder_of_function = Path(files[0]).parent
     if previous_folder:

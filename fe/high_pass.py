@@ -49,8 +49,11 @@ def filtered_record(
     steps = np.diff(time)
     count = max(len(time) - 1, 1)
     span = float(time[-1] - time[0])
-    if count > 1 and np.max(np.abs(steps - span / count)) > _UNEVEN_SAMPLING * span / count:
-        count = int(np.ceil(2.0 * span / np.median(steps)))
+    if count > 1:
+        largest_deviation = np.max(np.abs(steps - span / count))
+        is_uneven = largest_deviation > _UNEVEN_SAMPLING * span / count
+        if is_uneven:
+            count = int(np.ceil(2.0 * span / np.median(steps)))
     grid = np.linspace(time[0], time[-1], count + 1)
     interval = span / count
     signal = _interpolated(grid, time, signal)

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypedDict, Unpack
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -35,6 +35,9 @@ from reporting.errors import InvalidFigureError
 from reporting.files import atomic_write_bytes
 from reporting.hover import annotated
 from reporting.tiles import NARROW, tiles_of_figure
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 # Okabe and Ito's palette for colour-blind readers; each colour has one meaning in all figures.
 OBSERVED: Final = "#595959"
@@ -128,7 +131,7 @@ FULL_WIDTH: Final = 7.2
 """Width of a figure over two columns of a journal, in inches."""
 PNG_RESOLUTION: Final = 200.0
 
-_STYLE: Final[dict[Any, Any]] = {
+_STYLE: Final["dict[RcKeyType, object]"] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.0,
@@ -384,7 +387,8 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
     title : str
         A few words after the letter.
     """
-    axes.set_title("  ".join(text for text in (label, title) if text), loc="left")
+    stated_texts = [text for text in (label, title) if text]
+    axes.set_title("  ".join(stated_texts), loc="left")
 
 
 def to_svg(figure: Figure) -> bytes:

@@ -210,7 +210,11 @@ def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, byte
     files = [path for path in folder.rglob("*") if path.is_file()]
     if suffixes:
         files = [path for path in files if path.suffix in suffixes]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(files)}
+    members = {}
+    for path in sorted(files):
+        relative_path = path.relative_to(folder).as_posix()
+        members[relative_path] = path.read_bytes()
+    return members
 
 
 def write_members(folder: Path, members: Mapping[str, bytes]) -> None:

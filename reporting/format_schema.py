@@ -13,19 +13,21 @@ from collections.abc import Mapping
 from functools import cache
 from math import isfinite
 from textwrap import dedent
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 from pydantic import TypeAdapter, WithJsonSchema
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, JsonSchemaWarningKind
 from pydantic_core import core_schema
 
-JsonSchema = dict[str, Any]
+from reporting.json_file import JsonObject
+
+JsonSchema: TypeAlias = JsonObject
 """A JSON Schema as plain data."""
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """The version of JSON Schema in which the schemas are written."""
 
-NeverInFile = Annotated[Any, WithJsonSchema({"not": {}})]
+NeverInFile = Annotated[object, WithJsonSchema({"not": {}})]
 """The type, for the schema, of a field of a record that a file must not contain."""
 
 MUST_BE_STATED = "must_be_stated"
@@ -128,7 +130,7 @@ class _DescribedSchema(GenerateJsonSchema):
         "non-serializable-default",
     }
 
-    def field_title_should_be_set(self, schema: Any) -> bool:
+    def field_title_should_be_set(self, schema: object) -> bool:
         """Return false: a title of a key would only repeat the name of the key."""
         return False
 

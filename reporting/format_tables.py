@@ -2,11 +2,12 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from reporting.format_schema import JsonSchema
+from reporting.json_file import JsonRecord
 from reporting.words import listing
 
 Notation = Literal["toml", "json"]
@@ -311,7 +312,7 @@ def _basic_types(node: JsonSchema, root: JsonSchema) -> set[str]:
     return types
 
 
-def keys_of_format(schema: Mapping[str, Any]) -> set[str]:
+def keys_of_format(schema: JsonRecord) -> set[str]:
     """Return the names of all keys of a format."""
     tables = _TableFinder(dict(schema), "json").tables
     return {key for table in tables for key in table.schema["properties"]}

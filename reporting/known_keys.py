@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
 
@@ -52,15 +52,15 @@ def _inner_types(annotation: object, step: int | str) -> list[object]:
     if step in types_of_keys:
         return [*_alternatives(types_of_keys[step])]
     arguments = get_args(annotation)
-    if isinstance(get_origin(annotation), type) and len(arguments) == 2 and _is_mapping(annotation):
+    if len(arguments) == 2 and _is_mapping(annotation):
         return [*_alternatives(arguments[1])]
     return []
 
 
 def _is_mapping(annotation: object) -> bool:
     """Return whether a type is a dictionary or another mapping."""
-    origin: Any = get_origin(annotation)
-    return issubclass(origin, Mapping)
+    origin = get_origin(annotation)
+    return isinstance(origin, type) and issubclass(origin, Mapping)
 
 
 def _types_of_keys(annotation: object) -> dict[str, object]:

@@ -19,10 +19,9 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
-from numpy.typing import NDArray
-
+from reporting.arrays import AnyArray
 from reporting.errors import DamagedFileError
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ class Variable(NamedTuple):
     """
 
     dims: tuple[str, ...]
-    values: NDArray[Any]
+    values: AnyArray
     attrs: Mapping[str, str]
 
 

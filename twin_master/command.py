@@ -6,7 +6,7 @@ import webbrowser
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -31,6 +31,7 @@ from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
 
 if TYPE_CHECKING:
+    from reporting.json_file import JsonObject
     from twin_master.assets.resolution import Overrides
     from twin_master.mission.parts import TwinParts
     from twin_master.store.writing import RunOutcome
@@ -316,13 +317,13 @@ def _scenario_and_ssp(
     return scenario, None
 
 
-def _outcome_record(outcome: "RunOutcome") -> dict[str, Any]:
+def _outcome_record(outcome: "RunOutcome") -> "JsonObject":
     """Return the content of `summary.json` with the paths of run and report."""
     from twin_master.store.writing import SUMMARY_NAME
 
     summary = (outcome.folder / SUMMARY_NAME).read_text(encoding="utf-8")
     report = None if outcome.report is None else str(outcome.report)
-    record: dict[str, Any] = {"folder": str(outcome.folder), "report": report}
+    record: JsonObject = {"folder": str(outcome.folder), "report": report}
     record |= json.loads(summary)
     return record
 

@@ -7,7 +7,6 @@ weights.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +19,7 @@ from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from reporting.words import comma_list
 from twin_master.assets.asset_source import Asset
-from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.assets.resolution import OverridesOrMapping, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.fleet.checks import source_of
 from twin_master.mission.preparation import prepare_knowledge
@@ -91,7 +90,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     def __init__(
         self,
         scenario: LoadedScenario | str | Path,
-        overrides: Overrides | Mapping[str, Any] | None = None,
+        overrides: OverridesOrMapping | None = None,
         *,
         progress: Progress | None = None,
     ) -> None:

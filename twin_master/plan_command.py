@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from reporting.arrays import Float
+    from reporting.json_file import JsonObject
     from twin_master.mission.planning import ComparedPolicy
     from twin_master.mission.preparation import Knowledge
     from twin_master.mission.sensor_design import SensorDesign
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from twin_master.scenario.schema import Scenario
 
 
-Record = dict[str, Any]
+Record: TypeAlias = "JsonObject"
 """The result of a command, as it is printed as JSON."""
 
 

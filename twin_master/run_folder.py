@@ -9,19 +9,16 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from reporting.files import atomic_write_text, remove_leftovers, write_members
 from reporting.folders import closing_lock, lock_folder, restore_folder, whole_folder
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, read_json
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-
-JsonObject = dict[str, Any]
-"""An object of JSON: strings, numbers, lists and further objects by their keys."""
 
 CONFIG_NAME = "config.json"
 """The file of a run folder with its configuration."""

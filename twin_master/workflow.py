@@ -7,16 +7,16 @@ which takes no time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from math import prod
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
+from reporting.json_file import JsonObject
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
 from twin_master.assets.asset_source import (
@@ -25,7 +25,7 @@ from twin_master.assets.asset_source import (
     noise_free_observations,
 )
 from twin_master.assets.resolution import (
-    Overrides,
+    OverridesOrMapping,
     asset_source,
     believed_source,
     resolve_scenario,
@@ -62,7 +62,7 @@ Begun = Callable[[Path], None]
 def fly(
     scenario: LoadedScenario | str | Path,
     folder: Path | str | None = None,
-    overrides: Overrides | Mapping[str, Any] | None = None,
+    overrides: OverridesOrMapping | None = None,
     *,
     policy: GivenPolicy | None = None,
     sensor_model: GivenSensorModel | None = None,
@@ -254,7 +254,7 @@ def _run(
 
 
 def _note_mismatches(
-    config: run_folder.JsonObject, knowledge: Knowledge, source: AssetSource, progress: Progress
+    config: JsonObject, knowledge: Knowledge, source: AssetSource, progress: Progress
 ) -> None:
     """Tell the user if the flown asset or the model is not the one that was calibrated."""
     scenario = knowledge.scenario
@@ -309,7 +309,7 @@ def _advice_on_error(folder: Path) -> Iterator[None]:
 
 def _fly(
     folder: Path,
-    config: run_folder.JsonObject,
+    config: JsonObject,
     knowledge: Knowledge,
     source: AssetSource,
     progress: Progress,
@@ -362,10 +362,10 @@ def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path]
     return lambda path: source.write_field(path, state, control)
 
 
-def _timing_record(flight: History) -> run_folder.JsonObject:
+def _timing_record(flight: History) -> JsonObject:
     """Return the times of the steps that this process flew, in seconds."""
     seconds = flight.seconds[flight.resumed_at :]
-    record: run_folder.JsonObject = {"resumed_at": flight.resumed_at, "steps": len(seconds)}
+    record: JsonObject = {"resumed_at": flight.resumed_at, "steps": len(seconds)}
     if len(seconds) == 0:
         return record
     for name, seconds_of_part in zip(("asset", "twin", "checkpoint"), seconds.T, strict=True):
@@ -385,8 +385,8 @@ def _write_report(folder: Path) -> None:
 
 
 def check_scenario(
-    loaded_scenario: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
-) -> run_folder.JsonObject:
+    loaded_scenario: LoadedScenario, overrides: OverridesOrMapping | None = None
+) -> JsonObject:
     """Check a scenario and its files; return the asset that flies and the model of the twin.
 
     Parameters

@@ -2,7 +2,7 @@
 
 import gc
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -22,16 +22,19 @@ from uav_twin.options import (
     FmuArgument,
     FmuKind,
     FmuKindOption,
+    PlatformsOption,
     ReplaceOption,
     SspArgument,
     StepSizeOption,
     StepTimeoutOption,
+    split_platforms,
 )
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import is_structure_file, print_packed_fmu
 
 if TYPE_CHECKING:
     from fmu_asset.archive.declared import VariableInfo
+    from fmu_asset.compiled.platforms import Platform
     from fmu_asset.ssp.check import SspCheck
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
@@ -169,10 +172,8 @@ def build(
             help="How it is run; in model exchange a compiled wing has its modes as states.",
         ),
     ] = "co-simulation",
-    windows: Annotated[
-        bool,
-        typer.Option("--windows", help="Add a binary for 64-bit Windows to a compiled wing."),
-    ] = False,
+    platforms: PlatformsOption = None,
+    windows: Annotated[bool, typer.Option("--windows", hidden=True)] = False,
     calibration: Annotated[
         Path | None,
         typer.Option(
@@ -203,13 +204,17 @@ def build(
 
     Example: `uav-twin fmu build --kind compiled --out wing.fmu`
     """
+    if windows:
+        raise typer.BadParameter(
+            "--windows is now --platforms linux64,win64, compiled by zig: pip install "
+            "'uav-twin[cross]'."
+        )
     if script is None and calibration is None and design is not None and is_structure_file(design):
-        if patch is not None or activate or interface != "co-simulation" or windows:
+        if patch is not None or activate or interface != "co-simulation":
             raise typer.BadParameter(
-                "--patch, --activate, --interface and --windows are for wings; the design is a "
-                "structure."
+                "--patch, --activate and --interface are for wings; the design is a structure."
             )
-        build_structure(design, out=out, kind=kind, fmi=fmi, replace=replace)
+        build_structure(design, out=out, kind=kind, fmi=fmi, platforms=platforms, replace=replace)
         return
     target = out or Path("uav_wing.fmu")
     if calibration is not None and design is not None:
@@ -218,9 +223,9 @@ def build(
         raise typer.BadParameter("there is no --patch whose effects could be switched on.")
     if script is not None:
         is_default_form = kind == "python" and fmi == 2 and interface == "co-simulation"
-        if any((design, calibration, patch, windows)) or not is_default_form:
+        if any((design, calibration, patch, platforms)) or not is_default_form:
             raise typer.BadParameter(
-                "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are "
+                "--design, --calibration, --patch, --kind, --fmi, --interface and --platforms are "
                 "for the wing.",
                 param_hint="--script",
             )
@@ -234,7 +239,7 @@ def build(
         kind=kind,
         fmi=fmi,
         interface=interface,
-        windows=windows,
+        platforms=split_platforms(platforms),
         activate=activate,
         replace=replace,
     )
@@ -267,14 +272,14 @@ def _build_wing(
     kind: FmuKind,
     fmi: int,
     interface: Interface,
-    windows: bool,
+    platforms: "Sequence[Platform] | None",
     activate: bool,
     replace: bool,
 ) -> None:
     """Pack a wing as an FMU, and print the file that was written.
 
-    The parameters are the options of `fmu build`. All options are checked before the reduced model
-    of the wing is computed, which can take minutes.
+    The parameters are the options of `fmu build`, with the platforms as a list. All options are
+    checked before the reduced model of the wing is computed, which can take minutes.
     """
     from calibration.result.file import Tailoring, load_calibration, tailoring
     from fe.wing.design import load_design
@@ -283,12 +288,7 @@ def _build_wing(
     from fmu_asset.packing.structure_fmu import check_form, pack_wing
 
     target = checked_target(out, replace=replace)
-    if windows and kind != "compiled":
-        raise typer.BadParameter("--windows is for --kind compiled.")
     version: Literal[2, 3] = 3 if fmi == 3 else 2
-    platforms: list[Literal["linux64", "win64"]] = ["linux64"]
-    if windows:
-        platforms.append("win64")
     effects = None if patch is None else load_patch(patch)
     check_form(kind, version, interface, patched=effects is not None, platforms=platforms)
     tailored: Tailoring = {}
@@ -304,7 +304,7 @@ def _build_wing(
         kind=kind,
         fmi=version,
         interface=interface,
-        platforms=tuple(platforms),
+        platforms=platforms,
         patch=effects,
         activate=activate,
         replace=replace,

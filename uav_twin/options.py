@@ -1,12 +1,15 @@
 """Arguments and options that several commands share, as annotations of parameters for Typer."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
 from reporting.command_options import LARGEST_SEED
 from uav_twin.completion import complete_model, complete_structure
+
+if TYPE_CHECKING:
+    from fmu_asset.compiled.platforms import Platform
 
 CampaignArgument = Annotated[
     Path, typer.Argument(show_default=False, help="Folder with campaign.toml.")
@@ -38,6 +41,16 @@ FmuKindOption = Annotated[
     FmuKind,
     typer.Option(
         "--kind", help="Run by Python, compiled C, or C sources to be compiled elsewhere."
+    ),
+]
+PlatformsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--platforms",
+        metavar="NAMES",
+        show_default="this host, by its C compiler",
+        help="Platforms of a compiled FMU, such as linux64,win64,darwin64; all for all. Needs the "
+        "extra cross.",
     ),
 ]
 InProcessOption = Annotated[
@@ -94,3 +107,13 @@ StepTimeoutOption = Annotated[
     float | None,
     typer.Option("--step-timeout", min=0.0, help="Wall-clock limit of a step in seconds."),
 ]
+
+
+def split_platforms(names: str | None) -> "list[Platform] | None":
+    """Return the platforms that `--platforms` names, separated by commas.
+
+    Whoever takes the list checks its names.
+    """
+    if names is None:
+        return None
+    return cast("list[Platform]", [name.strip() for name in names.split(",")])

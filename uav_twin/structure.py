@@ -24,8 +24,10 @@ from uav_twin.options import (
     FmuKindOption,
     MemoryLimitOption,
     ModeCountOption,
+    PlatformsOption,
     ReplaceOption,
     StructureArgument,
+    split_platforms,
 )
 
 if TYPE_CHECKING:
@@ -366,6 +368,7 @@ def fmu(
     ] = None,
     kind: FmuKindOption = "python",
     fmi: FmiOption = 2,
+    platforms: PlatformsOption = None,
     binding: Annotated[
         Path | None,
         typer.Option("--binding", help="Write the binding of the FMU to this file, too."),
@@ -393,7 +396,8 @@ def fmu(
     from uav_twin.formats import schema_line
 
     version: Literal[2, 3] = 3 if fmi == 3 else 2
-    check_form(kind, version)
+    chosen_platforms = split_platforms(platforms)
+    check_form(kind, version, platforms=chosen_platforms)
     if version == 3 and (binding is not None or rig is not None):
         raise typer.BadParameter(
             "--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding."
@@ -416,7 +420,10 @@ def fmu(
     binding_text = structure_binding_text(design) if binding is not None else ""
     model_text = rig_text(design, relpath(target, rig.parent)) if rig is not None else ""
     model = reduced_model(source, memory_limit=_in_bytes(memory_limit))
-    print_packed_fmu(build_fmu(model, target, kind=kind, fmi=version, replace=replace))
+    packed_fmu = build_fmu(
+        model, target, kind=kind, fmi=version, platforms=chosen_platforms, replace=replace
+    )
+    print_packed_fmu(packed_fmu)
     if binding is not None:
         atomic_write_text(binding, schema_line("binding") + binding_text)
         terminal.say(f"{binding}: its binding")

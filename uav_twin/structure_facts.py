@@ -1,8 +1,7 @@
 """The facts about a structure that `uav-twin structure info` prints."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from fe.structure.affine import (
     AffineResponse,
@@ -13,11 +12,12 @@ from fe.structure.affine import (
 from fe.structure.mesh_file import memory_estimate
 from fe.structure.operators import Structure, mass_and_centre
 from reporting import terminal
+from reporting.json_file import JsonObject, JsonRecord
 
 BYTES_OF_A_GIBIBYTE = 2**30
 
 
-def structure_record(structure: AffineStructure, modes: int) -> dict[str, Any]:
+def structure_record(structure: AffineStructure, modes: int) -> JsonObject:
     """Return the facts about an undamaged structure at its nominal values, by name.
 
     All values are in SI units, except for the lengths `centre_of_gravity`, `lower` and `upper`,
@@ -52,7 +52,7 @@ def structure_record(structure: AffineStructure, modes: int) -> dict[str, Any]:
     }
 
 
-def _load_facts(structure: AffineStructure, name: str, response: AffineResponse) -> dict[str, Any]:
+def _load_facts(structure: AffineStructure, name: str, response: AffineResponse) -> JsonObject:
     """Return the facts about a load, and about the static response to this load alone."""
     strains = response.strain.tolist()
     displacements = response.output.tolist()
@@ -66,7 +66,7 @@ def _load_facts(structure: AffineStructure, name: str, response: AffineResponse)
     }
 
 
-def _mesh_facts(structure: Structure) -> dict[str, Any]:
+def _mesh_facts(structure: Structure) -> JsonObject:
     """Return the facts that only a structure from a mesh has: mesh, mass, box and parts."""
     mesh = structure.mesh
     mass, centre = mass_and_centre(structure)
@@ -154,7 +154,7 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
         yield StructurePart("gauge", gauge.name, "", 1, "place", note)
 
 
-def print_structure(record: Mapping[str, Any]) -> None:
+def print_structure(record: JsonRecord) -> None:
     """Print the facts about a structure: its content, parts, natural frequencies and loads.
 
     Parameters
@@ -179,7 +179,7 @@ def print_structure(record: Mapping[str, Any]) -> None:
         _print_load(load)
 
 
-def _matrix_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def _matrix_rows(record: JsonRecord) -> list[tuple[str, ...]]:
     """Return the rows (fact, value, unit) of the table of a structure from matrices."""
     return [
         ("name", record["name"]),
@@ -188,7 +188,7 @@ def _matrix_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
     ]
 
 
-def _mesh_rows(record: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def _mesh_rows(record: JsonRecord) -> list[tuple[str, ...]]:
     """Return the rows (fact, value, unit) of the table of a structure from a mesh."""
     length_unit = record["length_unit"]
     elements = f"{record['elements']:,} {record['kind']}"
@@ -221,13 +221,13 @@ def _point_text(point: list[float]) -> str:
     return ", ".join(f"{coordinate:.6g}" for coordinate in point)
 
 
-def _part_row(part: Mapping[str, Any]) -> tuple[str, ...]:
+def _part_row(part: JsonRecord) -> tuple[str, ...]:
     """Return the cells of a part of a structure, given as the dictionary of a `StructurePart`."""
     contents = f"{part['count']:,} {part['of']}"
     return (part["what"], part["name"], str(part["set"]), contents, part["note"])
 
 
-def _print_load(load: Mapping[str, Any]) -> None:
+def _print_load(load: JsonRecord) -> None:
     """Print a load, its largest displacement [mm], and the response of all sensors to it.
 
     Strains are printed in microstrain, displacements in mm.

@@ -319,8 +319,16 @@ def body(
     states = solved(slope, [0.0] * 5, course, stamps)
     law_forces = []
     disturbance_forces = []
-    for t, (x, v, z, _loose_x, _loose_v) in zip(stamps, states, strict=True):
-        law_forces.append(law_force(truth, scales, x, v, z))
+    for t, state in zip(stamps, states, strict=True):
+        x, v, z, _loose_x, _loose_v = state
+        if truth.law == "coulomb_friction" and v == 0.0:
+            # dry friction holds a body at rest with what pulls at it, up to its own size; the
+            # smoothed law would have no force there
+            size = truth.size * scales.force
+            pull = mass * slope(t, state)[1]
+            law_forces.append(float(np.clip(pull, -size, size)))
+        else:
+            law_forces.append(law_force(truth, scales, x, v, z))
         disturbance_forces.append(disturbance(t, x, v))
     x, v = states.T[:2]
     return BodyMotion(x, v, np.array(law_forces), np.array(disturbance_forces))

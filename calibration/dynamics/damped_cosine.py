@@ -133,12 +133,12 @@ class DampedCosineFit(NamedTuple):
         """The waves with their amplitudes in the first signal, in the order of the poles."""
         count = len(self.pole)
         modes = []
-        for number in range(count):
+        amplitudes_in_first_signal = self.amplitude.T[0].tolist()
+        for number, amplitude in enumerate(amplitudes_in_first_signal):
             real_and_imaginary = [number, count + number]
             covariance = self.covariance[np.ix_(real_and_imaginary, real_and_imaginary)]
             pole = complex(self.pole[number])
-            wave = complex(self.amplitude[number, 0])
-            modes.append(RingDownMode(pole, wave, covariance))
+            modes.append(RingDownMode(pole, amplitude, covariance))
         return tuple(modes)
 
 

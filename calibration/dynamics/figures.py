@@ -81,16 +81,19 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     The style names colours by what they show in most figures; here they only tell curves apart.
     """
     time = fit.record.time
+    time_from_start = time - time[0]
     measured_signal = fit.record.signal * _MILLIVOLTS_PER_VOLT
+    fitted_signal = fit.fitted * _MILLIVOLTS_PER_VOLT
     axes.plot(time, measured_signal, ".", color=style.OBSERVED, ms=2.2, label="measured")
-    axes.plot(time, fit.fitted * _MILLIVOLTS_PER_VOLT, color=style.PAST, lw=0.9, label="two modes")
+    axes.plot(time, fitted_signal, color=style.PAST, lw=0.9, label="two modes")
     colours = (style.PRESENT, style.PREDICTION)
     for mode, colour, dashes in zip(fit.modes, colours, ("--", ":"), strict=True):
-        decay = np.exp(mode.pole.real * (time - time[0]))
+        decay = np.exp(mode.pole.real * time_from_start)
         envelope = mode.amplitude * decay * _MILLIVOLTS_PER_VOLT
         label = f"envelope, {mode.frequency:.2f} Hz"
         axes.plot(time, envelope, color=colour, lw=0.9, ls=dashes, label=label)
-    axes.set(xlim=(0.0, min(2.0, float(time[-1]))), xlabel="time (s)", ylabel="strain signal (mV)")
+    last_shown_time = min(2.0, float(time[-1]))
+    axes.set(xlim=(0.0, last_shown_time), xlabel="time (s)", ylabel="strain signal (mV)")
     axes.legend(loc="upper right", fontsize=6.8)
     style.panel_label(axes, "a", "First trial")
 

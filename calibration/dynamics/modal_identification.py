@@ -40,6 +40,12 @@ _MOST_LAGS = 40
 _SMALLEST_RELATIVE_SIZE = 1e-2  # of a mode that is fitted to a free decay, over the strongest mode
 
 
+_FREQUENCY = 0
+_DAMPING_RATIO = 1
+_SHAPE = slice(2, None)
+"""Columns of the values of modes, see `IdentifiedModes`."""
+
+
 @dataclass(frozen=True)
 class IdentifiedModes:
     """M modes at A accelerometers; the values of a mode are NaN if its band shows none.
@@ -59,17 +65,17 @@ class IdentifiedModes:
     @property
     def frequency(self) -> Float:
         """Natural frequencies (M,) [Hz]."""
-        return self.value[:, 0]
+        return self.value[:, _FREQUENCY]
 
     @property
     def damping_ratio(self) -> Float:
         """Damping ratios (M,) [1]."""
-        return self.value[:, 1]
+        return self.value[:, _DAMPING_RATIO]
 
     @property
     def shape(self) -> Float:
         """Shapes (M, A - 1), divided by that at the first accelerometer [1]."""
-        return self.value[:, 2:]
+        return self.value[:, _SHAPE]
 
     @property
     def standard_error(self) -> Float:
@@ -148,10 +154,11 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
         raise ExperimentDataError(
             f"{LARGEST_ORDER // 2} modes are identified at most, but {len(limits)} were asked for."
         )
-    ascending = limits[np.argsort(limits[:, 0])]
-    starts = ascending[1:, 0]
-    ends_of_previous = ascending[:-1, 1]
-    if np.any(starts < ends_of_previous):
+    starts, ends = limits.T
+    ascending = np.argsort(starts)
+    next_starts = starts[ascending][1:]
+    previous_ends = ends[ascending][:-1]
+    if np.any(next_starts < previous_ends):
         raise ExperimentDataError(
             "bands overlap, so that one mode could be found in two of them: give bands that do not "
             "overlap."
@@ -440,15 +447,18 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
     count, channels = fit.amplitude.shape
     first_amplitude, *other_amplitudes = fit.amplitude[number].tolist()
     gradient = np.zeros((1 + channels, len(fit.covariance)))
-    gradient[:2, [number, count + number]] = modal_gradients(complex(fit.pole[number]))
+    # the order of the unknowns begins with the poles: K Re s, K Im s
+    parts_of_pole = [number, count + number]
+    gradient[:2, parts_of_pole] = modal_gradients(complex(fit.pole[number]))
     for channel, amplitude in enumerate(other_amplitudes, start=1):
         # Relative shape A_c / A_0: derivatives with respect to A_c and to A_0
         by_amplitude = 1.0 / first_amplitude
         by_first_amplitude = -amplitude / first_amplitude**2
         for of_channel, derivative in ((channel, by_amplitude), (0, by_first_amplitude)):
-            # Order of the unknowns: the poles (K Re s, K Im s), and then for each channel K Re A,
-            # K Im A and the offset. For an analytic w(A), dRe w = Re w' dRe A - Im w' dIm A.
-            real_row = 2 * count + of_channel * (2 * count + 1) + number
-            imaginary_row = real_row + count
-            gradient[1 + channel, [real_row, imaginary_row]] = derivative.real, -derivative.imag
+            # After the poles come for each channel K Re A, K Im A and the offset. For an analytic
+            # w(A), dRe w = Re w' dRe A - Im w' dIm A.
+            real_part = 2 * count + of_channel * (2 * count + 1) + number
+            imaginary_part = real_part + count
+            gradient[1 + channel, real_part] = derivative.real
+            gradient[1 + channel, imaginary_part] = -derivative.imag
     return np.asarray(gradient @ fit.covariance @ gradient.T)

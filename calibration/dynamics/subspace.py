@@ -76,8 +76,12 @@ class IdentifiedPoles(NamedTuple):
         """
         # s = -zeta omega +- i omega sqrt(1 - zeta^2) with |s| = omega
         s = self.pole[number]
-        relative_shape = (self.shape[number, 1:] / self.shape[number, 0]).real
-        return np.array([abs(s) / (2.0 * np.pi), -s.real / abs(s), *relative_shape])
+        omega = abs(s)
+        frequency = omega / (2.0 * np.pi)
+        damping_ratio = -s.real / omega
+        shape = self.shape[number]
+        relative_shape = (shape[1:] / shape[0]).real
+        return np.array([frequency, damping_ratio, *relative_shape])
 
     def strongest(self, low: float, high: float) -> int | None:
         """Return the number of the largest structural pole in a frequency band.
@@ -93,10 +97,12 @@ class IdentifiedPoles(NamedTuple):
             None if there is no such pole, or if noise may have given it.
         """
         frequency = np.abs(self.pole) / (2.0 * np.pi)
-        is_inside = (frequency >= low) & (frequency <= high) & self.is_structural
-        if not is_inside.any():
+        is_in_band = (frequency >= low) & (frequency <= high)
+        is_candidate = is_in_band & self.is_structural
+        if not is_candidate.any():
             return None
-        strongest = int(np.argmax(np.where(is_inside, self.size, -1.0)))
+        size_of_candidates = np.where(is_candidate, self.size, -1.0)
+        strongest = int(np.argmax(size_of_candidates))
         return strongest if self.is_beyond_noise[strongest] else None
 
 
@@ -208,18 +214,23 @@ class Subspace:
 
         # Contribution of each pole to the correlations. The input matrix is the first block column
         # of the controllability matrix S^(1/2) V', which is S times that of the basis.
-        input_matrix = (basis[:channels] * self._singular_values[:order]).T
-        participation = np.linalg.solve(realisation.eigenvector, input_matrix.astype(np.complex128))
+        first_block = basis[:channels]
+        input_matrix = (first_block * self._singular_values[:order]).T
+        complex_input = input_matrix.astype(np.complex128)
+        participation = np.linalg.solve(realisation.eigenvector, complex_input)
         time = np.arange(lags) / self._sampling_rate
         decay = np.exp(np.multiply.outer(time, realisation.pole))
         correlation_of_pole = np.einsum("cn,ln,nd->nlcd", realisation.shape, decay, participation)
 
         # Increase of the squared residuals if a pair of conjugate poles is left out
         is_positive = realisation.pole.imag > 0.0
-        residual = self._correlation - correlation_of_pole.sum(axis=0).real
-        correlation_of_pair = 2.0 * correlation_of_pole[is_positive].real
-        increase_without_pole = (residual + correlation_of_pair) ** 2 - residual**2
-        squared_size = np.abs(correlation_of_pole[is_positive]) ** 2
+        reproduced = correlation_of_pole.sum(axis=0).real
+        residual = self._correlation - reproduced
+        correlation_of_positive = correlation_of_pole[is_positive]
+        correlation_of_pair = 2.0 * correlation_of_positive.real
+        residual_without_pair = residual + correlation_of_pair
+        increase_without_pole = residual_without_pair**2 - residual**2
+        squared_size = np.abs(correlation_of_positive) ** 2
         poles = IdentifiedPoles(
             pole=realisation.pole[is_positive],
             shape=realisation.shape.T[is_positive],

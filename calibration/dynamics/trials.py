@@ -207,33 +207,38 @@ def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
     decay : float
         The decay rate lambda of the factor exp(-lambda t) on the record [1/s].
     """
-    decay_factor = np.exp(-decay * (record.time - record.time[0]))
+    time_from_start = record.time - record.time[0]
+    decay_factor = np.exp(-decay * time_from_start)
     decayed_signal = decay_factor * detrend(record.signal)
     decayed = RingDownRecord(record.time, decayed_signal, source=record.source)
     frequency, amplitude = spectrum(decayed if decay else record)
-    noise = _noise_amplitude(record) * math.sqrt(float(np.mean(decay_factor**2)))
+    root_mean_square_factor = math.sqrt(float(np.mean(decay_factor**2)))
+    noise = _noise_amplitude(record) * root_mean_square_factor
 
     # Smallest significant peak, which grows with the signal that remains at the end of the record
     signal = detrend(decayed.signal)
-    end = signal[-max(int(_END_FRACTION * record.count), 8) :]
+    end_length = max(int(_END_FRACTION * record.count), 8)
+    end = signal[-end_length:]
     end_amplitude = math.sqrt(2.0 * float(np.mean(end**2)))
     relative_end_amplitude = end_amplitude / float(np.abs(signal).max())
     smallest_peak = float(np.clip(relative_end_amplitude, *_SMALLEST_PEAK))
     prominence = max(_PROMINENCE * noise, smallest_peak * float(amplitude.max()))
 
-    indices, properties = find_peaks(amplitude, prominence=prominence)
-    by_prominence = np.argsort(properties["prominences"])[::-1]
-    return [float(frequency[index]) for index in indices[by_prominence]]
+    peaks, properties = find_peaks(amplitude, prominence=prominence)
+    most_prominent_first = np.argsort(properties["prominences"])[::-1]
+    return [float(frequency[peak]) for peak in peaks[most_prominent_first]]
 
 
 def _noise_amplitude(record: RingDownRecord) -> float:
     """Return the median amplitude of the noise in the spectrum of a record [V]."""
     # A Hann window, of mean square 3/8, hides a mode that dies away at the start.
     window = np.hanning(record.count) / math.sqrt(0.375)
-    amplitude = 2.0 / record.count * np.abs(np.fft.rfft(window * detrend(record.signal)))
+    transform = np.fft.rfft(window * detrend(record.signal))
+    amplitude = 2.0 / record.count * np.abs(transform)
     frequency = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
-    is_inside = (frequency >= SEARCH_BAND[0]) & (frequency <= SEARCH_BAND[1])
-    return float(np.median(amplitude[is_inside]))
+    low, high = SEARCH_BAND
+    is_in_band = (frequency >= low) & (frequency <= high)
+    return float(np.median(amplitude[is_in_band]))
 
 
 def fit_ring_down(

@@ -155,7 +155,8 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
             # Ratio of the variance of Student's t with n - 1 degrees of freedom to that of a
             # Gaussian. It is 3 for four trials and infinite for fewer, for which 4 is assumed.
             variance_ratio = (count - 1) / (count - 3) if count > 3 else 4.0
-            return _Estimate(mean, math.sqrt(variance_ratio * sum_of_squares / (count - 1) / count))
+            variance_of_mean = variance_ratio * sum_of_squares / (count - 1) / count
+            return _Estimate(mean, math.sqrt(variance_of_mean))
     return _Estimate(mean, math.sqrt(expected_variance / count))
 
 

@@ -210,7 +210,8 @@ class _WhitenedPosterior:
         log_posterior = -0.5 * np.sum(residual**2, axis=1) - log_scale
         # Importance weight: posterior over proposal, zero outside the ranges of the parameters
         log_weight = log_posterior - proposal.logpdf(points)
-        is_inside: NDArray[np.bool_] = np.all((u >= self._lower_u) & (u <= self._upper_u), axis=1)
+        is_within_range = (u >= self._lower_u) & (u <= self._upper_u)
+        is_inside: NDArray[np.bool_] = np.all(is_within_range, axis=1)
         weight = softmax(np.where(is_inside, log_weight, -np.inf))
         return _WeightedDraws(points, weight)
 
@@ -277,7 +278,8 @@ def joint_posterior(
 
     compare = _comparison_with_wing(wing, static, list(reading_of.values()), model_error)
     samples = infer(priors, compare, seed=seed, count=count)
-    _refuse_samples_at_limits(samples[:, 0], prior_of_e)
+    samples_of_e, *_ = samples.T
+    _refuse_samples_at_limits(samples_of_e, prior_of_e)
     return samples
 
 

@@ -204,7 +204,7 @@ class WingTable:
                 f"for {prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a "
                 "model with a wider range."
             )
-        unit_points = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
+        unit_points = (2.0 * points - (lower + upper)) / (upper - lower)
         return _evaluate(unit_points, self.coefficients)
 
     def outputs(self, states: Float) -> Float:
@@ -270,8 +270,9 @@ def _interpolating_coefficients(
         The coefficients of ln f1 and ln f2.
     """
     x, y, z = nodes.T
-    # Each row of the matrix holds the products of the polynomials at one node.
-    coefficients = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequencies))
+    # each row of the matrix holds the products of the polynomials at one node
+    polynomials_at_nodes = chebvander3d(x, y, z, degrees)
+    coefficients = np.linalg.solve(polynomials_at_nodes, np.log(frequencies))
     counts = [degree + 1 for degree in degrees]
     return np.asarray(coefficients.reshape(*counts, 2))
 
@@ -343,8 +344,8 @@ def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -
         The states: values of these parameters, each scaled from its range to [-1, 1].
     """
     centre = limits.mean(axis=1)
-    half_width = 0.5 * np.diff(limits, axis=1)[:, 0]
     lower, upper = limits.T
+    half_width = 0.5 * (upper - lower)
     # A node at an end may leave the range by a rounding error.
     states = np.clip(centre + half_width * unit_points, lower, upper)
     frequencies = []

@@ -217,11 +217,18 @@ _RUN_LINES = ("-", "--", "-.", ":")
 def calibration_figure(result: StaticCalibration) -> Figure:
     """Return Fig. 5 of the paper: the load test with bands; densities of e and stiffness."""
     figure = style.new_figure(height=4.4)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0), wspace=0.22, hspace=0.48)
+    axes = figure.subplot_mosaic(
+        [
+            ["loads", "factor"],
+            ["loads", "stiffness"],
+        ],
+        width_ratios=(1.05, 1.0),
+        gridspec_kw={"wspace": 0.22, "hspace": 0.48},
+    )
     figure.subplots_adjust(left=0.062, right=0.985, bottom=0.095, top=0.94)
-    _draw_loads(figure.add_subplot(grid[:, 0]), result)
-    _draw_factor(figure.add_subplot(grid[0, 1]), result)
-    _draw_stiffness(figure.add_subplot(grid[1, 1]), result)
+    _draw_loads(axes["loads"], result)
+    _draw_factor(axes["factor"], result)
+    _draw_stiffness(axes["stiffness"], result)
     return figure
 
 

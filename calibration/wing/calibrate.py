@@ -238,6 +238,7 @@ class _RecordMaker:
         """
         lab = self._lab
         lengths = _length_samples(lab.lengths, len(states), self._seed)
+        samples_of_e, *_ = states.T
         calibration = Calibration(
             asset=self._asset,
             model=self._tailored.name,
@@ -248,7 +249,7 @@ class _RecordMaker:
             prior_samples=self._prior_samples,
             explained=None,
             findings=(),
-            channels=_channel_fits(self._static, float(states[:, 0].mean())),
+            channels=_channel_fits(self._static, float(samples_of_e.mean())),
             source="; ".join(origin.text for origin in lab.origins),
             seed=self._seed,
             provenance=self._provenance,

@@ -211,14 +211,17 @@ def modes_figure(fields: WingFields, modes: ReducedModes, titles: Sequence[str])
         The title of each mode.
     """
     # The skin with its damage regions, see `fe.reduction.model_cache.WingFields`
-    skin_cells = fields.cells[fields.region <= len(fields.regions)][:, :8]
-    height = fields.points[skin_cells][:, :, 2].mean(axis=1)
-    upper_nodes = np.unique(skin_cells[height > 0.0])
+    is_skin = fields.region <= len(fields.regions)
+    corners_of_skin = fields.cells[is_skin][:, :8]
+    _, _, heights = np.moveaxis(fields.points[corners_of_skin], 2, 0)
+    is_upper = heights.mean(axis=1) > 0.0
+    upper_nodes = np.unique(corners_of_skin[is_upper])
     points = fields.points[upper_nodes]
+    x, y, _ = points.T
     # Nodes are connected as seen from above. Triangles at the trailing edge, in front, come last.
-    triangles = Triangulation(points[:, 1], points[:, 0]).triangles
-    triangles = triangles[np.argsort(points[triangles, 0].mean(axis=1))]
-    span = float(np.ptp(points[:, 1]))
+    triangles = Triangulation(y, x).triangles
+    triangles = triangles[np.argsort(x[triangles].mean(axis=1))]
+    span = float(np.ptp(y))
     shapes = (fields.modal_displacement @ modes.shape)[upper_nodes]
     row_count = (len(titles) + 1) // 2
     figure, grid = style.panels(

@@ -4,7 +4,6 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -297,7 +296,7 @@ def sampling_interval(answer: str) -> float:
     return float(amount[1])
 
 
-def release_in_si(answer: str) -> dict[str, Any]:
+def release_in_si(answer: str) -> dict[str, str | float]:
     """Return the table `release` of a trial from the option `--release`, a displacement with unit.
 
     Raises

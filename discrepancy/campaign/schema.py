@@ -4,9 +4,9 @@ Units are still those of the file.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 
@@ -15,6 +15,7 @@ from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Relea
 from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
+from reporting.json_file import JsonRecord
 from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
 from reporting.words import comma_list
 
@@ -348,7 +349,7 @@ class CampaignSection(Section):
         )
 
 
-def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
+def parse_campaign(table: JsonRecord, source: str) -> CampaignSection:
     """Return the checked content of a campaign's TOML file.
 
     Parameters

@@ -22,7 +22,8 @@ def _is_single_column(rows: Rows) -> bool:
     Most cells from the first number on must be numbers. The rows are not a column if their cells
     contain blanks or another separator, and thus probably several numbers.
     """
-    if any(any(row[1:]) for _, row in rows):
+    has_further_cells = any(any(row[1:]) for _, row in rows)
+    if has_further_cells:
         return False
     cells = [row[0] for _, row in rows]
     rows_of_numbers = [index for index, cell in enumerate(cells) if is_value(cell)]
@@ -181,8 +182,13 @@ def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]
     rows_of_values = [values for values in places_of_values if len(values) > 1]
     if not rows_of_values and _is_single_column(rows):
         rows_of_values = [values for values in places_of_values if values]
-    counts = Counter(column for values in rows_of_values for column in values)
-    return sorted(column for column, count in counts.items() if 2 * count >= len(rows_of_values))
+    row_counts = Counter(column for values in rows_of_values for column in values)
+    core_columns = []
+    for column, row_count in row_counts.items():
+        is_in_half_of_rows = 2 * row_count >= len(rows_of_values)
+        if is_in_half_of_rows:
+            core_columns.append(column)
+    return sorted(core_columns)
 
 
 def _head_and_units(rows: Rows, first_row: int) -> tuple[list[str], list[str]]:

@@ -25,11 +25,11 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
 
 Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such
 as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_needs` (words of
-`NEEDS`), `spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of
-`unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are the parameters and
-`SCALES`. Text values of a primitive (port, channel, run) are taken as they are; "place" stands for
-the place, "quantity of the place" for what it measures. A primitive with `if` is left out where
-that is zero.
+`NEEDS`), `spectral` and `at_several_places` (see `Effect`), `[[shape]]` (as a parameter, with
+`canonical` in place of `unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are
+the parameters and `SCALES`. Text values of a primitive (port, channel, run) are taken as they are;
+"place" stands for the place, "quantity of the place" for what it measures. A primitive with `if` is
+left out where that is zero.
 
 Time and events of the campaign (`docs/explanation/when.md`)::
 

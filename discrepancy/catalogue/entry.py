@@ -203,6 +203,9 @@ class EffectKeys:
     spectral : str
         Name of a parameter that is a frequency over the first natural frequency; fits of it begin
         at peaks of the residuals' spectrum at the place, a channel. Empty if there is none.
+    at_several_places : bool
+        Whether it may act at several places at once, with a size at each. A search for errors of
+        whole simulations then adds it at a second place, too.
     """
 
     identifier: Annotated[str, Field(alias="id")]
@@ -216,6 +219,7 @@ class EffectKeys:
     shape: tuple[ShapeParameter, ...] = ()
     confusable: tuple[str, ...] = ()
     spectral: str = ""
+    at_several_places: Annotated[bool, Strict()] = False
 
 
 @dataclass(frozen=True, kw_only=True)

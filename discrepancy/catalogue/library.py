@@ -5,14 +5,15 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.effect_in_setting import DYNAMIC
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.errors import CatalogueError
+from fe.runtime.errors import PlugInError
 from fe.runtime.patch import SENSORS, ModelPatch, Window
+from fe.runtime.plug_ins import load_plug_ins
 from reporting.choices import did_you_mean
 
 THEMES = (
@@ -50,21 +51,31 @@ def effects_of_entry_points() -> tuple[Effect, ...]:
     Raises
     ------
     CatalogueError
-        If an entry point fails or returns something other than effects. The message names the
-        entry point.
+        If two entry points have the same name, or one fails or returns something other than
+        effects. The message names the entry point and its package.
     """
     all_effects: list[Effect] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-        subject = f"The entry point {point.name!r} of the group {GROUP!r}"
+    with CatalogueError.instead_of(PlugInError):
+        plug_ins = load_plug_ins(GROUP)
+    for plug_in in plug_ins:
+        if not callable(plug_in.value):
+            raise CatalogueError(
+                f"{plug_in.subject} must be a function that returns effects, but is "
+                f"{plug_in.value!r}."
+            )
         try:
-            returned = point.load()()
-        except Exception as cause:
-            raise CatalogueError(f"{subject} failed: {type(cause).__name__}: {cause}.") from cause
+            returned = plug_in.value()
+        except Exception as cause:  # the function of a plug-in may fail with any error
+            raise CatalogueError(
+                f"{plug_in.subject} failed: {type(cause).__name__}: {cause}. Mend the package, or "
+                "uninstall it."
+            ) from cause
         effects = tuple(returned) if isinstance(returned, Iterable) else (returned,)
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise CatalogueError(
-                    f"{subject} must return effects, but returned a {type(effect).__name__}."
+                    f"{plug_in.subject} must return effects, but returned a "
+                    f"{type(effect).__name__}."
                 )
         all_effects += effects
     return tuple(all_effects)

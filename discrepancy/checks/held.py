@@ -161,7 +161,8 @@ def stuck_spans(
     """
     is_equal_to_next = (np.diff(values) == 0.0) & is_used[1:] & is_used[:-1]
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
-    lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
+    starts, stops = bounds_of_runs.T
+    lengths = stops - starts
     long_runs = bounds_of_runs[lengths >= LEAST_RUN_LENGTH].tolist()
     distinct_values = np.unique(values)
     if len(distinct_values) < 3 or not long_runs:
@@ -207,13 +208,12 @@ def _is_sensor_failure(
     # no failure if runs of comparable length show a dead zone, or fill much of the surroundings
     begin_of_surroundings = max(start - _SURROUNDINGS_LENGTH * length, 0)
     end_of_surroundings = min(stop + _SURROUNDINGS_LENGTH * length, len(runs.values))
+    run_starts, run_stops = runs.bounds.T
     is_comparable = runs.lengths >= _COMPARABLE_LENGTH * length
     is_in_surroundings = (
-        is_comparable
-        & (runs.bounds[:, 0] >= begin_of_surroundings)
-        & (runs.bounds[:, 1] <= end_of_surroundings)
+        is_comparable & (run_starts >= begin_of_surroundings) & (run_stops <= end_of_surroundings)
     )
-    values_of_comparable = runs.values[runs.bounds[is_comparable, 0]]
+    values_of_comparable = runs.values[run_starts[is_comparable]]
     is_dead_zone = np.count_nonzero(values_of_comparable == runs.values[start]) > 1
     window_starts = [
         *range(start - length, begin_of_surroundings - 1, -length),

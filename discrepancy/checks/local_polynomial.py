@@ -133,12 +133,16 @@ def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
     inner_times = time[width : len(time) - width, np.newaxis]
     relative_times = sliding_window_view(time, 2 * width + 1) - inner_times
     relative_times /= np.max(np.abs(relative_times), axis=1, keepdims=True)
-    basis = np.polynomial.polynomial.polyvander(np.delete(relative_times, width, axis=1), degree)
+    times_of_neighbours = np.delete(relative_times, width, axis=1)
+    basis = np.polynomial.polynomial.polyvander(times_of_neighbours, degree)
     # a ridge, because next to a wide gap the samples may not determine the whole polynomial
     ridge = 1e-10 * np.eye(degree + 1)
-    inverse_gram = np.linalg.inv(basis.transpose(0, 2, 1) @ basis + ridge)
+    gram = basis.transpose(0, 2, 1) @ basis
+    inverse_gram = np.linalg.inv(gram + ridge)
     # the sample itself is at time zero, where the polynomial equals its constant coefficient
-    prediction_weights = (basis @ inverse_gram[..., :1])[..., 0]
+    constant_columns = inverse_gram[..., :1]
+    prediction_weights = (basis @ constant_columns).squeeze(axis=-1)
     weights = np.insert(-prediction_weights, width, 1.0, axis=1)
     norm = np.linalg.norm(weights, axis=1, keepdims=True)
-    return np.asarray(weights * (np.linalg.norm(even_weights(width, degree)) / norm))
+    even_norm = np.linalg.norm(even_weights(width, degree))
+    return np.asarray(weights * (even_norm / norm))

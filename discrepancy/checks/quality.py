@@ -233,13 +233,17 @@ def _is_clipped_over_load(
     digit : float
         The least difference between two readings, which is their last digit.
     """
-    other_rows = np.delete(np.arange(len(values)), np.s_[start:stop])
-    loads_of_run = np.unique(load[start:stop])
-    if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[other_rows]).size < 2:
+    run = slice(start, stop)
+    loads_of_run = load[run]
+    other_loads = np.delete(load, run)
+    other_values = np.delete(values, run)
+    spans_loads = np.unique(loads_of_run).size >= LEAST_CLIPPED_RUN
+    gives_line = np.unique(other_loads).size >= 2
+    if not (spans_loads and gives_line):
         return False
-    line = np.polynomial.Polynomial.fit(load[other_rows], values[other_rows], 1)
-    excess = float(np.max(np.abs(line(load[start:stop]) - values[start])))
-    scatter = float(np.std(values[other_rows] - line(load[other_rows])))
+    line = np.polynomial.Polynomial.fit(other_loads, other_values, 1)
+    excess = float(np.max(np.abs(line(loads_of_run) - values[start])))
+    scatter = float(np.std(other_values - line(other_loads)))
     return excess > 1.5 * digit + 6.0 * scatter
 
 
@@ -267,4 +271,5 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     excess = abs(weights_at_middle @ values[neighbours] - values[start])
     # each neighbour may be wrong by this error; half of the largest sum of such errors is allowed
     error = 3.0 * digit + 6.0 * estimate_roughness(values)
-    return bool(excess > 0.5 * np.abs(weights_at_middle).sum() * error)
+    sum_of_weights = np.abs(weights_at_middle).sum()
+    return bool(excess > 0.5 * sum_of_weights * error)

@@ -114,10 +114,13 @@ def _static_scale(
         The standard deviations of the noise and of the channel's zero [channel's unit].
     """
     # all pairs of at most 400 rows
-    rows = np.linspace(0, len(readings) - 1, min(len(readings), 400)).round().astype(int)
-    first_rows, second_rows = np.triu_indices(len(rows), 1)
-    data_steps = readings[rows][first_rows] - readings[rows][second_rows]
-    model_steps = predicted_readings[rows][first_rows] - predicted_readings[rows][second_rows]
+    row_count = min(len(readings), 400)
+    rows = np.linspace(0, len(readings) - 1, row_count).round().astype(int)
+    first_of_pair, second_of_pair = np.triu_indices(row_count, 1)
+    first_rows = rows[first_of_pair]
+    second_rows = rows[second_of_pair]
+    data_steps = readings[first_rows] - readings[second_rows]
+    model_steps = predicted_readings[first_rows] - predicted_readings[second_rows]
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
     is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(predicted_readings))
@@ -128,12 +131,14 @@ def _static_scale(
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
     slopes = data_steps[is_clear_step] / model_steps[is_clear_step]
     slope = float(np.median(slopes))
-    usual_step = np.median(np.abs(model_steps[is_clear_step]))
-    is_above_noise = max(abs(slope), 1.0) * usual_step > CLEAR_NOISE_DEVIATIONS * noise
+    usual_model_step = np.median(np.abs(model_steps[is_clear_step]))
+    usual_step = max(abs(slope), 1.0) * usual_model_step
+    is_above_noise = usual_step > CLEAR_NOISE_DEVIATIONS * noise
     pairs_agree = np.mean(slopes * slope > 0.0) > _LEAST_AGREEING_SHARE
     has_sign_of_model = median_reading * np.sign(median_prediction) > 2.0 * zero_deviation
     has_another_cause = slope < 0.0 and has_sign_of_model
-    return slope if is_above_noise and pairs_agree and not has_another_cause else 0.0
+    is_determined = is_above_noise and pairs_agree and not has_another_cause
+    return slope if is_determined else 0.0
 
 
 def _dynamic_scale(

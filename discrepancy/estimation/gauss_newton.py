@@ -186,12 +186,15 @@ class Linearisation:
         # Inner products of the whitened residual (index 0) and its derivatives by the shared and
         # effect unknowns, then by the local unknowns.
         products, _ = linear_trial.whitened_products
-        local_slice = slice(1 + len(shared_and_effect), None)
-        fixed = slice(1, 1 + len(shared_and_effect))
+        residual = 0
+        first_local = 1 + len(shared_and_effect)
+        fixed = slice(1, first_local)
+        local_slice = slice(first_local, None)
         # normal equations of the local unknowns, with the fixed unknowns on the right side
         prior_precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
         normal_matrix = products[local_slice, local_slice] + np.diag(prior_precision)
-        right_side = products[local_slice, 0] - products[local_slice, fixed] @ shared_and_effect
+        by_fixed = products[local_slice, fixed] @ shared_and_effect
+        right_side = products[local_slice, residual] - by_fixed
         return np.linalg.solve(normal_matrix, right_side)
 
 

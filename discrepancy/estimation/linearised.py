@@ -27,6 +27,9 @@ from discrepancy.missing_force.trial import PortedTrial
 from .kernel import filter_record, smooth_record, substep_matrices_with_laws
 from .trajectory import LinearisedForce, LinearisedSensorErrors, Trajectory
 
+CONSTANT = 0
+"""Number of the constant among the weights (1, unknowns)."""
+
 
 @dataclass(frozen=True, eq=False)
 class LinearisedTrial:
@@ -145,13 +148,14 @@ class LinearisedTrial:
                     law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
             # the first weight: the force at zero unknowns
-            force_coefficients[:, row, 0] = (
+            force_coefficients[:, row, CONSTANT] = (
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
             # unknowns that change the laws; `law.force` is the force at u0
             for unknown_index, derivative in self.forces[port].by_unknown.items():
                 force_coefficients[:, row, 1 + unknown_index] += derivative
-                force_coefficients[:, row, 0] -= self._value_of_unknown(unknown_index) * derivative
+                present_value = self._value_of_unknown(unknown_index)
+                force_coefficients[:, row, CONSTANT] -= present_value * derivative
         return force_coefficients
 
     def _value_of_unknown(self, unknown_index: int) -> float:
@@ -245,7 +249,8 @@ class LinearisedTrial:
             )
             # linear about u0 = `linearisation_point`: the change is proportional to u - u0
             drift[:, :, 1 + unknown_index] += state_change
-            drift[:, :, 0] -= trial.linearisation_point[unknown_index] * state_change
+            present_value = trial.linearisation_point[unknown_index]
+            drift[:, :, CONSTANT] -= present_value * state_change
         return drift
 
     def _initial_state(self) -> tuple[FloatArray, FloatArray]:
@@ -312,10 +317,11 @@ class LinearisedTrial:
         coefficients = np.zeros((*trial.residual.shape, self.weight_count))
         # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
         # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
-        coefficients[:, :, 0] = trial.residual - self.sensor_errors.change
+        coefficients[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
         for unknown_index, derivative in self.sensor_errors.by_unknown.items():
+            present_value = self._value_of_unknown(unknown_index)
             coefficients[:, :, 1 + unknown_index] -= derivative
-            coefficients[:, :, 0] += self._value_of_unknown(unknown_index) * derivative
+            coefficients[:, :, CONSTANT] += present_value * derivative
         # The response of the model needs no constant, as `trial.residual` is at zero unknowns. The
         # unknowns of this trial follow the shared ones here; in u those of effects are between.
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
@@ -323,8 +329,9 @@ class LinearisedTrial:
             coefficients[:, :, self.weight_index(unknown_index)] -= derivative
         # parameters and gains change the readings of a fixed state by d (u - u0)
         for unknown_index, derivative in self._readings_by_shared_unknowns().items():
+            present_value = trial.linearisation_point[unknown_index]
             coefficients[:, :, 1 + unknown_index] -= derivative
-            coefficients[:, :, 0] += trial.linearisation_point[unknown_index] * derivative
+            coefficients[:, :, CONSTANT] += present_value * derivative
         coefficients *= noise_scale[:, None]
         # A force at a port changes some readings at once, such as accelerations: by -e per unit of
         # force, with e in `direct_reading`. The force of the hypothesis' laws at the port is

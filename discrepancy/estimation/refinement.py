@@ -6,6 +6,7 @@ are part of the smoother that estimates the motion.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,7 +81,165 @@ def refine_hypotheses(
         if estimated_hypothesis.log_evidence > hypothesis.log_evidence:
             position = next(index for index, entry in enumerate(hypotheses) if entry is hypothesis)
             hypotheses[position] = estimated_hypothesis
-    return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
+    hypotheses.sort(key=lambda hypothesis: -score(hypothesis))
+    return _estimate_simpler_forms(search, hypotheses, effect_count, on_progress)
+
+
+def _estimate_simpler_forms(
+    search: ForceSearch,
+    ranked_hypotheses: Sequence[ForceHypothesis],
+    effect_count: int,
+    on_progress: Callable[[str], None],
+) -> list[ForceHypothesis]:
+    """Estimate the simpler forms of the best hypothesis, as long as one of them is better.
+
+    A set may lead only because its fit reached the right values of one effect, and the fit of that
+    effect alone did not. The same holds for a law of free shape and the named laws of its family,
+    such as dry friction. Each simpler form of the best hypothesis is therefore estimated, beginning
+    with the motion of that hypothesis.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    ranked_hypotheses : sequence of ForceHypothesis
+        The hypotheses, the most probable first.
+    effect_count : int
+        The number of effects that were compared.
+    on_progress : callable
+        The function that receives a line for the progress display: the estimate that runs.
+
+    Returns
+    -------
+    list of ForceHypothesis
+        The hypotheses, the most probable first. A simpler form replaces the hypothesis of the same
+        effects if it is more probable.
+    """
+
+    def score(hypothesis: ForceHypothesis) -> float:
+        return search.score(hypothesis, effect_count)
+
+    # in ascending order, so that the most probable hypothesis of each set is kept
+    by_effects = {
+        hypothesis.candidate.key: hypothesis for hypothesis in reversed(ranked_hypotheses)
+    }
+    best_hypothesis = ranked_hypotheses[0]
+    while best_hypothesis.speed_window is not None:
+        simpler_forms = [
+            *_named_laws_of_family(best_hypothesis, tuple(by_effects.values())),
+            *_simpler_forms(best_hypothesis.candidate, best_hypothesis.effect),
+        ]
+        # the values of the best hypothesis are preferred where both have the same effects
+        form_by_effects = {form.candidate.key: form for form in simpler_forms}
+        for form in form_by_effects.values():
+            on_progress(f"estimating {form.candidate.description} together with the motion")
+            simpler_hypothesis = _estimate_from_values(search, best_hypothesis, form)
+            if simpler_hypothesis is None:
+                continue
+            same_effects = by_effects.get(form.candidate.key)
+            if same_effects is None or simpler_hypothesis.log_evidence > same_effects.log_evidence:
+                by_effects[form.candidate.key] = simpler_hypothesis
+        best_of_all = max(by_effects.values(), key=score)
+        if best_of_all is best_hypothesis:
+            break
+        best_hypothesis = best_of_all
+    return sorted(by_effects.values(), key=lambda hypothesis: -score(hypothesis))
+
+
+class _ValuedCandidate(NamedTuple):
+    """A set of effects, and the scaled parameters (E,) with which its estimate begins."""
+
+    candidate: Candidate
+    effect: FloatArray
+
+
+def _simpler_forms(candidate: Candidate, effect: FloatArray) -> list[_ValuedCandidate]:
+    """Return the simpler forms of a set: without one effect, or with one law in canonical shape.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        The set of effects. A single effect is not left out.
+    effect : (E,) array
+        The scaled parameters of the set, which the forms inherit.
+    """
+    forms = []
+    numbers = range(len(candidate.terms))
+    if len(numbers) > 1:
+        for left_out in numbers:
+            kept = [number for number in numbers if number != left_out]
+            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, effect)))
+    for number, term in enumerate(candidate.terms):
+        if not term.free_shape:
+            continue
+        canonical_term = replace(term, free_shape=False)
+        terms = list(candidate.terms)
+        terms[number] = canonical_term
+        values = [values for _, values in candidate.split_by_term(effect)]
+        # the parameters of the shape follow those of the canonical law
+        values[number] = values[number][: len(canonical_term.parameters)]
+        forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(values)))
+    return forms
+
+
+def _named_laws_of_family(
+    hypothesis: ForceHypothesis, other_hypotheses: Sequence[ForceHypothesis]
+) -> list[_ValuedCandidate]:
+    """Return the sets in which named laws stand in place of the laws of free shape of a hypothesis.
+
+    They are taken from the other hypotheses, with the values that these have. A set that has been
+    estimated with the motion is left out.
+
+    Parameters
+    ----------
+    hypothesis : ForceHypothesis
+        The hypothesis, some of whose laws may have a free shape.
+    other_hypotheses : sequence of ForceHypothesis
+        The hypotheses that were fitted.
+    """
+
+    def laws(candidate: Candidate) -> list[tuple[str, str]]:
+        return sorted((term.effect.family, term.place) for term in candidate.terms)
+
+    if not hypothesis.candidate.has_free_shape:
+        return []
+    return [
+        _ValuedCandidate(other.candidate, other.effect)
+        for other in other_hypotheses
+        if other.speed_window is None
+        and not other.candidate.has_free_shape
+        and laws(other.candidate) == laws(hypothesis.candidate)
+    ]
+
+
+def _estimate_from_values(
+    search: ForceSearch, hypothesis: ForceHypothesis, form: _ValuedCandidate
+) -> ForceHypothesis | None:
+    """Return a set of effects, estimated with the motion from that of an estimated hypothesis.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypothesis : ForceHypothesis
+        The estimated hypothesis, whose motion and missing forces the estimate begins with.
+    form : _ValuedCandidate
+        The set of effects, with the values to begin with.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if its laws are not possible along the motion.
+    """
+    trials = hypothesis.linear_trials
+    laws, estimator = laws_and_estimator(search, form.candidate, trials)
+    start = EstimatorStart(
+        form.effect, hypothesis.shared, _trajectories(hypothesis), hypothesis.processes
+    )
+    estimate = estimator.polish(laws, start, hypothesis.speed_window or SPEED_WINDOWS[-1])
+    if estimate is None:
+        return None
+    return hypothesis_of_estimate(search, form.candidate, trials, estimate)
 
 
 def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
@@ -128,14 +287,8 @@ def estimate_extended_hypothesis(
     ForceHypothesis or None
         The hypothesis; None if its laws are not possible along the motion.
     """
-    laws, estimator = laws_and_estimator(search, hypothesis.candidate, base.linear_trials)
-    start = EstimatorStart(
-        hypothesis.effect, hypothesis.shared, _trajectories(base), base.processes
-    )
-    estimate = estimator.polish(laws, start, base.speed_window or SPEED_WINDOWS[-1])
-    if estimate is None:
-        return None
-    return hypothesis_of_estimate(search, hypothesis.candidate, base.linear_trials, estimate)
+    start = _ValuedCandidate(hypothesis.candidate, hypothesis.effect)
+    return _estimate_from_values(search, base, start)
 
 
 def _trajectories(hypothesis: ForceHypothesis) -> tuple[Trajectory, ...]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
@@ -29,6 +29,7 @@ from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
 from reporting.format_schema import JsonSchema
+from reporting.json_file import JsonObject
 from reporting.words import brief
 
 VERDICT_SCHEMA = "uav-twin verdict 5"
@@ -124,7 +125,7 @@ def read_verdict_file(path: Path) -> StoredVerdict:
     return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS, _drop_old_definitions)
 
 
-def _drop_old_definitions(content: dict[str, Any]) -> None:
+def _drop_old_definitions(content: JsonObject) -> None:
     """Remove entries of an older file whose definition has changed: fractions and chi-squared."""
     verdict = content["verdict"]
     proof = content["proof"]

@@ -400,12 +400,14 @@ class FmuSimulator(FmuAtRest):
         first_loads = {name: values[:1] for name, values in run.offsets.items()}
         one_step = run._replace(steps=1, offsets=first_loads)
         undisturbed = self.outputs_of_run(one_step)[:, speed_columns]
+        _, undisturbed_at_end = undisturbed
         amplitudes = np.array([self.probing_amplitude(name) for name in inputs])
         speed_changes = []
-        for name in inputs:
-            force = first_loads.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
+        for name, amplitude in zip(inputs, amplitudes, strict=True):
+            force = first_loads.get(name, 0.0) + np.full(1, amplitude)
             pushed_run = one_step._replace(offsets={**first_loads, name: force})
-            speed_changes.append(self.outputs_of_run(pushed_run)[1, speed_columns] - undisturbed[1])
+            _, pushed_at_end = self.outputs_of_run(pushed_run)[:, speed_columns]
+            speed_changes.append(pushed_at_end - undisturbed_at_end)
         return undisturbed, np.stack(speed_changes, axis=1) / amplitudes
 
     def _find_converged_parts(

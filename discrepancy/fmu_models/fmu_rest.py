@@ -68,9 +68,11 @@ class FmuAtRest(IdentifiedFmu):
         if not static.settle:
             return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
-        load_values = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
+        values_of_inputs = np.array([loads[name] for name in names])
+        load_values = values_of_inputs.reshape(-1, len(states)).T
         # the test for linearity, made at the first row, is the strictest at the largest load
-        largest_first = np.argsort(-np.abs(load_values).sum(axis=1), kind="stable")
+        total_load = np.abs(load_values).sum(axis=1)
+        largest_first = np.argsort(-total_load, kind="stable")
         outputs = {}
         for row in largest_first.tolist():
             outputs[row] = self._settled_outputs(states[row], load_values[row], names)
@@ -140,14 +142,16 @@ class FmuAtRest(IdentifiedFmu):
         if not self.ports:
             # there is nothing to compute, and the FMU may not accept loads of zero
             return np.zeros((0, 0))
-        probing_forces = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
+        amplitudes = np.array([self.probing_amplitude(name) for name in self.port_inputs])
         # the first row is without a force; each further row has a force at one port
-        loads = dict.fromkeys(self.port_inputs, np.zeros(len(probing_forces) + 1))
-        for name, force in zip(self.port_inputs, probing_forces, strict=True):
+        row_count = 1 + len(amplitudes)
+        loads = dict.fromkeys(self.port_inputs, np.zeros(row_count))
+        for name, force in zip(self.port_inputs, np.diag(amplitudes), strict=True):
             loads[name] = loads[name] + np.append(0.0, force)
-        outputs = self.solve_rest([state] * (len(probing_forces) + 1), loads)
+        outputs = self.solve_rest([state] * row_count, loads)
         displacements = outputs[:, self.displacement_columns]
-        return np.asarray((displacements[1:] - displacements[0]).T / np.diag(probing_forces))
+        changes = displacements[1:] - displacements[0]
+        return np.asarray(changes.T / amplitudes)
 
     def solve_rest_with_laws(
         self,

@@ -284,9 +284,12 @@ class IdentifiedFmu(FmuRuns):
             loads.append(Load(direction, history))
         start = self._start_state(system, excitation, release_values)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
-        prediction_error = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
+        by_states = states @ system.output_matrix.T
+        by_inputs = acting @ system.feedthrough.T
+        prediction_error = motion - by_states - by_inputs
         largest_error = np.max(np.abs(prediction_error)[1:], axis=0)
-        return bool(np.all(largest_error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
+        largest_motion = np.max(np.abs(motion), axis=0)
+        return bool(np.all(largest_error <= tolerance * largest_motion + 1e-300))
 
     # ------------------------------------------------------------ releases
 

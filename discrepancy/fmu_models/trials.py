@@ -48,8 +48,10 @@ def effect_parameters(
             )
         parameters[f"{effect}.active"] = 1.0
         for key, value in primitive.to_mapping().items():
-            if key != "kind":
-                parameters[f"{effect}.{key}"] = float(value)
+            if key == "kind":
+                continue
+            assert isinstance(value, int | float)  # an effect of an FMU has numbers alone
+            parameters[f"{effect}.{key}"] = float(value)
     return parameters
 
 

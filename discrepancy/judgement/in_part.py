@@ -82,9 +82,10 @@ def _missing_force_vanishes(search: Search) -> bool:
     if not search.is_all_in_motion or not np.all(search.problem.record_freedom > 0.0):
         return False
     simulations = [fit for fit in search.exact_fits.values() if fit.candidate.terms]
-    scores = [search.score_under_recorded_noise(fit) for fit in simulations]
-    best_with_force = max(search.score(hypothesis) for hypothesis in search.force_hypotheses)
-    return max(scores, default=-np.inf) > best_with_force
+    scores_without_force = [search.score_under_recorded_noise(fit) for fit in simulations]
+    scores_with_force = [search.score(hypothesis) for hypothesis in search.force_hypotheses]
+    best_without_force = max(scores_without_force, default=-np.inf)
+    return best_without_force > max(scores_with_force)
 
 
 def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:

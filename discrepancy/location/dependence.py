@@ -7,7 +7,7 @@ modes is split into them by bands of its spectrum.
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from discrepancy.location.map import (
     normal_equations_of,
 )
 from discrepancy.location.residuals import FittedTrial
+from reporting.arrays import AnyArray
 
 
 def mode_bands(frequencies: Sequence[float]) -> list[tuple[float, float]]:
@@ -116,22 +117,29 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     """
     longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
     count = len(longest_trial.time)
-    power = np.zeros((count - 1) // 2)
+    frequency_count = (count - 1) // 2
+    # the falling half of a Hann window, because most of a ring-down is at its start
+    taper = np.hanning(2 * count)[count:, np.newaxis]
+    # power of all channels and trials over their noise, without the constant
+    power = np.zeros(frequency_count)
     for fitted_trial in trials:
-        interval_ratio = fitted_trial.trial.interval / longest_trial.interval
-        if len(fitted_trial.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
+        trial = fitted_trial.trial
+        interval_ratio = trial.interval / longest_trial.interval
+        if len(trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
         values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)
-        # the falling half of a Hann window, because most of a ring-down is at its start
-        taper = np.hanning(2 * count)[count:, np.newaxis]
-        spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted_trial.noise_deviation**2
-        power += spectra[1 : power.size + 1].sum(axis=1)
-    frequencies = np.arange(1, power.size + 1) / (count * longest_trial.interval)
+        transform = np.fft.rfft(values * taper, axis=0)
+        spectra = np.abs(transform) ** 2 / fitted_trial.noise_deviation**2
+        power += spectra[1 : frequency_count + 1].sum(axis=1)
+    frequencies = np.arange(1, frequency_count + 1) / (count * longest_trial.interval)
+    # peaks
+    least_power = 1e-3 * power.max(initial=0.0)
     peaks = []
-    for index in range(3, power.size - 1):  # index 3 is four periods in the record
+    for index in range(3, frequency_count - 1):  # index 3 is four periods in the record
         frequency = float(frequencies[index])
         is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
-        if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
+        is_highest = power[index] >= power[is_neighbour].max()
+        if is_highest and power[index] > least_power:
             peaks.append((float(power[index]), frequency))
     highest_peaks = sorted(peaks, reverse=True)[:4]
     return tuple(sorted(frequency for _, frequency in highest_peaks))
@@ -362,7 +370,8 @@ def dependence_bases(
     }
     temperature = samples.stack_used_samples(lambda fitted: fitted.trial.temperature)
     if np.ptp(temperature) > 0.0:
-        proportional = temperature * samples.prediction_features("x")[:, 0]
+        x = samples.prediction_features("x").squeeze(axis=1)
+        proportional = temperature * x
         bases["", "temperature"] = np.column_stack([temperature, proportional])
     if trials[0].trial.is_dynamic:
         return bases | _dynamic_bases(samples, modes)
@@ -402,7 +411,7 @@ class _UsedSamples:
         """
         return self.stack_arrays([values(fitted_trial) for fitted_trial in self.trials])
 
-    def stack_arrays(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def stack_arrays(self, arrays: Sequence[AnyArray]) -> AnyArray:
         """Return arrays (N, ...) of the trials at the used samples, stacked (n, ...)."""
         is_used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
         return np.concatenate(is_used)
@@ -420,8 +429,10 @@ class _UsedSamples:
         (n, k T) ndarray
             Block diagonal: the columns of a trial are zero at the samples of the others.
         """
-        ends = np.cumsum([int(rows.sum()) for rows in self.rows])
-        return np.asarray(block_diag(*np.split(functions, ends[:-1])))
+        used_counts = [int(rows.sum()) for rows in self.rows]
+        starts_of_next_trials = np.cumsum(used_counts)[:-1]
+        functions_by_trial = np.split(functions, starts_of_next_trials)
+        return np.asarray(block_diag(*functions_by_trial))
 
     def prediction_features(self, *names: str) -> FloatArray:
         """Return functions of the prediction at the n used samples of all trials, side by side.
@@ -429,19 +440,15 @@ class _UsedSamples:
         They are zero in a trial that lacks them. The names, such as "x", are those of
         `discrepancy.location.map.dependence_functions`.
         """
-        widths = [
-            feature.shape[1]
-            for features_of_trial in self._features
-            for name, feature in features_of_trial.items()
-            if name in names
-        ]
-        width = max(widths, default=1)
+        width = 1
+        for features_of_trial in self._features:
+            for name in features_of_trial.keys() & set(names):
+                width = max(width, features_of_trial[name].shape[1])
         stacked_features = []
         for features_of_trial, rows in zip(self._features, self.rows, strict=True):
             zeros = np.zeros((int(rows.sum()), width))
-            stacked_features.append(
-                np.hstack([features_of_trial.get(name, zeros) for name in names])
-            )
+            features = [features_of_trial.get(name, zeros) for name in names]
+            stacked_features.append(np.hstack(features))
         return np.vstack(stacked_features)
 
 
@@ -458,7 +465,7 @@ def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
         bases["", "time"] = np.column_stack([np.ones_like(time), time - time.mean()])
     load = samples.stack_used_samples(lambda fitted: fitted.trial.load)
     if np.ptp(load) > 0.0:
-        x = samples.prediction_features("x")[:, 0]
+        x = samples.prediction_features("x").squeeze(axis=1)
         bases["", "load (proportional)"] = np.column_stack([x, load])
         not_proportional = [load, np.abs(load) * load, load**2]
         bases["", "load (not proportional)"] = np.column_stack(not_proportional)

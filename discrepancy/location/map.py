@@ -114,14 +114,19 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     equations : sequence of NormalEquations
         The normal equations of each channel; every channel has its own coefficients.
     """
-    covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
-    if all(channel_equations.absorbed_by_fit.shape[0] for channel_equations in equations):
-        absorbed = np.hstack([channel_equations.absorbed_by_fit for channel_equations in equations])
+    grams = [channel_equations.gram for channel_equations in equations]
+    absorbed_by_fit = [channel_equations.absorbed_by_fit for channel_equations in equations]
+    projections = [channel_equations.projection for channel_equations in equations]
+    # covariance of the projection, without what the fit absorbs
+    covariance = block_diag(*grams)
+    if all(len(absorbed_of_channel) for absorbed_of_channel in absorbed_by_fit):
+        absorbed = np.hstack(absorbed_by_fit)
         covariance = covariance - absorbed.T @ absorbed
-    projection = np.concatenate([channel_equations.projection for channel_equations in equations])
+    # squares along the remaining eigenvectors, over their variances
     eigenvalues, eigenvectors = np.linalg.eigh(covariance)
     is_remaining = eigenvalues > _LEAST_REMAINING_VARIANCE
-    squares = (eigenvectors[:, is_remaining].T @ projection) ** 2 / eigenvalues[is_remaining]
+    components = eigenvectors[:, is_remaining].T @ np.concatenate(projections)
+    squares = components**2 / eigenvalues[is_remaining]
     return ExplainedSquares(float(np.sum(squares)), int(is_remaining.sum()))
 
 
@@ -145,13 +150,15 @@ def motion_envelope(fitted_trial: FittedTrial, column: int) -> FloatArray:
         Amplitude [channel's unit].
     """
     assert fitted_trial.rates is not None
-    x = fitted_trial.prediction[:, column] - _value_at_rest(fitted_trial, column)
+    prediction = fitted_trial.prediction[:, column]
+    x = prediction - _value_at_rest(fitted_trial, column)
     v = fitted_trial.rates[:, column]
     rms_value = float(np.sqrt(np.mean(x**2)))
     rms_rate = float(np.sqrt(np.mean(v**2)))
     if rms_value == 0.0 or rms_rate == 0.0:
         return np.abs(x)
-    amplitude = np.hypot(x, v * rms_value / rms_rate)
+    rate_over_frequency = v * rms_value / rms_rate
+    amplitude = np.hypot(x, rate_over_frequency)
     # Moving average over one period 2 pi / w. Near the ends fewer samples are in the window, so the
     # sums are divided by their numbers.
     period = 2.0 * np.pi * rms_value / (rms_rate * fitted_trial.trial.interval)
@@ -417,17 +424,19 @@ def _spans(fitted_trial: FittedTrial, column: int) -> Iterator[_Span]:
     is_used = fitted_trial.used[:, column]
     yield _Span("whole", np.nan, np.nan, is_used)
     if trial.is_dynamic:
-        edges = np.linspace(trial.time[0], trial.time[-1], BIN_COUNT + 1)
-        yield from _spans_of_bins("time", trial.time, edges, is_used)
+        time_edges = np.linspace(trial.time[0], trial.time[-1], BIN_COUNT + 1)
+        yield from _spans_of_bins("time", trial.time, time_edges, is_used)
         if fitted_trial.rates is not None:
             amplitude = motion_envelope(fitted_trial, column)
             if amplitude.any():
-                least_amplitude = max(amplitude.min(), 1e-4 * amplitude.max())
-                edges = np.geomspace(least_amplitude, amplitude.max(), BIN_COUNT + 1)
+                largest_amplitude = amplitude.max()
+                least_amplitude = max(amplitude.min(), 1e-4 * largest_amplitude)
+                edges = np.geomspace(least_amplitude, largest_amplitude, BIN_COUNT + 1)
                 yield from _spans_of_bins("amplitude", amplitude, edges, is_used)
     else:
-        edges = np.linspace(trial.load.min(), trial.load.max(), LOAD_BIN_COUNT + 1)
-        yield from _spans_of_bins("load", trial.load, edges, is_used)
+        load = trial.load
+        load_edges = np.linspace(load.min(), load.max(), LOAD_BIN_COUNT + 1)
+        yield from _spans_of_bins("load", load, load_edges, is_used)
 
 
 def _spans_of_bins(

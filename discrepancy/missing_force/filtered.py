@@ -489,14 +489,14 @@ class Regression:
         prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
         column_scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior_precision)
-        normal_matrix = (products[1:, 1:] + np.diag(prior_precision)) * np.outer(
-            column_scale, column_scale
-        )
-        factor = cho_factor(normal_matrix + ROUNDING * np.eye(len(column_scale)))
-        mean = column_scale * cho_solve(factor, column_scale * products[1:, 0])
-        covariance = np.outer(column_scale, column_scale) * cho_solve(
-            factor, np.eye(len(prior_precision))
-        )
+        scale_of_pair = np.outer(column_scale, column_scale)
+        normal_matrix = (products[1:, 1:] + np.diag(prior_precision)) * scale_of_pair
+        unity = np.eye(len(prior_precision))
+        factor = cho_factor(normal_matrix + ROUNDING * unity)
+        residual = 0  # its row comes before those of the unknowns
+        right_side = products[1:, residual]
+        mean = column_scale * cho_solve(factor, column_scale * right_side)
+        covariance = scale_of_pair * cho_solve(factor, unity)
         # Laplace's approximation of the evidence, which is exact for a linear model
         residual_weights = np.r_[1.0, -mean]
         misfit = float(

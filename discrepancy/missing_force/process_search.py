@@ -61,6 +61,10 @@ def _ratios_to_median(process: Process, median_process: Process) -> tuple[float,
     )
 
 
+_TIME = 1
+"""Column of the correlation times in the result of `logarithms`."""
+
+
 @dataclass(frozen=True, eq=False)
 class ProcessSearch:
     """The search for the most probable sizes and correlation times of P missing forces.
@@ -109,8 +113,8 @@ class ProcessSearch:
         low = log_medians - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         high = log_medians + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         log_shortest, log_longest = np.log(time_range)
-        low[:, 1] = np.clip(low[:, 1], log_shortest, log_longest)
-        high[:, 1] = np.clip(high[:, 1], log_shortest, log_longest)
+        low[:, _TIME] = np.clip(low[:, _TIME], log_shortest, log_longest)
+        high[:, _TIME] = np.clip(high[:, _TIME], log_shortest, log_longest)
         return cls(log_evidence, initial_processes, low, high)
 
     def processes(self, logs: FloatArray) -> dict[int, Process]:

@@ -275,8 +275,11 @@ def _weighted_squares(forces: PortForces, weights: Mapping[int, float], samples:
     samples : slice
         The fine stamps of the samples.
     """
-    sums = [np.sum((weights[port] * force[samples]) ** 2) for port, force in forces.items()]
-    return float(sum(sums))
+    total = 0.0
+    for port, force in forces.items():
+        weighted_force = weights[port] * force[samples]
+        total += float(np.sum(weighted_force**2))
+    return total
 
 
 def _largest_rms(forces_by_trial: Sequence[PortForces], ports: Iterable[int]) -> float:

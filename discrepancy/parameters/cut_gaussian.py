@@ -87,10 +87,12 @@ class TruncatedGaussian:
         normal = np.zeros_like(uniform)
         log_weight = np.zeros(uniform.shape[:-1])
         for index, shift in enumerate(self.tilt.tolist()):
+            # the range of the parameter in standard deviations about its shifted conditional mean
             factor_row = self.factor[index]
             conditional_mean = means[..., index] + normal @ factor_row
-            low = (self.low[index] - conditional_mean) / factor_row[index] - shift
-            high = (self.high[index] - conditional_mean) / factor_row[index] - shift
+            conditional_deviation = factor_row[index]
+            low = (self.low[index] - conditional_mean) / conditional_deviation - shift
+            high = (self.high[index] - conditional_mean) / conditional_deviation - shift
             normal[..., index] = shift + truncnorm.ppf(uniform[..., index], low, high)
             # ln of the probability between the ends; an interval in the upper tail is mirrored, as
             # the difference of two numbers close to one would lose digits
@@ -142,8 +144,11 @@ class TruncatedGaussian:
         uniform = generator.random((CANDIDATES_PER_DRAW * count, len(self.mean)))
         candidates, log_weight = self.weighted_draws(self.mean, uniform)
         cumulative_weights = np.cumsum(softmax(log_weight))
-        chosen_indices = np.searchsorted(cumulative_weights, stratified(generator, count))
-        return np.asarray(candidates[np.minimum(chosen_indices, len(candidates) - 1)])
+        levels = stratified(generator, count)
+        chosen_indices = np.searchsorted(cumulative_weights, levels)
+        # rounding may leave the last cumulative weight below the last level
+        chosen_indices = np.minimum(chosen_indices, len(candidates) - 1)
+        return np.asarray(candidates[chosen_indices])
 
     def draws_with_means(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return one draw (N, P) for each of several means, with the covariance of this Gaussian.

@@ -137,13 +137,15 @@ def is_gaussian(marginal: MarginalPosterior, gaussian: TruncatedGaussian) -> boo
     """
     mean, covariance = gaussian.moments
     variances, directions = np.linalg.eigh(covariance)
-    axes = (directions * np.sqrt(np.maximum(variances, 0.0))).T
+    standard_deviations = np.sqrt(np.maximum(variances, 0.0))
+    axes = (directions * standard_deviations).T
     energy_at_mean = marginal(mean) - gaussian.energy(mean)
     for axis, (distance, allowed_error), side in product(axes, GAUSSIAN_CHECKS, (-1.0, 1.0)):
         offset = side * distance * axis
         distance_to_end = np.where(offset > 0.0, gaussian.high - mean, mean - gaussian.low)
-        largest_fraction = distance_to_end / np.maximum(np.abs(offset), 1e-300)
-        point = mean + min(1.0, largest_fraction.min()) * offset
+        fraction_to_end = distance_to_end / np.maximum(np.abs(offset), 1e-300)
+        fraction = min(1.0, fraction_to_end.min())
+        point = mean + fraction * offset
         point = np.clip(point, gaussian.low, gaussian.high)
         error = marginal(point) - gaussian.energy(point) - energy_at_mean
         if not abs(error) < allowed_error:
@@ -329,10 +331,13 @@ def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray,
     energies = np.minimum(energies - energies.min(), LARGEST_ENERGY)
     # density at the nodes and at equally spaced points between them
     fractions = np.linspace(0.0, 1.0, INTERPOLATION_INTERVALS, endpoint=False)
-    between_nodes = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
-    points = np.append(between_nodes, nodes[-1])
-    density = np.exp(-Akima1DInterpolator(nodes, energies)(points))
+    distances = np.diff(nodes)
+    from_each_node = nodes[:-1, None] + distances[:, None] * fractions
+    points = np.append(from_each_node.ravel(), nodes[-1])
+    interpolated_energy = Akima1DInterpolator(nodes, energies)
+    density = np.exp(-interpolated_energy(points))
     # trapezoidal rule
-    masses = 0.5 * (density[1:] + density[:-1]) * np.diff(points)
+    mean_density = 0.5 * (density[1:] + density[:-1])
+    masses = mean_density * np.diff(points)
     cumulative = np.concatenate(([0.0], np.cumsum(masses)))
     return points, cumulative / cumulative[-1]

@@ -107,7 +107,7 @@ def draw_heat_map(
     names: tuple[Iterable[str], Iterable[str]],
     norm: Normalize,
     slant: float,
-    texts: NDArray[Any] | None = None,
+    texts: NDArray[np.str_] | None = None,
 ) -> AxesImage:
     """Draw values as a map of cells.
 

@@ -77,6 +77,14 @@ def changes_structure(effect: Effect, setting: Setting) -> bool:
     return not all(isinstance(primitive, SENSORS) for primitive in patch)
 
 
+def free_places(effect: Effect, candidate: Candidate, setting: Setting) -> tuple[str, ...]:
+    """Return the places of an effect at which a set of effects does not have it yet."""
+    taken_places = {
+        term.place for term in candidate.terms if term.effect.identifier == effect.identifier
+    }
+    return tuple(place for place in effect.places(setting) if place not in taken_places)
+
+
 def are_related(effect: Effect, other_effect: Effect) -> bool:
     """Return whether one of two different effects is easily mistaken for the other."""
     if effect.identifier == other_effect.identifier:
@@ -102,10 +110,10 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     screen : Screen
         The fit that the effect is added to.
     effect : Effect
-        The effect; all its places are tried.
+        The effect; all its places are tried where the fit does not have it.
     """
     setting = screen.problem.setting
-    places = effect.places(setting)
+    places = free_places(effect, screen.fit.candidate, setting)
     has_few_places = len(places) <= SEARCH.few_places
     other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
     start_count = (
@@ -160,7 +168,9 @@ class ScreenedPair(NamedTuple):
 
 
 def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[ScreenedPair]:
-    """Return the best pair of changes for each pair of different effects, the best first.
+    """Return the best pair of changes for each pair of effects, the best first.
+
+    The two effects are different, or the same one at two places if it may act at both at once.
 
     Parameters
     ----------
@@ -182,8 +192,12 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
             ]
         )
         overlap = np.array([first_change.overlap, second_change.overlap])
+        is_one_effect_twice = effect_names[0] == effect_names[1] and (
+            not first_change.term.effect.at_several_places
+            or first_change.term.place == second_change.term.place
+        )
         # no pair: the same effect twice, or two effects of parallel changes
-        if effect_names[0] == effect_names[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
+        if is_one_effect_twice or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
         # least misfit F(s) = F(0) - b^T s + s^T G s / 2: s = G^-1 b, F(s) - F(0) = -b^T s / 2
         best_scales = np.linalg.solve(gram, overlap)
@@ -245,10 +259,10 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     base : CandidateFit
         The fit that the effect is added to.
     effect : Effect
-        The effect; all its places are tried.
+        The effect; all its places are tried where the base does not have it.
     """
     valued_starts = []
-    for place in effect.places(problem.setting):
+    for place in free_places(effect, base.candidate, problem.setting):
         term = EffectTerm(effect, place)
         parameter_count = len(term.parameters)
         level_counts = SEARCH.grid_levels_far_from_data

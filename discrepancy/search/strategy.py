@@ -17,8 +17,8 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
 from discrepancy.estimation.ranking import rank_by_missing_force
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
-from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, time_step_error
+from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.gates import check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.missing_force.explained import ForceHypothesis
@@ -27,6 +27,7 @@ from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .fitted_candidates import FittedCandidates
+from .free_shapes import fits_of_free_shape
 from .other_optima import canonical_relatives, points_at_other_magnitudes, sets_at_other_places
 from .starts import (
     FitStart,
@@ -325,6 +326,7 @@ class Search(FittedCandidates):
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
         if not self.best().candidate.has_free_shape:
+            self.fit_effects_at_several_places()
             self.add_effects()
         if not self.best().candidate.has_free_shape and self.is_unexplained():
             self.fit_pairs()
@@ -435,7 +437,9 @@ class Search(FittedCandidates):
             current_score = self.score(current_fit)
             present_identifiers = {term.effect.identifier for term in current_fit.candidate.terms}
             other_effects = [
-                effect for effect in self.effects if effect.identifier not in present_identifiers
+                effect
+                for effect in self.effects
+                if effect.identifier not in present_identifiers or effect.at_several_places
             ]
             rough_fits = self.fit_one_more_effect(current_fit, other_effects)
             floor_score = current_score - SEARCH.largest_longer_set_deficit
@@ -443,6 +447,35 @@ class Search(FittedCandidates):
             if not exact_fits or self.score(exact_fits[0]) <= current_score:
                 break
             current_fit = exact_fits[0]
+
+    def fit_effects_at_several_places(self) -> None:
+        """Fit effects that may act at several places at once at more and more places.
+
+        At one place such an effect explains little if it acts at two, so that errors of sensors may
+        lead and no set with it would be tried. The places are therefore compared beside each other
+        whatever leads.
+        """
+        for effect in self.effects:
+            if not effect.at_several_places:
+                continue
+            single_fits = [
+                fit
+                for fit in (*self.exact_fits.values(), *self.rough_fits.values())
+                if [term.effect.identifier for term in fit.candidate.terms] == [effect.identifier]
+            ]
+            if not single_fits:
+                continue
+            current_fit = max(single_fits, key=self.score)
+            if current_fit is self.best() and not self.is_unexplained():
+                continue  # one place is enough
+            while len(current_fit.candidate.terms) < SEARCH.largest_set:
+                current_score = self.score(current_fit)
+                rough_fits = self.fit_one_more_effect(current_fit, [effect])
+                floor_score = current_score - SEARCH.largest_longer_set_deficit
+                exact_fits = self.fit_best_exactly(rough_fits, floor_score)
+                if not exact_fits or self.score(exact_fits[0]) <= current_score:
+                    break
+                current_fit = exact_fits[0]
 
     def move_effects(self) -> None:
         """Fit the best set with one effect at another place, until the set explains the data.
@@ -492,56 +525,9 @@ class Search(FittedCandidates):
         """Fit the best single effects with free shapes, and record those that explain the data.
 
         One law with a free shape is a simpler cause than two laws, so it is tried before pairs.
-        Effects of one family at one place lead to the same free law; of their fits, the one with
-        the highest score is recorded.
         """
-        single_fits = self._single_fits_to_free()
-        best_by_family: dict[tuple[str, str], CandidateFit] = {}
-        for single_fit in single_fits:
-            free_fit = fit_free_shape(self.problem, single_fit, term_index=0)
-            if free_fit is None:
-                continue
-            evidence_gain = free_fit.log_evidence - single_fit.log_evidence
-            if evidence_gain <= LEAST_SHAPE_GAIN:
-                continue
-            (term,) = free_fit.candidate.terms
-            key = (term.effect.family, term.place)
-            previous_best = best_by_family.get(key)
-            is_best = previous_best is None or self.score(previous_best) < self.score(free_fit)
-            if is_best and self._is_not_refuted(free_fit):
-                best_by_family[key] = free_fit
-        for free_fit in best_by_family.values():
+        for free_fit in fits_of_free_shape(self):
             self.record_fit(free_fit, exact=True)
-
-    def _is_not_refuted(self, fit: CandidateFit) -> bool:
-        """Return whether a fit passes the test of absolute fit, or cannot be tested.
-
-        It cannot be tested if there is no noise record (`passed` is then None).
-        """
-        return check_absolute_fit(self.problem, fit).passed is not False
-
-    def _single_fits_to_free(self) -> list[CandidateFit]:
-        """Return the single effects that are to be fitted with a free shape, the best first.
-
-        If the best effect does not explain the data, these are the best ones, at most
-        `SEARCH.most_exact_fits`. If it does, these are the effects that explain the data too, with
-        a score at most `SEARCH.family_fit_range` below that of the best. There are none if there is
-        only one such effect, or if the model without effect explains the data: the test of shape
-        (`gates.check_shape`) then examines the best effect later.
-        """
-        single_fits = []
-        for fit in self.exact_fits.values():
-            if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
-                single_fits.append(fit)
-        single_fits = sorted(single_fits, key=self.score, reverse=True)[: SEARCH.most_exact_fits]
-        explaining_fits = [fit for fit in single_fits if self._is_not_refuted(fit)]
-        if not explaining_fits or explaining_fits[0] is not single_fits[0]:
-            return single_fits
-        least_score = self.score(single_fits[0]) - SEARCH.family_fit_range
-        competing_fits = [fit for fit in explaining_fits if self.score(fit) > least_score]
-        if len(competing_fits) == 1 or self._is_not_refuted(self.no_effect):
-            return []
-        return competing_fits
 
     def fit_pairs(self) -> None:
         """Fit the pairs of effects that reduce the misfit most by a screen without effect."""

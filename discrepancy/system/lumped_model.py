@@ -8,7 +8,6 @@ from typing import ClassVar
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
-from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
@@ -18,7 +17,8 @@ from discrepancy.system.lumped_file import BLOCKS, LumpedDescription
 from discrepancy.system.lumped_sections import InputSection, OutputSection
 from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.output_equation import Feedthrough, OutputEquation
-from discrepancy.system.response import EITHER, MOVES, TURNS, Outputs, Place
+from discrepancy.system.port_units import units_at_port
+from discrepancy.system.response import EITHER, Outputs, Place
 from discrepancy.system.rig import OffsetInput, Rig, build_rig
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import LoadsAndMotions, PatchedTrial, SystemState
@@ -351,52 +351,9 @@ class LumpedModel(DescribedModel, SystemModel):
     # ------------------------------------------------------------ units of ports
 
     def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of the force and of the motion at a port, `EITHER` if not known.
-
-        A port that is a sum or difference of unknowns has their unit (length or angle), and an
-        unknown has the unit of an output or an input that measures or prescribes it alone.
-        """
+        """Return the units of the force and of the motion at a port, `EITHER` if not known."""
         row = self.port_rows.get(port)
-        if row is None:
-            return EITHER
-        if not np.any(row[: self.description.displacement_count]):
-            return self._units_of_state_port()
-        if not np.all(np.isin(row, (-1.0, 0.0, 1.0))):
-            return EITHER
-        units_by_unknown = self._units_by_unknown()
-        units: set[tuple[str, str]] = set()
-        for unknown_index in np.flatnonzero(row).tolist():
-            units |= units_by_unknown.get(unknown_index, {MOVES, TURNS})
-        return units.pop() if len(units) == 1 else EITHER
-
-    def _units_of_state_port(self) -> tuple[str, str]:
-        """Return the units of a flow at a port of a state, and of the state."""
-        first_state = self.description.displacement_count
-        quantities = {
-            output.quantity
-            for output in self.description.output
-            if output.vector and any(output.vector[first_state:])
-        }
-        unit = UNITS[quantities.pop()].si if len(quantities) == 1 else "of the state's unit"
-        return f"{unit}/s times capacity", unit
-
-    def _units_by_unknown(self) -> dict[int, set[tuple[str, str]]]:
-        """Return the units of force and motion of unknowns that are measured or prescribed alone.
-
-        More than one pair of units for an unknown means that the file contradicts itself.
-        """
-        units: dict[int, set[tuple[str, str]]] = {}
-        sections: list[InputSection | OutputSection] = [*self.description.output]
-        sections += self.description.input
-        for section in sections:
-            vector = section.vector or ()
-            moving = section.quantity.motion_chain
-            if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
-                unit = TURNS if Quantity.ANGLE in moving else MOVES
-                units.setdefault(vector.index(1.0), set()).add(unit)
-        return units
-
-    # ------------------------------------------------------------ matrices
+        return EITHER if row is None else units_at_port(self.description, row)
 
     def _term_factors(self, parameters: Sequence[float]) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""

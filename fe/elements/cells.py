@@ -159,7 +159,8 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
         The element mass [kg].
     """
     values, _ = kind.shape_functions(rule.points)
-    determinant = np.linalg.det(jacobians(kind, nodes, rule.points))
+    jacobian = jacobians(kind, nodes, rule.points)
+    determinant = np.linalg.det(jacobian)
     volume = determinant * rule.weights
     density_of_cell = np.reshape(density, (-1, 1))
     mass = volume * density_of_cell
@@ -227,14 +228,21 @@ class CellMesh:
         """The faces that belong to one cell alone."""
         faces = []
         for face in self.kind.faces:
-            corners = np.sort(self.cells[:, list(face)], axis=1)
+            corners_of_cells = self.cells[:, list(face)]
+            corners = np.sort(corners_of_cells, axis=1)
             missing_corners = _MOST_FACE_CORNERS - len(face)  # one for a triangle
             no_rows = (0, 0)
             columns_before = (missing_corners, 0)
             faces.append(np.pad(corners, (no_rows, columns_before), constant_values=-1))
         all_faces = np.vstack(faces)
-        _, first_index, count = np.unique(all_faces, axis=0, return_index=True, return_counts=True)
-        outer_index = np.sort(first_index[count == 1])
+        _, first_index, cell_count = np.unique(
+            all_faces,
+            axis=0,
+            return_index=True,
+            return_counts=True,
+        )
+        is_outer = cell_count == 1
+        outer_index = np.sort(first_index[is_outer])
         # `all_faces` holds face 0 of all cells, then face 1 of all cells, ...
         number, cell = np.divmod(outer_index, len(self.cells))
         return OuterFaces(cell, number, all_faces[outer_index])
@@ -242,7 +250,8 @@ class CellMesh:
     def unknowns_of(self, cells: IntArray, components: int = 3) -> IntArray:
         """Return the unknowns (n, components k) of cells (n,), for one or three components."""
         first_unknown = components * self.cells[cells]
-        unknowns = first_unknown[..., np.newaxis] + np.arange(components)
+        component = np.arange(components)
+        unknowns = first_unknown[..., np.newaxis] + component
         return np.asarray(unknowns.reshape(len(cells), -1))
 
     def positions(self, cells: IntArray, local_positions: FloatArray) -> FloatArray:
@@ -312,7 +321,8 @@ class CellMesh:
             The sums per displacement [1/m].
         """
         _, local_gradients = self.kind.shape_functions(local_positions)
-        inverse_jacobians = np.linalg.inv(self.jacobians_at(cells, local_positions))
+        jacobians_at_points = self.jacobians_at(cells, local_positions)
+        inverse_jacobians = np.linalg.inv(jacobians_at_points)
         # dN_a/dX_i dX_i/dx_j d_j, for the node a of the cell at the point p
         gradient_along_direction = np.einsum(
             "pai,pij,pj->pa", local_gradients, inverse_jacobians, direction
@@ -320,11 +330,13 @@ class CellMesh:
         weight_column = np.asarray(weight)[:, np.newaxis]
         weighted_gradient = weight_column * gradient_along_direction
         values = weighted_gradient[..., np.newaxis] * direction[:, np.newaxis]
-        row_of_entry = np.repeat(row, AXES * self.kind.node_count)
+        unknowns_per_cell = AXES * self.kind.node_count
+        row_of_entry = np.repeat(row, unknowns_per_cell)
         column_of_entry = self.unknowns_of(cells).ravel()
-        row_count = int(row_of_entry.max(initial=-1)) + 1
+        last_row = int(row_of_entry.max(initial=-1))
+        shape = (last_row + 1, self.unknowns)
         entries = (values.ravel(), (row_of_entry, column_of_entry))
-        return sparse.coo_array(entries, (row_count, self.unknowns)).tocsr()
+        return sparse.coo_array(entries, shape).tocsr()
 
     def stiffness(
         self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
@@ -408,16 +420,22 @@ class CellMesh:
         cells_at_once = max(BATCH, _SUMMED_ENTRIES // width**2)
         for start in range(0, len(cells), cells_at_once):
             end = min(start + cells_at_once, len(cells))
-            unknowns = self.unknowns_of(cells[start:end], components).astype(np.int32)
+            # element matrices
             element_matrices = []
             for first in range(start, end, BATCH):
-                batch = slice(first, min(first + BATCH, end))
+                last = min(first + BATCH, end)
+                batch = slice(first, last)
                 element_matrices.append(blocks(batch))
             values = np.concatenate(element_matrices).ravel()
+            # row and column of each entry
+            unknowns = self.unknowns_of(cells[start:end], components)
+            unknowns = unknowns.astype(np.int32)
             rows = np.repeat(unknowns, width, axis=1).ravel()
             columns = np.tile(unknowns, (1, width)).ravel()
-            summed = sparse.coo_array((values, (rows, columns)), shape=total.shape)
-            total = total + summed.tocsr()
+            # entries of one row and column are added
+            entries = (values, (rows, columns))
+            assembled = sparse.coo_array(entries, shape=total.shape)
+            total = total + assembled.tocsr()
         return total
 
 
@@ -438,11 +456,17 @@ def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:
     """
     ends_in_cell = np.array(HEXAHEDRA_20.edges)
     edge_ends = np.sort(cells[:, ends_in_cell], axis=2)
-    edges, edge_of_cell = np.unique(edge_ends.reshape(-1, 2), axis=0, return_inverse=True)
-    mid_edge_nodes = len(points) + edge_of_cell.reshape(len(cells), -1)
+    # cells share edges: each edge gets one node
+    edges, edge_of_cell = np.unique(
+        edge_ends.reshape(-1, 2),
+        axis=0,
+        return_inverse=True,
+    )
+    edge_numbers = edge_of_cell.reshape(len(cells), -1)
+    mid_edge_nodes = len(points) + edge_numbers
     mid_edge_points = points[edges].mean(axis=1)
     return CellMesh(
-        HEXAHEDRA_20,
-        np.vstack((points, mid_edge_points)),
-        np.hstack((cells, mid_edge_nodes)),
+        kind=HEXAHEDRA_20,
+        points=np.vstack((points, mid_edge_points)),
+        cells=np.hstack((cells, mid_edge_nodes)),
     )

@@ -44,9 +44,10 @@ def orthotropic_compliance(
     young = np.broadcast_to(moduli, 3)
     # The shear moduli are 12, 13, 23, and Voigt order is 23, 13, 12.
     shear = np.broadcast_to(shear_moduli, 3)[::-1]
-    compliance = np.diag(1.0 / np.concatenate((young, shear)))
-    ratio_of_axes = zip(_PAIRS_OF_AXES, np.broadcast_to(ratios, 3), strict=True)
-    for (i, j), ratio in ratio_of_axes:
+    stiffness_moduli = np.concatenate((young, shear))
+    compliance = np.diag(1.0 / stiffness_moduli)
+    poisson_ratios = np.broadcast_to(ratios, 3)
+    for (i, j), ratio in zip(_PAIRS_OF_AXES, poisson_ratios, strict=True):
         coupling = -ratio / young[i]
         compliance[i, j] = coupling
         compliance[j, i] = coupling

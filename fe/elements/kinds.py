@@ -148,7 +148,8 @@ def gauss_points(order: int, dimensions: int = 3) -> Rule:
     line_weights = 0.5 * root_weights
     points = list(itertools.product(line_points, repeat=dimensions))
     factors = list(itertools.product(line_weights, repeat=dimensions))
-    return Rule(np.array(points), np.array(factors).prod(axis=1))
+    weights = np.array(factors).prod(axis=1)
+    return Rule(np.array(points), weights)
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
@@ -166,6 +167,23 @@ def _wedge_rule(triangle_order: int, line_order: int) -> Rule:
         points.append((*position, height))
     weights = np.outer(line.weights, triangle.weights)
     return Rule(np.array(points), weights.ravel())
+
+
+def _powers_and_slopes(
+    coordinate: FloatArray, exponents: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return powers of a coordinate (q,) with exponents (k,) of at most two, and their derivatives.
+
+    Returns
+    -------
+    powers, slopes : (q, k) array
+        The powers and their derivatives by the coordinate.
+    """
+    zero = np.zeros_like(coordinate)
+    one = np.ones_like(coordinate)
+    powers = np.stack((one, coordinate, coordinate**2), axis=1)
+    slopes = np.stack((zero, one, 2.0 * coordinate), axis=1)
+    return powers[:, exponents], slopes[:, exponents]
 
 
 @dataclass(frozen=True)
@@ -205,8 +223,11 @@ class ElementKind:
     def node_positions(self) -> FloatArray:
         """Local positions (k, 3) of the nodes in the order of the file."""
         corners = np.array(self.corners, dtype=np.float64)
-        middles = [0.5 * (corners[start] + corners[end]) for start, end in self.edges]
-        return np.vstack([corners, *middles])
+        positions = list(corners)
+        for start, end in self.edges:
+            mid_edge = 0.5 * (corners[start] + corners[end])
+            positions.append(mid_edge)
+        return np.vstack(positions)
 
     @property
     def node_count(self) -> int:
@@ -233,7 +254,11 @@ class ElementKind:
     @cached_property
     def face_nodes(self) -> tuple[tuple[int, ...], ...]:
         """Nodes of each face: its corners, then its mid-edge nodes."""
-        return tuple((*face, *self._mid_edge_nodes(face)) for face in self.faces)
+        nodes_of_faces = []
+        for face in self.faces:
+            mid_edge_nodes = self._mid_edge_nodes(face)
+            nodes_of_faces.append((*face, *mid_edge_nodes))
+        return tuple(nodes_of_faces)
 
     def _mid_edge_nodes(self, face: tuple[int, ...]) -> list[int]:
         """Return the mid-edge nodes of a face with the given corners."""
@@ -277,14 +302,10 @@ class ElementKind:
         gradients : (q, k, 3) array
             The gradients of the shape functions by the local coordinates.
         """
-        exponents = np.array(self.exponents)
-        # powers 0, 1, 2 of each coordinate (q, 3, 3), and their derivatives
-        zeros = np.zeros_like(local_positions)
-        ones = np.ones_like(local_positions)
-        powers = np.stack((ones, local_positions, local_positions**2), axis=2)
-        slopes = np.stack((zeros, ones, 2.0 * local_positions), axis=2)
-        x, y, z = (powers[:, axis, exponents[:, axis]] for axis in range(3))
-        dx, dy, dz = (slopes[:, axis, exponents[:, axis]] for axis in range(3))
+        # the monomials x^i y^j z^k are products of a power of each coordinate
+        coordinates = np.transpose(local_positions)
+        exponents = np.transpose(self.exponents)
+        (x, dx), (y, dy), (z, dz) = map(_powers_and_slopes, coordinates, exponents)
         # monomials and their derivatives, combined
         values = x * y * z @ self._coefficients
         slope_x = dx * y * z @ self._coefficients
@@ -298,7 +319,10 @@ class ElementKind:
         """Local frames of the faces."""
 
         def corner_positions(number_in_face: int) -> FloatArray:
-            positions = [self.corners[face[number_in_face]] for face in self.faces]
+            positions = []
+            for face in self.faces:
+                corner = face[number_in_face]
+                positions.append(self.corners[corner])
             return np.array(positions, dtype=np.float64)
 
         # Seen from outside, the corners of a face turn clockwise in Abaqus, so that the tangent to

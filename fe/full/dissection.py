@@ -72,8 +72,10 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
         cumulative = np.cumsum(weight[order])
         for fraction in CUT_FRACTIONS:
             # cut each part where this fraction of its weight is reached
-            cut_node = order[np.searchsorted(cumulative, weight_before + fraction * total_weight)]
-            is_above = coordinate > coordinate[cut_node][part]
+            weight_at_cut = weight_before + fraction * total_weight
+            cut_vertex = order[np.searchsorted(cumulative, weight_at_cut)]
+            cut_coordinate = coordinate[cut_vertex]
+            is_above = coordinate > cut_coordinate[part]
             first_is_above, second_is_above = is_above[edges]
             crossing_edges = edges[:, first_is_above != second_is_above]
             for half in (True, False):  # the vertices on either side of the cut separate the halves
@@ -113,12 +115,15 @@ def _cut_costs(
     (parts,) array
         The weight of the separator, increased if the halves are uneven.
     """
+    in_upper_half = is_above & ~on_cut
     separator_weight = np.bincount(part, weights=weight * on_cut)
-    above = np.bincount(part, weights=weight * (is_above & ~on_cut))
-    below = total - separator_weight - above
-    imbalance = (above - below) / total
+    upper_weight = np.bincount(part, weights=weight * in_upper_half)
+    lower_weight = total - separator_weight - upper_weight
+    imbalance = (upper_weight - lower_weight) / total
     cost = separator_weight * (1.0 + _IMBALANCE_WEIGHT * imbalance**2)
-    cost[np.maximum(above, below) > LARGEST_HALF * total] = np.inf
+    larger_half = np.maximum(upper_weight, lower_weight)
+    is_too_uneven = larger_half > LARGEST_HALF * total
+    cost[is_too_uneven] = np.inf
     return np.asarray(cost)
 
 
@@ -134,7 +139,11 @@ def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
 
     def distance_from(sources: IntArray) -> FloatArray:
         distance = csgraph.dijkstra(
-            graph, directed=False, unweighted=True, indices=sources, min_only=True
+            graph,
+            directed=False,
+            unweighted=True,
+            indices=sources,
+            min_only=True,
         )
         is_connected = np.isfinite(distance)
         # a component that is not connected with the sources counts as the most distant
@@ -143,7 +152,8 @@ def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
 
     def most_distant_of_each_part(distance: FloatArray) -> IntArray:
         order = np.lexsort((-distance, part))
-        is_first_of_part = np.concatenate(([True], np.diff(part[order]) != 0))
+        changes_part = np.diff(part[order]) != 0
+        is_first_of_part = np.concatenate(([True], changes_part))
         return np.asarray(order[is_first_of_part])
 
     # an end is the vertex most distant from a vertex that is itself distant
@@ -193,31 +203,38 @@ def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight:
         The first position, in the order of elimination, of the leaf or separator of each vertex.
     """
     size = graph.shape[0]
+    # edges from the upper triangle of the symmetric pattern
     entries = graph.tocoo()
     is_upper = entries.row < entries.col
     edges = np.stack((entries.row[is_upper], entries.col[is_upper])).astype(np.int64)
     position = np.zeros(size, dtype=np.int64)
     # the whole graph is the first part
-    parts = _Parts(np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64))
+    parts = _Parts(
+        starts=np.zeros(1, dtype=np.int64),
+        vertices=np.arange(size),
+        part=np.zeros(size, dtype=np.int64),
+    )
     while True:
         parts = _heavy_parts(parts, weight, leaf_weight)
-        if not len(parts.vertices):
+        vertex_count = len(parts.vertices)
+        if not vertex_count:
             return position
-        # keep the edges inside parts, and number the vertices anew
-        index = np.full(size, -1)
-        index[parts.vertices] = np.arange(len(parts.vertices))
-        in_parts = (index[edges] >= 0).all(axis=0)
+        # number the vertices of these parts anew
+        new_number = np.full(size, -1)
+        new_number[parts.vertices] = np.arange(vertex_count)
+        # keep the edges inside parts
+        in_parts = (new_number[edges] >= 0).all(axis=0)
         first_position, second_position = position[edges]
-        edges = edges[:, in_parts & (first_position == second_position)]
-        cuts = best_cuts(parts.part, weight[parts.vertices], index[edges])
+        in_one_part = in_parts & (first_position == second_position)
+        edges = edges[:, in_one_part]
+        cuts = best_cuts(parts.part, weight[parts.vertices], new_number[edges])
         parts = _halves(parts, cuts, position)
 
 
 def _heavy_parts(parts: _Parts, weight: FloatArray, leaf_weight: float) -> _Parts:
     """Return the parts that are heavier than a leaf."""
-    part_weight = np.bincount(
-        parts.part, weights=weight[parts.vertices], minlength=len(parts.starts)
-    )
+    part_count = len(parts.starts)
+    part_weight = np.bincount(parts.part, weights=weight[parts.vertices], minlength=part_count)
     is_heavy = part_weight > leaf_weight
     in_heavy_part = is_heavy[parts.part]
     new_number = np.cumsum(is_heavy) - 1
@@ -245,9 +262,11 @@ def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
     vertices = parts.vertices[in_cut_part]
     new_number = np.cumsum(cuts.is_cut) - 1
     block_in_part = np.where(cuts.separator, _SEPARATOR, cuts.side)
-    block = (_BLOCKS * new_number[parts.part] + block_in_part)[in_cut_part]
+    first_block = _BLOCKS * new_number[parts.part]
+    block = (first_block + block_in_part)[in_cut_part]
     # the blocks of a part follow one another from its start
-    block_count = _BLOCKS * int(cuts.is_cut.sum())
+    cut_count = int(cuts.is_cut.sum())
+    block_count = _BLOCKS * cut_count
     count = np.bincount(block, minlength=block_count).reshape(-1, _BLOCKS)
     count_before = np.cumsum(count, axis=1) - count
     block_starts = parts.starts[cuts.is_cut, np.newaxis] + count_before

@@ -110,17 +110,21 @@ class Factorisation:
     """
 
     def __init__(self, stiffness: sparse.sparray) -> None:
-        self.stiffness = matrix = stiffness.tocsr()
-        if matrix.shape[0] == 0:
+        matrix = stiffness.tocsr()
+        self.stiffness = matrix
+        size = matrix.shape[0]
+        if size == 0:
             raise SolutionError(
                 "The structure has no free unknown: all its nodes are held. Hold fewer of them."
             )
         if not np.all(matrix.diagonal() > 0.0):
             self._refuse("it has a diagonal entry that is not positive")
+        row_starts = matrix.indptr.astype(np.int32)
+        columns = matrix.indices.astype(np.int32)
         self._order, self._fronts = _analysed_pattern(
-            matrix.shape[0],
-            matrix.indptr.astype(np.int32).tobytes(),
-            matrix.indices.astype(np.int32).tobytes(),
+            size,
+            row_starts.tobytes(),
+            columns.tobytes(),
         )
         self._factors: list[_FrontFactor] = []
         with _threads().limit(limits=1):
@@ -142,29 +146,41 @@ class Factorisation:
         row_in_front = np.empty(size, dtype=np.int64)  # from positions to rows of the present front
         waiting: list[list[_SchurComplement]] = [[] for _ in self._fronts]
         for front, contributions in zip(self._fronts, waiting, strict=True):
-            pivots = front.end - front.start
-            row_in_front[front.start : front.end] = np.arange(pivots)
-            row_in_front[front.boundary] = pivots + np.arange(len(front.boundary))
+            pivot_count = front.end - front.start
+            boundary_count = len(front.boundary)
+            row_in_front[front.start : front.end] = np.arange(pivot_count)
+            row_in_front[front.boundary] = pivot_count + np.arange(boundary_count)
             # assemble the front, right of its diagonal: transposed, that is LAPACK's lower half
             pivot_rows = _assembled_pivot_rows(front, rows, columns, row_in_front)
-            remaining = np.zeros((len(front.boundary), len(front.boundary)))
-            while contributions:  # popped, so that each is freed as soon as it is added
-                _extend_add(pivot_rows, remaining, contributions.pop(), row_in_front)
+            remaining = np.zeros((boundary_count, boundary_count))
+            while contributions:
+                contribution = contributions.pop()  # popped, so that it is freed after its addition
+                _extend_add(pivot_rows, remaining, contribution, row_in_front)
             # factorise the pivots
-            diagonal = np.ascontiguousarray(pivot_rows[:, :pivots])
-            coupling = np.ascontiguousarray(pivot_rows[:, pivots:])
-            lower, failed = lapack.dpotrf(diagonal.T, lower=1, overwrite_a=1, clean=0)
-            if failed:
-                failed_unknown = self._order[front.start + failed - 1]
-                self._refuse(f"unknown {failed_unknown} is left without a positive pivot")
-            below = coupling.T
-            if len(front.boundary):
-                below = blas.dtrsm(1.0, lower, below, side=1, lower=1, trans_a=1, overwrite_b=1)
-                complement = blas.dsyrk(
-                    -1.0, below, beta=1.0, c=remaining.T, lower=1, overwrite_c=1
-                )
-                waiting[front.parent].append(_SchurComplement(front.boundary, complement.T))
+            diagonal = np.ascontiguousarray(pivot_rows[:, :pivot_count])
+            coupling = np.ascontiguousarray(pivot_rows[:, pivot_count:])
+            lower = self._factorise_pivots(front, diagonal)
+            if boundary_count:
+                below = _below_pivots(lower, coupling)
+                complement = _schur_complement(remaining, below)
+                waiting[front.parent].append(_SchurComplement(front.boundary, complement))
+            else:
+                below = coupling.T
             self._factors.append(_FrontFactor(lower, below))
+
+    def _factorise_pivots(self, front: Front, pivot_block: FloatArray) -> FloatArray:
+        """Return the Cholesky factor (p, p) of the pivots of a front; overwrites their block."""
+        lower, failed = lapack.dpotrf(
+            pivot_block.T,
+            lower=1,
+            overwrite_a=1,
+            clean=0,
+        )
+        if failed:
+            # LAPACK counts the failed pivot from one
+            failed_unknown = self._order[front.start + failed - 1]
+            self._refuse(f"unknown {failed_unknown} is left without a positive pivot")
+        return np.asarray(lower)
 
     def riesz(self, right_hand_side: FloatArray) -> FloatArray:
         """Return the Riesz representative X^-1 f (n,) or (n, k), its residual unchecked."""
@@ -183,7 +199,8 @@ class Factorisation:
         (n,) or (n, k) array
             L^-1 f in the order of elimination.
         """
-        solution = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
+        ordered_loads = right_hand_side[self._order]
+        solution = np.array(ordered_loads, dtype=np.float64, order="C")
         values = solution.reshape(len(solution), -1)
         with _threads().limit(limits=1):
             for front, factor in zip(self._fronts, self._factors, strict=True):
@@ -208,8 +225,10 @@ class Factorisation:
         """
         ordered_values = np.array(whitened, dtype=np.float64, order="C")
         values = ordered_values.reshape(len(ordered_values), -1)
+        last_fronts_first = self._fronts[::-1]
+        last_factors_first = self._factors[::-1]
         with _threads().limit(limits=1):
-            for front, factor in zip(self._fronts[::-1], self._factors[::-1], strict=True):
+            for front, factor in zip(last_fronts_first, last_factors_first, strict=True):
                 pivots = values[front.start : front.end]
                 if len(front.boundary):
                     pivots -= factor.below.T @ values[front.boundary]
@@ -237,13 +256,13 @@ class Factorisation:
             If the backward error exceeds `BACKWARD_ERROR_LIMIT`, or refinement still changes the
             solution by more than `CORRECTION_LIMIT`.
         """
-        solution = self.riesz(right_hand_side)
-        correction = self.riesz(right_hand_side - self.stiffness @ solution)
-        solution = solution + correction
+        first_solution = self.riesz(right_hand_side)
+        residual = right_hand_side - self.stiffness @ first_solution
+        correction = self.riesz(residual)
+        solution = first_solution + correction
         error = self.backward_error(solution, right_hand_side)
-        length = max(
-            float(np.linalg.norm(solution)), 1e-300
-        )  # a zero load has no solution to scale
+        # under a zero load the solution has no length to scale with
+        length = max(float(np.linalg.norm(solution)), 1e-300)
         change = float(np.linalg.norm(correction)) / length
         is_accurate = error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT
         if not is_accurate:
@@ -259,9 +278,13 @@ class Factorisation:
         """Return the backward error max|b - K u| / (|K| max|u| + max|b|), zero for a zero load."""
         largest_row = float(norm(self.stiffness, np.inf))
         largest_load = float(np.abs(right_hand_side).max())
-        scale = largest_row * float(np.abs(solution).max()) + largest_load
-        residual = float(np.abs(right_hand_side - self.stiffness @ solution).max())
-        return residual / scale if scale > 0.0 else residual
+        largest_displacement = float(np.abs(solution).max())
+        scale = largest_row * largest_displacement + largest_load
+        residual = right_hand_side - self.stiffness @ solution
+        largest_residual = float(np.abs(residual).max())
+        if scale > 0.0:
+            return largest_residual / scale
+        return largest_residual
 
 
 def _assembled_pivot_rows(
@@ -294,6 +317,59 @@ def _assembled_pivot_rows(
     return pivot_rows
 
 
+def _below_pivots(lower: FloatArray, coupling: FloatArray) -> FloatArray:
+    """Return the rows below the pivots in a Cholesky factor: B with B L' = A.
+
+    Parameters
+    ----------
+    lower : (p, p) array
+        The factor L of the pivots, in its lower triangle.
+    coupling : (p, b) array
+        The coupling A' of the pivots with the boundary; it is overwritten.
+
+    Returns
+    -------
+    (b, p) array
+        The rows B.
+    """
+    below = blas.dtrsm(
+        1.0,
+        lower,
+        coupling.T,
+        side=1,
+        lower=1,
+        trans_a=1,
+        overwrite_b=1,
+    )
+    return np.asarray(below)
+
+
+def _schur_complement(remaining: FloatArray, below: FloatArray) -> FloatArray:
+    """Return the Schur complement S - B B' on the boundary of a front, right of its diagonal.
+
+    Parameters
+    ----------
+    remaining : (b, b) array
+        The block S of the boundary before the elimination; it is overwritten.
+    below : (b, p) array
+        The rows B of the boundary in the Cholesky factor.
+
+    Returns
+    -------
+    (b, b) array
+        The complement.
+    """
+    complement = blas.dsyrk(
+        -1.0,
+        below,
+        beta=1.0,
+        c=remaining.T,
+        lower=1,
+        overwrite_c=1,
+    )
+    return np.asarray(complement.T)
+
+
 def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> None:
     """Solve L x = v, or L' x = v, in place for contiguous values (m, k)."""
     row_count, column_count = values.shape
@@ -302,7 +378,14 @@ def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> N
         column[:] = blas.dtrsv(lower, column, lower=1, trans=int(transposed))
     else:
         # BLAS takes the transpose of C-ordered values without a copy: x' L' = v'.
-        solution = blas.dtrsm(1.0, lower, values.T, side=1, lower=1, trans_a=int(not transposed))
+        solution = blas.dtrsm(
+            1.0,
+            lower,
+            values.T,
+            side=1,
+            lower=1,
+            trans_a=int(not transposed),
+        )
         values[:] = solution.T
 
 
@@ -340,9 +423,11 @@ def most_compliant_modes(load: FloatArray, squares: FloatArray, shapes: FloatArr
     (2,) array of int
         Numbers of the modes, ascending.
     """
-    compliance = (load @ shapes) ** 2 / squares
+    modal_force = load @ shapes
+    compliance = modal_force**2 / squares
     ascending = np.argsort(compliance)
-    return np.asarray(np.sort(ascending[-2:]))
+    most_compliant = ascending[-2:]
+    return np.asarray(np.sort(most_compliant))
 
 
 def lowest_eigenpairs(
@@ -396,7 +481,9 @@ def _check_modes(
     """Raise `SolutionError` if the residual of a mode exceeds `MODE_RESIDUAL_LIMIT`."""
     largest_row = float(norm(stiffness, np.inf))
     scale = largest_row * np.abs(shapes).max(axis=0)
-    imbalance = stiffness @ shapes - (mass @ shapes) * squares
+    elastic_force = stiffness @ shapes
+    inertia_force = (mass @ shapes) * squares
+    imbalance = elastic_force - inertia_force
     residual = np.abs(imbalance).max(axis=0) / scale
     is_accurate = residual.max() <= MODE_RESIDUAL_LIMIT
     if not is_accurate:

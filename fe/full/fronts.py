@@ -55,25 +55,27 @@ def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
     # unknowns with equal rows, such as those of a node, are ordered as one group
     representatives, group_of_unknown = _groups_of_equal_rows(matrix)
     graph = matrix[representatives][:, representatives]
-    sizes = np.bincount(group_of_unknown)
-    block = elimination_blocks(graph, sizes.astype(np.float64), LEAF_UNKNOWNS)
-    order = np.argsort(block, kind="stable")
+    group_sizes = np.bincount(group_of_unknown)
+    group_weights = group_sizes.astype(np.float64)
+    block = elimination_blocks(graph, group_weights, LEAF_UNKNOWNS)
+    group_order = np.argsort(block, kind="stable")
     block_starts = np.unique(block)
-    position = np.empty(len(order), dtype=np.int64)
-    position[order] = np.arange(len(order))
+    group_position = np.empty(len(group_order), dtype=np.int64)
+    group_position[group_order] = np.arange(len(group_order))
     # from positions of groups to positions of unknowns
-    sizes = sizes[order]
+    sizes = group_sizes[group_order]
     offsets = np.concatenate(([0], np.cumsum(sizes)))
-    fronts = tuple(
-        Front(
-            start=int(offsets[front.start]),
-            end=int(offsets[front.end]),
-            boundary=_positions_of_unknowns(front.boundary, sizes, offsets),
-            parent=front.parent,
+    fronts = []
+    for group_front in _fronts_of_groups(graph[group_order], group_position, block_starts):
+        front = Front(
+            start=int(offsets[group_front.start]),
+            end=int(offsets[group_front.end]),
+            boundary=_positions_of_unknowns(group_front.boundary, sizes, offsets),
+            parent=group_front.parent,
         )
-        for front in _fronts_of_groups(graph[order], position, block_starts)
-    )
-    return np.argsort(position[group_of_unknown], kind="stable"), fronts
+        fronts.append(front)
+    order = np.argsort(group_position[group_of_unknown], kind="stable")
+    return order, tuple(fronts)
 
 
 def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
@@ -89,9 +91,16 @@ def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]
     group : (n,) array of int
         The group of each unknown.
     """
-    keys = np.random.default_rng(1973).integers(2**63, size=matrix.shape[0], dtype=np.int64)
-    sums = np.add.reduceat(keys[matrix.indices], matrix.indptr[:-1])
-    _, representatives, group = np.unique(sums, return_index=True, return_inverse=True)
+    random_numbers = np.random.default_rng(1973)
+    column_keys = random_numbers.integers(2**63, size=matrix.shape[0], dtype=np.int64)
+    key_of_entry = column_keys[matrix.indices]
+    row_starts = matrix.indptr[:-1]
+    row_sums = np.add.reduceat(key_of_entry, row_starts)
+    _, representatives, group = np.unique(
+        row_sums,
+        return_index=True,
+        return_inverse=True,
+    )
     return representatives.astype(np.int64), group.astype(np.int64)
 
 
@@ -110,17 +119,24 @@ def _fronts_of_groups(
         The first position of each front.
     """
     ends = np.append(starts[1:], graph.shape[0])
-    front_of_position = np.repeat(np.arange(len(starts)), ends - starts)
+    front_numbers = np.arange(len(starts))
+    front_of_position = np.repeat(front_numbers, ends - starts)
     coupled_positions = position[graph.indices]
     boundaries_of_children: list[list[IntArray]] = [[] for _ in starts]
     for start, end, child_boundaries in zip(
         starts.tolist(), ends.tolist(), boundaries_of_children, strict=True
     ):
-        coupled = coupled_positions[graph.indptr[start] : graph.indptr[end]]
-        positions = np.unique(np.concatenate((coupled, *child_boundaries)))
-        boundary = positions[np.searchsorted(positions, end) :]
-        parent = int(front_of_position[boundary[0]]) if len(boundary) else -1
-        if parent >= 0:
+        # a front is coupled to what its rows and the boundaries of its children hold
+        first_entry = graph.indptr[start]
+        last_entry = graph.indptr[end]
+        coupled_by_rows = coupled_positions[first_entry:last_entry]
+        coupled = np.unique(np.concatenate((coupled_by_rows, *child_boundaries)))
+        first_later = np.searchsorted(coupled, end)
+        boundary = coupled[first_later:]
+        # the parent is the front that eliminates the first position of the boundary
+        parent = -1
+        if len(boundary):
+            parent = int(front_of_position[boundary[0]])
             boundaries_of_children[parent].append(boundary)
         yield Front(start, end, boundary, parent)
 

@@ -41,8 +41,11 @@ def affine_product(
     (n, k) array
         The products.
     """
-    products = (factor * (term @ vectors) for term, factor in zip(terms, coefficients, strict=True))
-    return np.asarray(sum(products))
+    total: FloatArray = np.zeros_like(vectors)
+    for term, coefficient in zip(terms, coefficients, strict=True):
+        product = coefficient * (term @ vectors)
+        total = total + product
+    return total
 
 
 def project_terms(terms: FloatArray, directions: FloatArray) -> FloatArray:
@@ -142,20 +145,29 @@ class OrthonormalBasis:
     def extend(self, block: FloatArray) -> FloatArray:
         """Add vectors (n, m) to the basis; return their coordinates (k, m) in it."""
         length = np.linalg.norm(block, axis=0)
-        outside = block / np.where(length > 0.0, length, 1.0)
+        divisor = np.where(length > 0.0, length, 1.0)
+        outside = block / divisor
         # classical Gram-Schmidt, twice: the second pass removes what rounding left
-        coordinates_inside = np.zeros((self.vectors.shape[1], len(length)))
+        basis_size = self.vectors.shape[1]
+        coordinates_inside = np.zeros((basis_size, len(length)))
         for _ in range(2):
             projection = self.vectors.T @ outside
             outside -= self.vectors @ projection
             coordinates_inside += projection
         # rank-revealing factorisation of the component outside the basis
-        directions, triangle, order = qr(outside, mode="economic", pivoting=True, overwrite_a=True)
+        directions, triangle, order = qr(
+            outside,
+            mode="economic",
+            pivoting=True,
+            overwrite_a=True,
+        )
         is_new = np.linalg.norm(triangle, axis=1) > self._drop
         coordinates_outside = np.empty_like(triangle)
         coordinates_outside[:, order] = triangle * length[order]
-        self.dropped_square += float(np.sum(coordinates_outside[~is_new] ** 2))
-        self.vectors = np.concatenate((self.vectors, directions[:, is_new]), axis=1)
+        dropped = coordinates_outside[~is_new]
+        self.dropped_square += float(np.sum(dropped**2))
+        new_directions = directions[:, is_new]
+        self.vectors = np.concatenate((self.vectors, new_directions), axis=1)
         return np.concatenate((coordinates_inside * length, coordinates_outside[is_new]))
 
 

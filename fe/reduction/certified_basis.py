@@ -188,14 +188,17 @@ class StaticReduction:
         previous_size = self.residuals.vectors.shape[1]
         whitened = self.terms.factors.whitened(np.concatenate(images, axis=1))
         coordinates = self.residuals.extend(whitened)
+        # corrections of the outputs by the dual solutions
         new_vectors = self.residuals.vectors[:, previous_size:]
         new_correction = self.duals.functions @ new_vectors
         self.dual_correction = np.concatenate((self.dual_correction, new_correction), axis=3)
-        # Loads and previous images have no component along the new vectors.
-        no_rows = (0, len(coordinates) - previous_size)
-        self.residual_load = np.pad(self.residual_load, (no_rows, (0, 0)))
-        previous_stiffness = np.pad(self.residual_stiffness, (no_rows, (0, 0), (0, 0)))
-        new_stiffness = coordinates.reshape(len(coordinates), len(images), -1)
+        # loads and previous images have no component along the new vectors
+        size = len(coordinates)
+        new_rows = (0, size - previous_size)
+        unchanged = (0, 0)
+        self.residual_load = np.pad(self.residual_load, (new_rows, unchanged))
+        previous_stiffness = np.pad(self.residual_stiffness, (new_rows, unchanged, unchanged))
+        new_stiffness = coordinates.reshape(size, len(images), -1)
         self.residual_stiffness = np.concatenate((previous_stiffness, new_stiffness), axis=2)
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
@@ -208,11 +211,13 @@ class StaticReduction:
         """Return the relative difference of outputs between full and projected solutions (n, L)."""
         outputs = np.abs(self.outputs.T @ solutions)
         difference = np.abs(self.outputs.T @ (projected - solutions))
-        relative = [
-            difference[group].max(axis=0) / np.maximum(outputs[group].max(axis=0), least)
-            for group, least in zip(self.terms.groups, self.least_outputs, strict=True)
-        ]
-        return float(np.max(relative))
+        relative_differences = []
+        for group, least_output in zip(self.terms.groups, self.least_outputs, strict=True):
+            largest_output = outputs[group].max(axis=0)
+            largest_difference = difference[group].max(axis=0)
+            scale = np.maximum(largest_output, least_output)
+            relative_differences.append(largest_difference / scale)
+        return float(np.max(relative_differences))
 
     def model(self, directions: FloatArray | None = None) -> ReducedModel:
         """Return the reduced model on the present basis, or on combinations of its vectors.
@@ -366,10 +371,12 @@ class StaticReduction:
             is_last = not (has_grown and remaining)
             inspect_all = is_last or not history
             bounds = self._training_bounds(states, latest, target, inspect_all=inspect_all)
-            history.append(float(bounds.max()))
-            if is_last or history[-1] <= target:
+            largest_bound = float(bounds.max())
+            history.append(largest_bound)
+            if is_last or largest_bound <= target:
                 break
-            next_states = _next_states(points, bounds, min(STATES_PER_ROUND, remaining), target)
+            state_count = min(STATES_PER_ROUND, remaining)
+            next_states = _next_states(points, bounds, state_count, target)
         self._check_bound(history[-1], settings)
         return tuple(history)
 
@@ -435,8 +442,10 @@ class StaticReduction:
 def _most_central(states: list[State]) -> State:
     """Return the state closest to the mean of all states, at which the search begins."""
     points = np.array(states)
-    distance_square = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
-    return states[int(distance_square.argmin())]
+    from_mean = points - points.mean(axis=0)
+    squared_distance = (from_mean**2).sum(axis=1)
+    most_central = int(squared_distance.argmin())
+    return states[most_central]
 
 
 def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
@@ -460,7 +469,8 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
         bound and its distance from the nearest state chosen before.
     """
     # Distances are relative to the range of each input; one without a range counts as constant.
-    scaled_states = states / np.maximum(np.ptp(states, axis=0), 1e-300)
+    ranges = np.ptp(states, axis=0)
+    scaled_states = states / np.maximum(ranges, 1e-300)
     chosen_numbers = [int(bounds.argmax())]
     distance_from_nearest = np.full(len(states), np.inf)
     while len(chosen_numbers) < count:

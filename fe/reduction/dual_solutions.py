@@ -148,13 +148,19 @@ def _project_batch(
     displacements : (n, b, M) array
         The directions of each output as displacements.
     """
-    size, count = outputs.shape
+    size, output_count = outputs.shape
     flat = displacements.reshape(size, -1)
-    images = np.stack([(term @ flat).reshape(size, count, -1) for term in terms.stiffness_terms])
+    # the images of all directions under each stiffness term
+    images_of_terms = []
+    for term in terms.stiffness_terms:
+        flat_images = term @ flat
+        images_of_terms.append(flat_images.reshape(size, output_count, -1))
+    images = np.stack(images_of_terms)
     projected_terms = np.einsum("nom,tnok->otmk", displacements, images, optimize=True)
     # the images as whitened forces, all terms of an output side by side
-    forces = terms.factors.whitened(np.moveaxis(images, 0, 2).reshape(size, -1))
-    forces_by_output = forces.reshape(size, count, -1).swapaxes(0, 1)
+    terms_side_by_side = np.moveaxis(images, 0, 2)
+    forces = terms.factors.whitened(terms_side_by_side.reshape(size, -1))
+    forces_by_output = forces.reshape(size, output_count, -1).swapaxes(0, 1)
     projections = []
     for output, projected, force in zip(outputs.T, projected_terms, forces_by_output, strict=True):
         # A dropped direction is zero; a one on its diagonal keeps the system solvable. It is added
@@ -185,5 +191,8 @@ def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
         The factor R, and a last row that adds what rounding may have made of the residual.
     """
     columns = np.column_stack((output, force))
-    allowance = LEAST_DUAL_RESIDUAL * np.linalg.norm(output) * np.eye(1, columns.shape[1])
-    return np.concatenate((np.linalg.qr(columns, mode="r"), allowance))
+    factor = np.linalg.qr(columns, mode="r")
+    # the combination has a one at the output, the first column
+    first_column = np.eye(1, columns.shape[1])
+    allowance = LEAST_DUAL_RESIDUAL * np.linalg.norm(output) * first_column
+    return np.concatenate((factor, allowance))

@@ -179,8 +179,11 @@ def _davidson_corrections(
     projected_shapes = np.concatenate([mode_shapes for _, mode_shapes in modes], axis=1)
     shapes = working.displacements @ projected_shapes
     # coefficients of the affine terms of K (T, S M) and of M, one column for each mode
-    stiffness = np.repeat([state.stiffness for state in states], mode_count, axis=0).T
-    mass = np.repeat([state.mass for state in states], mode_count, axis=0).T
+    stiffness_of_states = [state.stiffness for state in states]
+    mass_of_states = [state.mass for state in states]
+    stiffness = np.repeat(stiffness_of_states, mode_count, axis=0).T
+    mass = np.repeat(mass_of_states, mode_count, axis=0).T
+    # residuals (K - omega^2 M) phi
     residuals = affine_product(terms.stiffness_terms, stiffness, shapes)
     residuals -= affine_product(terms.structure.mass_terms, mass * squared_frequencies, shapes)
     corrections = working.factors.whitened(residuals)
@@ -210,9 +213,14 @@ def _compressed_directions(
     def keeps_frequencies(directions: FloatArray) -> bool:
         stiffness = project_terms(working.stiffness, directions)
         mass = project_terms(working.mass, directions)
-        compressed = [projected_modes(stiffness, mass, state, count)[0] for state in states]
-        largest_ratio = np.max(np.array(compressed) / squares)
-        return bool(0.5 * (largest_ratio - 1.0) <= FREQUENCY_TOLERANCE)
+        compressed_squares = []
+        for state in states:
+            state_squares, _ = projected_modes(stiffness, mass, state, count)
+            compressed_squares.append(state_squares)
+        largest_ratio = np.max(np.array(compressed_squares) / squares)
+        # half the error of the square, for small errors
+        largest_error = 0.5 * (largest_ratio - 1.0)
+        return bool(largest_error <= FREQUENCY_TOLERANCE)
 
     # The error falls with the number of directions, because the spaces are nested.
     return fewest_directions(shapes, count, keeps_frequencies)

@@ -123,7 +123,8 @@ def _working_basis(full_model: PatchOperators) -> FloatArray:
     gram = snapshots.T @ (full_model.operators.stiffness() @ snapshots)
     squares, vectors = np.linalg.eigh(gram)
     is_large = squares > WORKING_TOLERANCE * squares[-1]
-    return np.asarray(snapshots @ (vectors[:, is_large] / np.sqrt(squares[is_large])))
+    coordinates = vectors[:, is_large] / np.sqrt(squares[is_large])
+    return np.asarray(snapshots @ coordinates)
 
 
 def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
@@ -140,13 +141,18 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
     health = dict.fromkeys(operators.regions, loss)
     factors = Factorisation(operators.stiffness(None, health))
     frequency, modes = natural_frequencies(operators, MODES, health, factors)
-    # solutions under loads, of unit energy, and modes
-    whitened = factors.whitened(_snapshot_loads(full_model, modes).T)
-    responses = factors.unwhitened(whitened / np.linalg.norm(whitened, axis=0))
-    solutions = np.concatenate((responses, modes / (2.0 * np.pi * frequency)), axis=1)
+    # solutions under loads, and modes, all of the same energy norm
+    loads = _snapshot_loads(full_model, modes).T
+    whitened_loads = factors.whitened(loads)
+    dual_norm = np.linalg.norm(whitened_loads, axis=0)
+    responses = factors.unwhitened(whitened_loads / dual_norm)
+    angular_frequency = 2.0 * np.pi * frequency
+    unit_modes = modes / angular_frequency
+    solutions = np.concatenate((responses, unit_modes), axis=1)
     # solutions under the forces that each part of the skin takes in these solutions
     skin_forces = np.concatenate(_skin_forces(full_model, solutions), axis=1)
-    return np.concatenate((solutions, factors.riesz(skin_forces)), axis=1)
+    skin_responses = factors.riesz(skin_forces)
+    return np.concatenate((solutions, skin_responses), axis=1)
 
 
 def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray:
@@ -211,11 +217,14 @@ def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[Floa
     edges = layout["strip_lines"]
     strip_middles = 0.5 * (edges[1:] + edges[:-1])
     part_middles = strip_middles[layout["strip_of"], np.newaxis]
-    is_near = np.abs(gauge_stations - part_middles) < NEAR_GAUGE * np.diff(edges).max()
-    return [
-        strip @ np.concatenate((main_solutions, of_gauges[:, near_gauges]), axis=1)
-        for strip, near_gauges in zip(full_model.strips, is_near, strict=True)
-    ]
+    widest_strip = np.diff(edges).max()
+    distance = np.abs(gauge_stations - part_middles)
+    is_near = distance < NEAR_GAUGE * widest_strip
+    forces = []
+    for part, near_gauges in zip(full_model.strips, is_near, strict=True):
+        part_solutions = np.concatenate((main_solutions, of_gauges[:, near_gauges]), axis=1)
+        forces.append(part @ part_solutions)
+    return forces
 
 
 def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
@@ -237,7 +246,6 @@ def project(full_model: PatchOperators, basis: FloatArray) -> PatchArrays:
         The basis.
     """
     operators = full_model.operators
-    lower = np.tril_indices(basis.shape[1])
     stiffness = np.stack([_projected(term.matrix, basis) for term in operators.stiffness_terms])
     mass = np.stack([_projected(term, basis) for term in operators.mass_terms])
     load_tip = np.asarray(operators.load_tip @ basis)
@@ -245,23 +253,31 @@ def project(full_model: PatchOperators, basis: FloatArray) -> PatchArrays:
     # the wing as it was
     nominal_stiffness = stiffness.sum(axis=0)
     nominal_mass = np.tensordot((1.0, *operators.masses.values()), mass, 1)
+    # its lowest modes, with an upward motion of the tip
     _, shapes = eigh(nominal_stiffness, nominal_mass, subset_by_index=[0, START_SHAPES - 1])
+    moves_down = tip_row @ shapes < 0.0
+    upward_shapes = shapes * np.where(moves_down, -1.0, 1.0)
+    # its compliance under a force at the tip, as a compliance of the root in rotation
     tip_compliance = float(load_tip @ np.linalg.solve(nominal_stiffness, load_tip))
+    squared_arm = full_model.layout["load_place"] ** 2
+    largest_compliance = COMPLIANCE_FRACTION * tip_compliance / squared_arm
+    # stiffness of the strips, as lower triangles
+    lower = np.tril_indices(basis.shape[1])
+    strips = []
+    for strip in full_model.strips:
+        triangle = _projected(strip, basis)[lower]
+        strips.append(triangle.astype(np.float32))
     return PatchArrays(
         design_hash=operators.design_hash,
         regions=operators.regions,
         validity_box=np.array(list(operators.ranges.values())),
         largest_loss=LARGEST_LOSS,
-        largest_compliance=COMPLIANCE_FRACTION
-        * tip_compliance
-        / full_model.layout["load_place"] ** 2,
+        largest_compliance=largest_compliance,
         largest_mass=LARGEST_MASS,
         stiffness=stiffness,
         mass=mass,
-        strip_stiffness=np.stack(
-            [_projected(strip, basis)[lower].astype(np.float32) for strip in full_model.strips]
-        ),
-        start_shapes=_unit_columns(shapes * np.where(tip_row @ shapes < 0.0, -1.0, 1.0)),
+        strip_stiffness=np.stack(strips),
+        start_shapes=_unit_columns(upward_shapes),
         flap_row=np.asarray(full_model.flap_row @ basis),
         line_rows=np.stack([rows @ basis for rows in full_model.line_rows.stacked]),
         load_tip=load_tip,
@@ -305,9 +321,11 @@ def _kept_directions(arrays: PatchArrays) -> FloatArray:
     for number, state_fractions in enumerate(fractions):
         is_unchanged = number == 0
         structure = _patched_state(wing, state_fractions, unchanged=is_unchanged)
-        solutions = _unit_columns(structure.static(loads.columns)) * loads.weights
-        modes = _unit_columns(structure.lowest_modes(MODES).shapes) * MODE_WEIGHTS
-        snapshots = np.concatenate((solutions, modes), axis=1)
+        solutions = structure.static(loads.columns)
+        modes = structure.lowest_modes(MODES).shapes
+        weighted_solutions = _unit_columns(solutions) * loads.weights
+        weighted_modes = _unit_columns(modes) * MODE_WEIGHTS
+        snapshots = np.concatenate((weighted_solutions, weighted_modes), axis=1)
         weight = UNCHANGED_WEIGHT**2 if is_unchanged else 1.0
         outer_products += snapshots @ snapshots.T * weight
     first_kept = max(0, wing.size - BASIS_VECTORS)

@@ -264,7 +264,8 @@ def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _Relati
 def _random_values(model: ReducedModel, count: int, seed: int) -> FloatArray:
     """Return random values (count, V) in the validity box, under nominal or unit controls."""
     low, high = model.validity_box.T
-    fractions = np.random.default_rng(seed).random((count, len(low)))
+    generator = np.random.default_rng(seed)
+    fractions = generator.random((count, len(low)))
     vectors: FloatArray = low + (high - low) * fractions
     first_control = len(model.input_names) - len(model.controls)
     unit = np.clip(1.0, low, high)

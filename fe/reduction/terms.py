@@ -196,9 +196,14 @@ class ReductionTerms:
         """Set the outputs, and the groups of outputs that are judged by a common scale."""
         rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
         self.outputs: FloatArray = np.asarray(rows.T.toarray())
-        gauges = len(self.structure.gauges)
-        groups = (slice(0, gauges), slice(gauges, self.outputs.shape[1]))
-        self.groups = tuple(group for group in groups if group.stop > group.start)
+        output_count = self.outputs.shape[1]
+        gauge_count = len(self.structure.gauges)
+        groups = []
+        if gauge_count:
+            groups.append(slice(0, gauge_count))
+        if output_count > gauge_count:
+            groups.append(slice(gauge_count, output_count))
+        self.groups = tuple(groups)
 
     def _set_reference(self) -> None:
         """Set the middle of all ranges, and the losses that separate anchors."""
@@ -263,10 +268,14 @@ class ReductionTerms:
             Fractions of the ranges of parameters and losses; for losses see `loss_at`.
         """
         first_loss = len(self.parameters)
-        low, high = np.concatenate((self.parameters, self.losses)).T
+        ranges = np.concatenate((self.parameters, self.losses))
+        low, high = ranges.T
         values = low + (high - low) * fractions
-        values[:, first_loss:] = loss_at(self.losses, fractions[:, first_loss:])
-        return [tuple(state) for state in np.clip(values, low, high).tolist()]
+        loss_fractions = fractions[:, first_loss:]
+        values[:, first_loss:] = loss_at(self.losses, loss_fractions)
+        # rounding must not leave the ranges
+        values = np.clip(values, low, high)
+        return [tuple(state) for state in values.tolist()]
 
     def training_states(self) -> list[State]:
         """Return the states of the greedy search: corners of the box, and points inside it."""
@@ -297,21 +306,25 @@ class ReductionTerms:
         """
         all_mass_corners = itertools.product((0.0, 1.0), repeat=len(self.masses))
         mass_corners = list(itertools.islice(all_mass_corners, MOST_MASS_CORNERS))
-        pairs = itertools.product(cube_corners(self.varied), mass_corners)
-        fractions = [np.append(corner, masses) for corner, masses in pairs]
+        state_corners = cube_corners(self.varied)
+        fractions = []
+        for state_corner, mass_corner in itertools.product(state_corners, mass_corners):
+            fractions.append(np.append(state_corner, mass_corner))
         return self._modal_states(np.array(fractions), 4 * INNER_MODAL_STATES)
 
     def _modal_states(self, fractions: FloatArray, inner_count: int) -> list[ModalState]:
         """Return states at fractions of all ranges and masses, then `inner_count` states inside."""
+        # the first Halton point is the corner of zeros, which is no inner state
         inner_fractions = halton_points(fractions.shape[1], 1 + inner_count)[1:]
         fractions = np.concatenate((fractions, inner_fractions))
+        state_fractions, mass_fractions = np.split(fractions, [self.varied], axis=1)
         low, high = self.masses.T
-        masses = low + (high - low) * fractions[:, self.varied :]
-        states = self.states(fractions[:, : self.varied])
-        return [
-            ModalState(self.theta(state), np.append(1.0, kilograms))
-            for state, kilograms in zip(states, masses, strict=True)
-        ]
+        masses = low + (high - low) * mass_fractions
+        modal_states = []
+        for state, kilograms in zip(self.states(state_fractions), masses, strict=True):
+            mass_coefficients = np.append(1.0, kilograms)  # one for the mass that is always there
+            modal_states.append(ModalState(self.theta(state), mass_coefficients))
+        return modal_states
 
     def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
         """Return the least outputs to which errors are relative, see `LEAST_COSINE`.
@@ -333,14 +346,17 @@ class ReductionTerms:
         """
         coefficients = self._largest_load_coefficients()
         responses = np.abs(outputs.T @ loads)
+        load_norm = np.linalg.norm(loads, axis=0)
         least = []
         for group in self.groups:
             largest_output = np.linalg.norm(outputs[:, group], axis=0).max()
-            floor = LEAST_COSINE * (largest_output * np.linalg.norm(loads, axis=0))
+            floor = LEAST_COSINE * (largest_output * load_norm)
             largest_response = responses[group].max(axis=0)
+            # a load that the group hardly sees is compared with the responses to all loads
             largest_of_all = (largest_response * coefficients).max()
             floor_of_unseen = np.maximum(floor, UNSEEN_FRACTION * largest_of_all / coefficients)
-            least.append(np.where(largest_response < floor, floor_of_unseen, floor))
+            is_unseen = largest_response < floor
+            least.append(np.where(is_unseen, floor_of_unseen, floor))
         return np.array(least)
 
     def _largest_load_coefficients(self) -> FloatArray:

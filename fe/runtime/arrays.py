@@ -172,7 +172,7 @@ class StoredArrays:
             else:
                 self._check_shape(field, declared, lengths)
 
-    def _check_range(self, field: Field[Any], limits: tuple[str | int | float, ...]) -> None:
+    def _check_range(self, field: Field[object], limits: tuple[str | int | float, ...]) -> None:
         """Raise `ReducedModelFileError` unless a number lies between its declared limits."""
         value = getattr(self, field.name)
         low, high = map(float, limits)
@@ -183,7 +183,7 @@ class StoredArrays:
 
     def _check_shape(
         self,
-        field: Field[Any],
+        field: Field[object],
         axes: tuple[str | int | float, ...],
         lengths: dict[str, int],
     ) -> None:
@@ -297,7 +297,7 @@ class StoredArrays:
         return cls.from_bytes(Path(path).read_bytes(), str(path))
 
 
-def _value_from_array(field: Field[Any], arrays: Mapping[str, AnyArray]) -> Any:
+def _value_from_array(field: Field[object], arrays: Mapping[str, AnyArray]) -> Any:
     """Return the value of a field of a record: a number, text or names, or else the array itself.
 
     Raises
@@ -320,7 +320,7 @@ def _names_from_array(array: AnyArray) -> tuple[str, ...]:
     return tuple(array.tolist())
 
 
-_CONVERSIONS: Mapping[object, Callable[[AnyArray], Any]] = {
+_CONVERSIONS: Mapping[object, Callable[[AnyArray], object]] = {
     str: str,
     int: int,
     float: float,

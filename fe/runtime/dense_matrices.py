@@ -37,8 +37,14 @@ def lowest_modes(
     shape : (n, M) array
         Mass-normalised shapes.
     """
+    # the standard problem L^-1 M L^-T y = y / omega^2, where K = L L^T and x = L^-T y
     inverse_cholesky = np.linalg.inv(np.linalg.cholesky(stiffness))
-    inverse_squares, vectors = np.linalg.eigh(inverse_cholesky @ mass @ inverse_cholesky.T)
-    inverse_omega = np.sqrt(inverse_squares[::-1][:count])
+    standard_matrix = inverse_cholesky @ mass @ inverse_cholesky.T
+    inverse_squares, vectors = np.linalg.eigh(standard_matrix)
+    # from ascending to descending eigenvalues, the lowest modes first
+    descending_squares = inverse_squares[::-1]
+    descending_vectors = vectors[:, ::-1]
+    inverse_omega = np.sqrt(descending_squares[:count])
     frequency = 1.0 / (2.0 * np.pi * inverse_omega)
-    return frequency, inverse_cholesky.T @ vectors[:, ::-1][:, :count] / inverse_omega
+    shape = inverse_cholesky.T @ descending_vectors[:, :count] / inverse_omega
+    return frequency, shape

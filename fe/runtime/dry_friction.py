@@ -78,7 +78,9 @@ def port_acceleration(
     """
     acceleration = 0.0
     for m in range(len(q)):
-        modal = applied[m] - steps.stiffness[m] * (1.0 + ports.stiffness_rate * time) * q[m]
+        modal = applied[m]
+        for n in range(len(q)):
+            modal -= steps.stiffness[m, n] * (1.0 + ports.stiffness_rate * time) * q[n]
         for n in range(len(q)):
             modal -= steps.damping[m, n] * v[n]
         for i in range(len(forces)):

@@ -32,6 +32,10 @@ class InvalidPatchError(FiniteElementError, ValueError):
     """A model patch cannot be read, or the model cannot carry it."""
 
 
+class PlugInError(FiniteElementError, ImportError):
+    """What an installed package adds cannot be loaded, or does not fit."""
+
+
 class SolutionError(FiniteElementError, RuntimeError):
     """A linear or eigenvalue solution did not reach the accuracy that was asked for."""
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
 from types import CodeType
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -21,23 +21,27 @@ LONGEST = 600
 """Longest expression [characters]."""
 
 
-def _smallest(*values: Any) -> Any:
+NumberOrArray: TypeAlias = float | FloatArray
+"""The value of an expression at one time, or at each of many times."""
+
+
+def _smallest(*values: NumberOrArray) -> NumberOrArray:
     """Return the smallest of numbers or arrays, element by element."""
     return reduce(np.minimum, values)
 
 
-def _largest(*values: Any) -> Any:
+def _largest(*values: NumberOrArray) -> NumberOrArray:
     """Return the largest of numbers or arrays, element by element."""
     return reduce(np.maximum, values)
 
 
-def _step(value: Any) -> Any:
+def _step(value: NumberOrArray) -> NumberOrArray:
     """Return 0 below zero and 1 from zero on."""
     return np.where(np.asarray(value) >= 0.0, 1.0, 0.0)
 
 
 _OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.UAdd, ast.USub)
-_FUNCTIONS: dict[str, Callable[..., Any]] = {
+_FUNCTIONS: dict[str, Callable[..., NumberOrArray]] = {
     "sqrt": np.sqrt,
     "exp": np.exp,
     "log": np.log,
@@ -167,14 +171,16 @@ class Expression:
             If another name has no value, or a result is not a finite real number.
         """
         result = self._evaluate({**values, "time": time}, " at every time")
-        return np.array(np.broadcast_to(result, time.shape), dtype=np.float64)
+        result_over_time = np.broadcast_to(result, time.shape)
+        return np.array(result_over_time, dtype=np.float64)
 
-    def _evaluate(self, values: Mapping[str, float | FloatArray], when: str = "") -> Any:
+    def _evaluate(self, values: Mapping[str, NumberOrArray], when: str = "") -> NumberOrArray:
         """Return the checked result, a number or an array; `when` ends the sentence of an error."""
         try:
             with np.errstate(all="ignore"):
                 # `_check` has found nothing but numbers, known names, functions and operators
-                result = eval(_parse(self.text.strip()).code, _GLOBALS, dict(values))
+                code = _parse(self.text.strip()).code
+                result: NumberOrArray = eval(code, _GLOBALS, dict(values))
         except NameError as cause:
             raise self._error(
                 f": {self.text!r} needs {cause.name!r}, which has no value at this place"

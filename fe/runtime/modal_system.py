@@ -42,8 +42,10 @@ def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) 
     (M,) array
         Damping ratios [1]; values of 1 and more mean that the mode does not oscillate.
     """
-    omega: FloatArray = 2.0 * math.pi * np.asarray(frequency, dtype=np.float64)
-    return np.asarray(0.5 * (alpha / omega + beta * omega), dtype=np.float64)
+    frequencies = np.asarray(frequency, dtype=np.float64)
+    omega: FloatArray = 2.0 * math.pi * frequencies
+    ratio = 0.5 * (alpha / omega + beta * omega)
+    return np.asarray(ratio, dtype=np.float64)
 
 
 def rayleigh_coefficients(
@@ -209,22 +211,32 @@ class ModalSystem:
         rates, shapes, amplitudes = self._free_modes
         # At evenly spaced times e^(r (t_i + s_j)) = e^(r t_i) e^(r s_j). With blocks of sqrt(N)
         # times, only 2 sqrt(N) exponentials are needed for each r.
-        block_begin = time
-        offset = np.zeros(1)
-        even_time = np.linspace(time[0], time[-1], len(time))
+        sample_count = len(time)
+        even_time = np.linspace(time[0], time[-1], sample_count)
+        duration = even_time[-1] - even_time[0]
         # Times count as even if they differ by rounding errors from even ones.
-        if np.abs(time - even_time).max() <= 1e-9 * (even_time[-1] - even_time[0]) / len(time):
-            block = math.isqrt(len(time))
-            block_begin = even_time[::block]
-            offset = even_time[:block] - even_time[0]
-        at_begin = shapes * (amplitudes @ np.concatenate((q, v)))
-        at_offsets = np.exp(np.outer(offset, rates))[:, None] * at_begin
+        largest_deviation = np.abs(time - even_time).max()
+        if largest_deviation <= 1e-9 * duration / sample_count:
+            block_length = math.isqrt(sample_count)
+            block_begin = even_time[::block_length]
+            offset = even_time[:block_length] - even_time[0]
+        else:  # each time is a block of its own
+            block_begin = time
+            offset = np.zeros(1)
+        # the oscillations in a block from time zero, and their factors at the begin of each block
+        state = np.concatenate((q, v))
+        at_zero = shapes * (amplitudes @ state)
+        at_offsets = np.exp(np.outer(offset, rates))[:, None] * at_zero
         in_block = at_offsets.reshape(-1, len(rates)).T
-        wave = np.exp(np.outer(block_begin, rates))
+        block_factor = np.exp(np.outer(block_begin, rates))
         # Re(a b) = Re a Re b - Im a Im b, as one real matrix product
-        motion = np.hstack((wave.real, -wave.imag)) @ np.vstack((in_block.real, in_block.imag))
-        motion = motion.reshape(-1, 2 * len(q))[: len(even_time)]
-        return motion[:, : len(q)], motion[:, len(q) :]
+        factor_parts = np.hstack((block_factor.real, -block_factor.imag))
+        block_parts = np.vstack((in_block.real, in_block.imag))
+        motion = factor_parts @ block_parts
+        # the last block may reach beyond the last time
+        coordinate_count = len(q)
+        motion = motion.reshape(-1, 2 * coordinate_count)[:sample_count]
+        return motion[:, :coordinate_count], motion[:, coordinate_count:]
 
     def exact_steps(self, lengths: FloatArray) -> "ExactSteps":
         """Return the exact time steps under forces that are linear in time.
@@ -311,23 +323,31 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
     duration = np.frombuffer(lengths)
     count = math.isqrt(len(damping) // 8)
     damping_matrix = np.frombuffer(damping).reshape(count, count)
-    if len(stiffness_values) != count:
-        steps = _linear_force_exponentials(
-            stiffness_values.reshape(1, count, count), damping_matrix[None], duration
+    is_coupled = len(stiffness_values) != count
+    if is_coupled:
+        stiffness_matrix = stiffness_values.reshape(count, count)
+        steps = _linear_force_exponentials(stiffness_matrix[None], damping_matrix[None], duration)
+        return ExactSteps(
+            transition=steps.transition.squeeze(axis=1),
+            begin=steps.begin.squeeze(axis=1),
+            end=steps.end.squeeze(axis=1),
         )
-        return ExactSteps(steps.transition[:, 0], steps.begin[:, 0], steps.end[:, 0])
     # each coordinate by itself, as a system of one
+    damping_values = np.diag(damping_matrix)
     single_steps = _linear_force_exponentials(
-        stiffness_values[:, None, None], np.diag(damping_matrix)[:, None, None], duration
+        stiffness_values[:, None, None],
+        damping_values[:, None, None],
+        duration,
     )
+    # from the systems of one to blocks of q and v of all coordinates
     mode = np.arange(count)
     steps_count = len(duration)
     transition = np.zeros((steps_count, 2, count, 2, count))
-    transition[:, :, mode, :, mode] = single_steps.transition.transpose(1, 0, 2, 3)
     begin = np.zeros((steps_count, 2, count, count))
-    begin[:, :, mode, mode] = single_steps.begin[..., 0].transpose(0, 2, 1)
     end = np.zeros((steps_count, 2, count, count))
-    end[:, :, mode, mode] = single_steps.end[..., 0].transpose(0, 2, 1)
+    transition[:, :, mode, :, mode] = single_steps.transition.transpose(1, 0, 2, 3)
+    begin[:, :, mode, mode] = single_steps.begin.squeeze(axis=-1).transpose(0, 2, 1)
+    end[:, :, mode, mode] = single_steps.end.squeeze(axis=-1).transpose(0, 2, 1)
     return ExactSteps(
         transition=transition.reshape(steps_count, 2 * count, 2 * count),
         begin=begin.reshape(steps_count, 2 * count, count),
@@ -361,10 +381,9 @@ def _linear_force_exponentials(
     # speeds in units of the highest frequency, which balances the matrix
     largest_stiffness = np.abs(stiffness).max(axis=(1, 2), keepdims=True)
     largest_damping = np.abs(damping).max(axis=(1, 2), keepdims=True)
-    speed_unit = np.maximum(
-        np.maximum(np.sqrt(largest_stiffness), largest_damping),
-        1.0 / (float(lengths.max()) or 1.0),
-    )
+    highest_frequency = np.maximum(np.sqrt(largest_stiffness), largest_damping)
+    longest_step = float(lengths.max()) or 1.0
+    speed_unit = np.maximum(highest_frequency, 1.0 / longest_step)
     q, v, f, s = (slice(number * count, (number + 1) * count) for number in range(4))
     state = slice(0, 2 * count)
     # the matrix of the extended state
@@ -377,7 +396,8 @@ def _linear_force_exponentials(
     step_matrix[:, :, f, s] = unity  # the force changes by one over the step
     result = exponential(step_matrix)
     # back to the units of the state
-    scale = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1).repeat(count, axis=1)
+    units = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1)
+    scale = units.repeat(count, axis=1)
     by_change = result[:, :, state, s] * scale
     by_constant = result[:, :, state, f] * scale
     # A linear force is its value at the begin times (1 - t / h) plus its value at the end times
@@ -392,9 +412,11 @@ def _linear_force_exponentials(
 
 def exponential(matrix: FloatArray) -> FloatArray:
     """Return e^A of matrices A (..., n, n), by scaling, a Taylor polynomial and squaring."""
-    norm = float(np.max(np.sum(np.abs(matrix), axis=-1), initial=0.0))
-    # few squarings, because each doubles the rounding
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
+    row_sums = np.sum(np.abs(matrix), axis=-1)
+    norm = float(np.max(row_sums, initial=0.0))
+    # the scaled matrix has a norm of at most 0.5; few squarings, because each doubles the rounding
+    doublings = np.log2(max(norm, 1e-300) / 0.5)
+    squarings = max(0, int(np.ceil(doublings)))
     scaled_matrix = matrix / 2.0**squarings
     unity = np.eye(matrix.shape[-1])
     result = np.broadcast_to(unity, matrix.shape)

@@ -206,6 +206,10 @@ def _empty_motion(sample_count: int, mode_count: int, memory: FloatArray) -> Mod
 
 def _section_boundaries(time: FloatArray, laws: PortLaws) -> list[int]:
     """Return the boundaries (of K + 1) at which a law begins or ends to act, with both ends."""
-    inside = [moment for moment in laws.switching_times if time[0] < moment < time[-1]]
-    cuts = np.concatenate(([0, len(time) - 1], np.searchsorted(time, inside)))
-    return [int(cut) for cut in np.unique(cuts)]
+    begin = time[0]
+    end = time[-1]
+    inner_times = [moment for moment in laws.switching_times if begin < moment < end]
+    inner_boundaries = np.searchsorted(time, inner_times)
+    ends = [0, len(time) - 1]
+    boundaries = np.unique(np.concatenate((ends, inner_boundaries)))
+    return [int(boundary) for boundary in boundaries]

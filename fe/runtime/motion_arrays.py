@@ -38,8 +38,8 @@ class StepArrays(NamedTuple):
         Times of the boundaries [s].
     sample_boundary : (N,) array of int
         Boundary of each sample; the first sample is at boundary 0.
-    stiffness : (M,) array
-        Squared angular frequencies [1/s^2].
+    stiffness : (M, M) array
+        S, which couples a mode with the drives, and is else diagonal [1/s^2].
     damping : (M, M) array
         D [1/s].
     """

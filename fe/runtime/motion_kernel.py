@@ -172,12 +172,28 @@ def first_half_impulse(
     for j in range(law_count):
         if workspace.forces[j] != 0.0:
             add_scaled(state.v, ports.force_rows[j], -workspace.forces[j] * half)
-    # drift of the whole stiffness
     if ports.stiffness_rate != 0.0:
-        for m in range(mode_count):
-            state.v[m] -= (
-                half * ports.stiffness_rate * steps.time[k] * steps.stiffness[m] * state.q[m]
-            )
+        add_stiffness_drift(steps, state, half * ports.stiffness_rate * steps.time[k])
+
+
+def add_stiffness_drift(steps: StepArrays, state: ModalState, duration_times_change: float) -> None:
+    """Give the modes the impulse of a stiffness that has drifted.
+
+    The whole stiffness acts on the coordinates, also where it couples a mode with a drive: a spring
+    between two points pulls by their distance, whatever distance both have gone.
+
+    Parameters
+    ----------
+    steps : StepArrays
+        The steps, with the stiffness S.
+    state : ModalState
+        The state, whose speeds are changed.
+    duration_times_change : float
+        The duration of the impulse times the relative change of the stiffness [s].
+    """
+    for m in range(len(state.q)):
+        for n in range(len(state.q)):
+            state.v[m] -= duration_times_change * steps.stiffness[m, n] * state.q[n]
 
 
 def linear_step(
@@ -276,12 +292,8 @@ def second_half_impulse(
     If the friction at a port has reversed within the step, its impulse is corrected.
     """
     half = 0.5 * h
-    # drift of the whole stiffness
     if ports.stiffness_rate != 0.0:
-        for m in range(len(state.q)):
-            state.v[m] -= (
-                half * ports.stiffness_rate * (steps.time[k] + h) * steps.stiffness[m] * state.q[m]
-            )
+        add_stiffness_drift(steps, state, half * ports.stiffness_rate * (steps.time[k] + h))
     # laws of speed, in the opposite order of the first half
     for j in range(len(ports.law_number) - 1, -1, -1):
         if ports.leader[j] != SPEED_LAW:

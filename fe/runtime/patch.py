@@ -243,7 +243,7 @@ class ModelPatch:
             tuple(primitive for primitive in self.primitives if not isinstance(primitive, kinds))
         )
 
-    def to_list(self) -> list[dict[str, Any]]:
+    def to_list(self) -> list[dict[str, object]]:
         """Return the primitives as plain data; `from_list` restores the patch to the last bit."""
         return [primitive.to_mapping() for primitive in self.primitives]
 

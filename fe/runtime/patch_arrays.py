@@ -118,7 +118,9 @@ class PatchArrays(StoredArrays):
         terms = set(range(len(self.regions) + 1))
         if not set(self.strip_of) <= strips or not set(self.term_of) <= terms:
             raise self._error("has strips that do not fit its strip lines")
-        if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
+        stations_rise = np.all(np.diff(self.stations) > 0.0)
+        strip_lines_rise = np.all(np.diff(self.strip_lines) > 0.0)
+        if not (stations_rise and strip_lines_rise):
             raise self._error("must have stations that rise from the root to the tip")
 
     def _axis_lengths(self) -> dict[str, int]:

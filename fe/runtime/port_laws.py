@@ -55,9 +55,9 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
             primitives.append(primitive)
             continue
         for port, fraction in zip(STATION_PORTS, area_fractions.tolist(), strict=True):
-            changes: dict[str, Any] = {
-                name: fraction * getattr(primitive, name) for name in primitive.proportional
-            }
+            changes: dict[str, Any] = {}
+            for name in primitive.proportional:
+                changes[name] = fraction * getattr(primitive, name)
             primitives.append(replace(primitive, **changes, port=port))
     return ModelPatch(tuple(primitives))
 
@@ -205,9 +205,13 @@ class PortLaws:
         """Return the leader (J,) of each law, see `PortArrays`."""
         on_modes = (self.depends_on_speed == 1) & (flexibility == 0.0)
         immovable = inverse_mass == 0.0
+        # laws at one port that act in the same way share a position, and the first of them leads
         locations = list(zip(self.ports, on_modes.tolist(), immovable.tolist(), strict=True))
-        first_law = np.array([locations.index(location) for location in locations], dtype=np.int64)
-        return np.where(immovable, IMMOVABLE, np.where(on_modes, SPEED_LAW, first_law))
+        first_laws = [locations.index(location) for location in locations]
+        leader = np.array(first_laws, dtype=np.int64)
+        leader[on_modes] = SPEED_LAW
+        leader[immovable] = IMMOVABLE
+        return leader
 
     def port_arrays_at_rest(self) -> PortArrays:
         """Return the arrays of the laws for static solutions, which have no modes."""
@@ -299,11 +303,14 @@ def port_flexibility(system: ModalSystem, laws: PortLaws) -> FloatArray:
     if system.flexibility is None or not len(laws):
         return flexibility
     port_names = list(system.ports)
-    residual = system.flexibility[[port_names.index(name) for name in laws.ports]]
+    port_numbers = [port_names.index(name) for name in laws.ports]
+    residual = system.flexibility[port_numbers]
     rows = laws.port_rows(system.ports, len(system.angular_frequency))
     with np.errstate(divide="ignore", invalid="ignore"):
         # a unit force at the port moves it by the sum of row^2 / omega^2 in the modes
         modal_compliance = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
-    nearly_rigid = residual < LEAST_RESIDUAL * (residual + modal_compliance)
+    whole_compliance = residual + modal_compliance
+    nearly_rigid = residual < LEAST_RESIDUAL * whole_compliance
     acts_on_modes = (laws.depends_on_speed == 1) & nearly_rigid
-    return np.where(acts_on_modes | (residual <= 0.0), 0.0, residual)
+    is_rigid = residual <= 0.0
+    return np.where(acts_on_modes | is_rigid, 0.0, residual)

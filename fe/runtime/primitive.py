@@ -120,7 +120,7 @@ class Primitive:
             acts |= (begin <= time) & (time < end)
         return acts
 
-    def to_mapping(self) -> dict[str, Any]:
+    def to_mapping(self) -> dict[str, object]:
         """Return the kind and the values as plain data, for a file."""
         values = asdict(self)
         windows = [window._asdict() for window in values.pop("windows")]
@@ -134,7 +134,8 @@ class Primitive:
         """Return the type of each value by its name, without the windows."""
         types: dict[str, type] = {}
         for item in fields(cls):
-            annotation: Any = item.type
             if item.name != "windows":
-                types[item.name] = getattr(annotation, "__origin__", annotation)
+                # the type of a number may be annotated with its unit
+                declared_type: Any = item.type
+                types[item.name] = getattr(declared_type, "__origin__", declared_type)
         return types

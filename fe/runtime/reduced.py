@@ -230,8 +230,9 @@ class ReducedModel(ReducedArrays):
         The factors are taken from columns of values: column 0 is one, then come the V inputs, then
         the healthy fractions 1 - loss of the damage regions.
         """
+        ones = np.ones_like(vectors[..., :1])
         healthy = 1.0 - vectors[..., self._loss_inputs]
-        values = np.concatenate((np.ones_like(vectors[..., :1]), vectors, healthy), axis=-1)
+        values = np.concatenate((ones, vectors, healthy), axis=-1)
         first, second = columns
         return np.asarray(values[..., first] * values[..., second])
 
@@ -334,13 +335,16 @@ class ReducedModel(ReducedArrays):
             If a value lies outside the validity box or is not finite.
         """
         low, high = self.validity_box.T
-        outside = np.flatnonzero(~((vectors >= low) & (vectors <= high)).all(axis=1))
+        is_within = (vectors >= low) & (vectors <= high)
+        outside = np.flatnonzero(~is_within.all(axis=1))
         if outside.size:
-            self.check_validity(vectors[outside[0]].tolist())
+            first_outside = vectors[outside[0]]
+            self.check_validity(first_outside.tolist())
         stiffness = self.stiffness_coefficients(vectors) @ self._solver.stiffness
-        load = self.load_coefficients(vectors) @ self.static_load
         matrices = stiffness.reshape(-1, *self._solver.square)
-        coordinates = np.squeeze(solve(matrices, load[:, :, np.newaxis]), axis=-1)
+        load = self.load_coefficients(vectors) @ self.static_load
+        load_columns = load[:, :, np.newaxis]
+        coordinates = np.squeeze(solve(matrices, load_columns), axis=-1)
         return np.asarray(coordinates @ self.static_output.T)
 
     def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: LossValues = ()) -> float:

@@ -232,6 +232,12 @@ class _Anchor(NamedTuple):
     residual_factor: FloatArray
 
 
+_OUTPUT = 0
+"""Column of `_Anchor.residual_factor` for the output itself."""
+_TERMS = slice(1, None)
+"""Columns of `_Anchor.residual_factor` for the stiffness terms times the functions."""
+
+
 class _DualSolution(NamedTuple):
     """Approximate dual solutions of the outputs.
 
@@ -335,7 +341,8 @@ class CertifiedSolver:
             chosen.
         """
         stiffness = (theta @ self.stiffness).reshape(self.square)
-        coordinates = np.asarray(solve(stiffness, load @ self._load), dtype=np.float64)
+        right_hand_side = load @ self._load
+        coordinates = np.asarray(solve(stiffness, right_hand_side), dtype=np.float64)
         # residual of the solution
         change = (theta - self._reference)[:-1]
         changes = np.multiply.outer(change, coordinates).ravel()
@@ -345,19 +352,23 @@ class CertifiedSolver:
         # reference norm is at least the smallest ratio of coefficients (min-theta approach).
         dual = self._dual_solution(theta, losses)
         coercivity = min((theta / self._reference).tolist())
-        remainder = (sqrt(residual @ residual) + outside) / coercivity
-        bounds = remainder * dual.residual_norm + np.abs(dual.correction @ residual)
-        return CertifiedSolution(coordinates, self._output @ coordinates, bounds)
+        error_norm = (sqrt(residual @ residual) + outside) / coercivity
+        correction = np.abs(dual.correction @ residual)
+        bounds = error_norm * dual.residual_norm + correction
+        outputs = self._output @ coordinates
+        return CertifiedSolution(coordinates, outputs, bounds)
 
 
 def _one_dual_function(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     """Return the dual solutions in one function for each output, without stacks of matrices."""
-    weights = anchor.output[:, 0] / (theta @ anchor.stiffness)[:, np.newaxis]
-    by_output = anchor.residual_factor[:, :, 0]
-    by_terms = anchor.residual_factor[:, :, 1:]
+    stiffness = (theta @ anchor.stiffness)[:, np.newaxis]
+    weights = anchor.output.squeeze(axis=1) / stiffness
+    by_output = anchor.residual_factor[:, :, _OUTPUT]
+    by_terms = anchor.residual_factor[:, :, _TERMS]
     residual = by_output - weights * (by_terms @ theta)
-    correction = weights * anchor.correction[:, 0]
-    return _DualSolution(correction, np.sqrt(einsum("ij,ij->i", residual, residual)))
+    squared_norm = einsum("ij,ij->i", residual, residual)
+    correction = weights * anchor.correction.squeeze(axis=1)
+    return _DualSolution(correction, np.sqrt(squared_norm))
 
 
 def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
@@ -367,9 +378,11 @@ def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     stiffness = (theta @ anchor.stiffness).reshape(outputs, functions, functions)
     weights = solve(stiffness, anchor.output).transpose(0, 2, 1)
     # norms of the residuals of the dual equations
-    coefficients = (-theta[:, np.newaxis] * weights).reshape(outputs, -1, 1)
-    by_output = anchor.residual_factor[:, :, 0]
-    by_terms = anchor.residual_factor[:, :, 1:]
+    term_weights = -theta[:, np.newaxis] * weights
+    coefficients = term_weights.reshape(outputs, -1, 1)
+    by_output = anchor.residual_factor[:, :, _OUTPUT]
+    by_terms = anchor.residual_factor[:, :, _TERMS]
     residual = by_output + np.squeeze(by_terms @ coefficients, axis=-1)
+    squared_norm = einsum("ij,ij->i", residual, residual)
     correction = np.squeeze(weights @ anchor.correction, axis=1)
-    return _DualSolution(correction, np.sqrt(einsum("ij,ij->i", residual, residual)))
+    return _DualSolution(correction, np.sqrt(squared_norm))

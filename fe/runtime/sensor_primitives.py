@@ -310,20 +310,32 @@ def interpolated_by_cubics(
     values, rates : (M, C) array
         The signals and their time derivatives at `new_time`.
     """
+    # the interval of each new time, and the fraction s of the interval before the time
     last_interval = len(time) - 2
-    interval = np.clip(np.searchsorted(time, new_time, side="right") - 1, 0, last_interval)
-    length = (time[interval + 1] - time[interval])[:, np.newaxis]
-    s = (new_time - time[interval])[:, np.newaxis] / length
-    begin, end = values[interval], values[interval + 1]
-    begin_rate, end_rate = rates[interval], rates[interval + 1]
-    # The Hermite basis in the fraction s of the interval is (1 + 2 s) (1 - s)^2 and s^2 (3 - 2 s)
-    # for the values, and s (1 - s)^2 and -s^2 (1 - s) times the length for the rates.
-    interpolated = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * begin + s**2 * (3.0 - 2.0 * s) * end
-    interpolated += length * s * (1.0 - s) * ((1.0 - s) * begin_rate - s * end_rate)
+    samples_before = np.searchsorted(time, new_time, side="right")
+    interval = np.clip(samples_before - 1, 0, last_interval)
+    next_sample = interval + 1
+    begin_time = time[interval]
+    length = (time[next_sample] - begin_time)[:, np.newaxis]
+    s = (new_time - begin_time)[:, np.newaxis] / length
+    remaining = 1.0 - s
+    begin = values[interval]
+    end = values[next_sample]
+    begin_rate = rates[interval]
+    end_rate = rates[next_sample]
+    # The Hermite basis is (1 + 2 s) (1 - s)^2 and s^2 (3 - 2 s) for the values, and s (1 - s)^2
+    # and -s^2 (1 - s) times the length for the rates.
+    weight_of_begin = (1.0 + 2.0 * s) * remaining**2
+    weight_of_end = s**2 * (3.0 - 2.0 * s)
+    interpolated = weight_of_begin * begin + weight_of_end * end
+    weighted_rates = remaining * begin_rate - s * end_rate
+    interpolated += length * s * remaining * weighted_rates
     # The time derivative of the basis is that in s, divided by the length: +-6 s (1 - s) / length
     # for the values, and (1 - s) (1 - 3 s) and s (3 s - 2) for the rates.
-    interpolated_rates = 6.0 * s * (1.0 - s) * (end - begin) / length
-    interpolated_rates += (1.0 - s) * (1.0 - 3.0 * s) * begin_rate + s * (3.0 * s - 2.0) * end_rate
+    interpolated_rates = 6.0 * s * remaining * (end - begin) / length
+    weight_of_begin_rate = remaining * (1.0 - 3.0 * s)
+    weight_of_end_rate = s * (3.0 * s - 2.0)
+    interpolated_rates += weight_of_begin_rate * begin_rate + weight_of_end_rate * end_rate
     return interpolated, interpolated_rates
 
 

@@ -322,4 +322,6 @@ def high_pass_step(stages: FloatArray, increment: float, ratio: float) -> FloatA
     matrix = np.zeros((count + 1, count + 1))
     matrix[:count, :count] = -ratio * np.tri(count)
     matrix[:count, count] = increment
-    return np.asarray(exponential(matrix)[:count] @ np.append(stages, 1.0))
+    state = np.append(stages, 1.0)
+    outputs = exponential(matrix)[:count] @ state
+    return np.asarray(outputs)

@@ -55,7 +55,8 @@ class Boundaries:
         """The distinct lengths of the steps; an exact step is computed once for each."""
         usual = float(np.median(self.lengths))
         if np.ptp(self.lengths) <= LENGTH_TOLERANCE * usual:
-            return DistinctLengths(self.lengths[:1], np.zeros(len(self.lengths), dtype=np.int64))
+            same_number = np.zeros(len(self.lengths), dtype=np.int64)
+            return DistinctLengths(self.lengths[:1], same_number)
         rounded = np.round(self.lengths / (LENGTH_TOLERANCE * usual))
         _, first_of_length, number = np.unique(rounded, return_index=True, return_inverse=True)
         return DistinctLengths(
@@ -122,10 +123,15 @@ def _divided_intervals(stamps: bytes, counts: bytes) -> Boundaries:
     time = np.frombuffer(stamps)
     parts = np.frombuffer(counts).astype(np.int64)
     sample_boundary = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
-    lengths = np.repeat(np.diff(time) / parts, parts)
+    # the interval of each step, and the number of the step in it, from one
     interval = np.repeat(np.arange(len(parts)), parts)
-    number_in_interval = np.arange(1, len(interval) + 1) - sample_boundary[:-1][interval]
-    boundary_times = np.concatenate((time[:1], time[interval] + number_in_interval * lengths))
+    steps_before_interval = sample_boundary[:-1][interval]
+    number_in_interval = np.arange(1, len(interval) + 1) - steps_before_interval
+    part_length = np.diff(time) / parts
+    lengths = np.repeat(part_length, parts)
+    # the ends of the steps; at a sample exactly the time of the sample
+    end_times = time[interval] + number_in_interval * lengths
+    boundary_times = np.concatenate((time[:1], end_times))
     boundary_times[sample_boundary] = time
     return Boundaries(boundary_times, sample_boundary, lengths)
 
@@ -171,6 +177,6 @@ def loaded_steps(
         residual_position=residual_position,
         time=boundaries.time,
         sample_boundary=boundaries.sample_boundary,
-        stiffness=system.stiffness,
+        stiffness=np.ascontiguousarray(system.full_stiffness),
         damping=np.ascontiguousarray(system.damping),
     )

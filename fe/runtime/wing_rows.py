@@ -113,9 +113,12 @@ class WingRows:
             inboard = _ARM_ROOT * self.span
             arm = (y - inboard) / (self.span - inboard)
             at_tip = self._station_weights(self.span)
-            return np.asarray(arm * at_tip + (1.0 - arm) * self._station_weights(inboard))
+            at_inboard = self._station_weights(inboard)
+            return np.asarray(arm * at_tip + (1.0 - arm) * at_inboard)
+        # cell c has its ends at the stations 2 c and 2 c + 2
         last_cell = (len(stations) - 3) // 2
-        cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), last_cell)
+        ends_of_cells = stations[2::2]
+        cell = min(int(np.searchsorted(ends_of_cells, y)), last_cell)
         begin = stations[2 * cell]
         end = stations[2 * cell + 2]
         # Shape functions: each is one at begin, middle or end of the cell, and zero at the others
@@ -164,7 +167,8 @@ class WingRows:
         # linear between the two lines, or extrapolated beyond them
         fraction = (chord - chords[fore]) / (chords[aft] - chords[fore])
         rows = self.arrays.line_rows[2:]
-        return np.asarray(weights @ ((1.0 - fraction) * rows[fore] + fraction * rows[aft]))
+        rows_at_chord = (1.0 - fraction) * rows[fore] + fraction * rows[aft]
+        return np.asarray(weights @ rows_at_chord)
 
     def force_row(self, location: LoadLocation, patch: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N at a location; as a row, the displacement there.

@@ -158,14 +158,28 @@ def read_blocks(path: Path) -> Iterator[KeywordBlock]:
             values = [value.strip() for value in text.split(",")]
             raw_blocks[-1].data.append(DataLine(where, values))
     for block in raw_blocks:
-        parts = [" ".join(part.split()) for part in "".join(block.head).split(",")]
-        keyword, *parameter_texts = parts
-        parameters = {}
-        for text in parameter_texts:
-            if text:
-                name, _, value = text.partition("=")
-                parameters[name.strip().upper()] = value.strip().strip('"')
-        yield KeywordBlock(block.where, keyword.upper(), parameters, block.data)
+        keyword, *parameter_texts = "".join(block.head).split(",")
+        yield KeywordBlock(
+            block.where,
+            _with_single_spaces(keyword).upper(),
+            _parameters(parameter_texts),
+            block.data,
+        )
+
+
+def _parameters(texts: list[str]) -> dict[str, str]:
+    """Return the parameters of a keyword by their names in capitals, from texts such as NSET=A."""
+    parameters = {}
+    for text in texts:
+        name, _, value = _with_single_spaces(text).partition("=")
+        if text.strip():
+            parameters[name.strip().upper()] = value.strip().strip('"')
+    return parameters
+
+
+def _with_single_spaces(text: str) -> str:
+    """Return a text with a single space between its words, and none around them."""
+    return " ".join(text.split())
 
 
 def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
@@ -200,13 +214,16 @@ def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
-    numbers = [whole(where, values[0]) for where, values in block.data]
+    numbers = []
     rows = []
-    for where, values in block.data:
-        three_texts = (*values[1:], "", "", "")[:3]  # those left out are 0
+    for where, (number_text, *coordinate_texts) in block.data:
+        numbers.append(whole(where, number_text))
+        three_texts = (*coordinate_texts, "", "", "")[:3]  # those left out are 0
         rows.append([real(where, text) for text in three_texts])
-    points = replace(coordinates, kind=kind).to_space(np.reshape(rows, (-1, 3)))
-    for line, number, point in zip(block.data, numbers, points.tolist(), strict=True):
+    local_points = np.reshape(rows, (-1, 3))
+    system = replace(coordinates, kind=kind)
+    points = system.to_space(local_points).tolist()
+    for line, number, point in zip(block.data, numbers, points, strict=True):
         deck.add_node(line.where, number, point)
     if "NSET" in block.parameters:
         deck.members("NSET", block.required("NSET")).extend(numbers)

@@ -31,8 +31,11 @@ No name in a structure file has a dot.
 
 def affine_sum(coefficients: ArrayLike, terms: Sequence[sparse.csr_array]) -> sparse.csr_array:
     """Return the sum of sparse matrices times coefficients (T,)."""
-    products = [factor * term for factor, term in zip(np.asarray(coefficients), terms, strict=True)]
-    return sum(products[1:], products[0]).tocsr()
+    first_product, *products = [
+        coefficient * term
+        for coefficient, term in zip(np.asarray(coefficients), terms, strict=True)
+    ]
+    return sum(products, first_product).tocsr()
 
 
 class StiffnessTerm(NamedTuple):

@@ -76,8 +76,9 @@ class Body(Generic[Mesh]):
 
     def stiffness(self, cells: IntArray) -> sparse.csr_array:
         """Return the stiffness (n, n) [N/m] of some cells on the free unknowns."""
-        points = len(self.mesh.kind.stiffness_rule.weights)
-        factor = np.broadcast_to(self.variation, (len(self.part), points))
+        point_count = len(self.mesh.kind.stiffness_rule.weights)
+        shape = (len(self.part), point_count)
+        factor = np.broadcast_to(self.variation, shape)
         stiffness = self.mesh.stiffness(cells, self.elasticity[cells], factor[cells])
         expansion = self.supports.expansion
         return (expansion.T @ (stiffness @ expansion)).tocsr()
@@ -124,8 +125,18 @@ class Body(Generic[Mesh]):
         outputs : OutputRows
             Rows of its gauges, displacements, accelerations and ports.
         """
-        components = sparse.eye_array(3)
-        weights = (sparse.csr_array(point_mass.weights) for point_mass in self.masses)
-        point_masses = (sparse.kron(rows.T @ rows, components, format="csr") for rows in weights)
+        components = sparse.eye_array(3)  # a mass acts equally along x, y and z
         mass = sparse.kron(self.cell_mass, components, format="csr")
-        return affine_fields(design, self.supports.expansion, mass, point_masses, loads, outputs)
+        point_masses = []
+        for point_mass in self.masses:
+            weights = sparse.csr_array(point_mass.weights)
+            nodal_mass = weights.T @ weights
+            point_masses.append(sparse.kron(nodal_mass, components, format="csr"))
+        return affine_fields(
+            design,
+            self.supports.expansion,
+            mass,
+            point_masses,
+            loads,
+            outputs,
+        )

@@ -83,8 +83,14 @@ def axes_by_points(
     MeshError
         If the points lie on a line.
     """
-    first, second = points[1] - points[0], points[2] - points[0]
+    origin, point_on_first_axis, point_in_plane = points
+    first = point_on_first_axis - origin
+    second = point_in_plane - origin
+    # |a x b| = |a| |b| sin(angle)
     product_of_lengths = np.linalg.norm(first) * np.linalg.norm(second)
-    if not np.linalg.norm(np.cross(first, second)) > _LEAST_SINE * product_of_lengths:
+    spanned_area = np.linalg.norm(np.cross(first, second))
+    spans_plane = spanned_area > _LEAST_SINE * product_of_lengths
+    if not spans_plane:
         fail(where, "the three points of a coordinate system must not lie on a line.")
-    return axes_of(first, second)[list(order)]
+    axes = axes_of(first, second)
+    return axes[list(order)]

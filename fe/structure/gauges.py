@@ -90,9 +90,17 @@ def gauge_rows(
         for surface_point in surface_points:
             local_direction = _projected_direction(direction, surface_point.normal, where)
             # the mean of the points, and of the cells that meet at each of them
-            weight = 1.0 / (len(surface_points) * len(surface_point.cell))
+            cell_count = len(surface_point.cell)
+            weight = 1.0 / (len(surface_points) * cell_count)
             for cell, local_position in zip(surface_point.cell, surface_point.local, strict=True):
-                strains.append(_GaugeStrain(number, weight, cell, local_position, local_direction))
+                strain = _GaugeStrain(
+                    gauge=number,
+                    weight=weight,
+                    cell=cell,
+                    local=local_position,
+                    direction=local_direction,
+                )
+                strains.append(strain)
         moved.append(middle.distance)
     rows = mesh.strain_rows(
         row=np.array([strain.gauge for strain in strains]),
@@ -208,10 +216,15 @@ def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
         centre = face_centres[face]
         normal = on_surface(mesh, centre, "a face").normal
         # the coordinate axis that is most tangential, projected on the surface
-        first_axis = np.eye(3)[np.argmin(np.abs(normal))]
+        most_tangential = np.argmin(np.abs(normal))
+        first_axis = np.eye(3)[most_tangential]
         first_axis -= (first_axis @ normal) * normal
         second_axis = np.cross(normal, first_axis)
-        axes = tuple(first_axis.tolist()), tuple(second_axis.tolist())
-        point = tuple((centre / mesh.unit).tolist())
-        rosettes.append(Rosette(name=f"spread_{number}", point=point, axes=axes))
+        point = centre / mesh.unit
+        rosette = Rosette(
+            name=f"spread_{number}",
+            point=tuple(point.tolist()),
+            axes=(tuple(first_axis.tolist()), tuple(second_axis.tolist())),
+        )
+        rosettes.append(rosette)
     return rosettes

@@ -121,7 +121,8 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     )
     centres = np.tile(mesh.kind.centre, (len(cells), 1))
     nearest_points = _nearest_points(mesh, point, whole_cells, centres, _clip_near_cell)
-    coincides = np.linalg.norm(nearest_points.residual, axis=1) <= 1e-9 * mesh.size
+    distance_from_nearest = np.linalg.norm(nearest_points.residual, axis=1)
+    coincides = distance_from_nearest <= 1e-9 * mesh.size
     is_inside = mesh.kind.contains(nearest_points.local, _INSIDE) & coincides
     if is_inside.any():
         first_inside = int(is_inside.argmax())
@@ -245,12 +246,17 @@ def _nearest_on_faces(
         The cell of each face, and its number in the cell.
     """
     frames = mesh.kind.face_frames
-    triangular_faces = np.array([len(face) == 3 for face in mesh.kind.faces])
-    is_triangle = triangular_faces[face_numbers]
+    is_triangular = np.array([len(face) == 3 for face in mesh.kind.faces])
+    is_triangle = is_triangular[face_numbers]
     corners = np.where(is_triangle[:, None, None], _UNIT_TRIANGLE, _UNIT_SQUARE)
     centres = np.where(is_triangle[:, None], 1.0 / 3.0, [0.5, 0.5])
-    on_faces = _Parametrisation(cells, frames.corner[face_numbers], frames.tangents[face_numbers])
-    return _nearest_points(mesh, point, on_faces, centres, partial(_nearest_on_face, corners))
+    on_faces = _Parametrisation(
+        cells,
+        origin=frames.corner[face_numbers],
+        tangents=frames.tangents[face_numbers],
+    )
+    nearest_on_face = partial(_nearest_on_face, corners)
+    return _nearest_points(mesh, point, on_faces, centres, nearest_on_face)
 
 
 def _nearest_on_face(
@@ -273,17 +279,24 @@ def _nearest_on_face(
         A point itself if it lies inside, else the nearest point of an edge.
     """
     edge = np.roll(corners, -1, axis=1) - corners
-    from_corner = coordinates[:, None] - corners
+    point = coordinates[:, None]
+    from_corner = point - corners
+    # a point inside lies left of all edges
     edge_x, edge_y = np.moveaxis(edge, 2, 0)
     point_x, point_y = np.moveaxis(from_corner, 2, 0)
-    is_inside = np.all(edge_x * point_y >= edge_y * point_x, axis=1)
+    is_left_of_edge = edge_x * point_y >= edge_y * point_x
+    is_inside = np.all(is_left_of_edge, axis=1)
     # nearest point of each edge; a triangle has an edge without length
-    squared_length = np.sum(edge @ metric * edge, axis=2)
-    safe_length = np.where(squared_length > 0.0, squared_length, 1.0)
-    fraction = np.sum(edge @ metric * from_corner, axis=2) / safe_length
-    on_edges = corners + np.clip(fraction, 0.0, 1.0)[..., None] * edge
+    edge_covector = edge @ metric
+    squared_length = np.sum(edge_covector * edge, axis=2)
+    divisor = np.where(squared_length > 0.0, squared_length, 1.0)
+    fraction = np.sum(edge_covector * from_corner, axis=2) / divisor
+    fraction_on_edge = np.clip(fraction, 0.0, 1.0)[..., None]
+    on_edges = corners + fraction_on_edge * edge
     # nearest edge
-    residual = coordinates[:, None] - on_edges
-    nearest_edge = np.sum(residual @ metric * residual, axis=2).argmin(axis=1)
-    on_nearest_edge = on_edges[np.arange(len(on_edges)), nearest_edge]
+    residual = point - on_edges
+    squared_distance = np.sum(residual @ metric * residual, axis=2)
+    nearest_edge = squared_distance.argmin(axis=1)
+    faces = np.arange(len(on_edges))
+    on_nearest_edge = on_edges[faces, nearest_edge]
     return np.where(is_inside[:, None], coordinates, on_nearest_edge)

@@ -159,11 +159,12 @@ def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
-    axes = [axis for axis in (1, 2, 3) if (part.node, axis) in files.rows]
-    if not axes:
-        axes = [1]  # refused by name below
-    columns = np.array([files.unit_vector_at((part.node, axis), where) for axis in axes]).T
-    selection = sparse.csr_array(columns)
+    places = [(part.node, axis) for axis in (1, 2, 3)]
+    places_with_rows = [place for place in places if place in files.rows]
+    if not places_with_rows:
+        places_with_rows = places[:1]  # refused by name below
+    unit_vectors = [files.unit_vector_at(place, where) for place in places_with_rows]
+    selection = sparse.csr_array(np.transpose(unit_vectors))
     return sparse.csr_array(selection @ selection.T)
 
 

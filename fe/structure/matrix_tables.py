@@ -143,13 +143,17 @@ def _symmetric_matrix(indices: IntArray, values: FloatArray) -> sparse.csr_array
         The entries; those of one place are added.
     """
     size = int(indices.max()) + 1
+    shape = (size, size)
     places = tuple(indices.T)
-    matrix = sparse.coo_array((values, places), (size, size)).tocsr()
-    pattern = sparse.coo_array((np.ones(len(values)), places), (size, size)).tocsr()
+    matrix = sparse.coo_array((values, places), shape).tocsr()
+    # a table of one triangle has a mirrored entry for its diagonal entries only
+    ones = np.ones(len(values))
+    pattern = sparse.coo_array((ones, places), shape).tocsr()
     mirrored_entries = pattern.multiply(pattern.T).tocoo()
     has_one_triangle = (mirrored_entries.row == mirrored_entries.col).all()
     if has_one_triangle:
-        matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
+        diagonal = sparse.diags_array(matrix.diagonal())
+        matrix = (matrix + matrix.T - diagonal).tocsr()
     return matrix
 
 

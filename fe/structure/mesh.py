@@ -113,9 +113,12 @@ class StructureMesh(CellMesh):
         radius = np.empty(len(surface))
         for number, face_nodes in enumerate(self.kind.face_nodes):
             faces = np.flatnonzero(surface.face == number)
-            points = self.nodes[surface.cell[faces]][:, list(face_nodes)]
+            cell_points = self.nodes[surface.cell[faces]]
+            points = cell_points[:, list(face_nodes)]
             centre[faces] = points.mean(axis=1)
-            radius[faces] = np.linalg.norm(points - centre[faces, None], axis=2).max(axis=1)
+            from_centre = points - centre[faces, None]
+            distance = np.linalg.norm(from_centre, axis=2)
+            radius[faces] = distance.max(axis=1)
         return Spheres(centre, radius)
 
     def place(self, point: FloatArray) -> str:

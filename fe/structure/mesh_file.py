@@ -130,6 +130,8 @@ GIB = 2.0**30
 _PROGRAM_BYTES = 0.35 * GIB  # libraries, and the triplets of a part of the cells
 _MATRIX_COUNT = 5  # stiffness, its terms, their sum, mass and the residual's copy
 _ENTRY_BYTES = 12  # of a sparse matrix
+_NUMBER_BYTES = 8  # of a dense matrix
+_NUMBERS_OF_PAIR = 9  # components that couple two nodes
 _FACTOR_BYTES = 520.0
 """Bytes over unknowns^(4/3) of factors and fronts of a cube, the worst body (340 to 500)."""
 
@@ -148,20 +150,26 @@ def memory_estimate(mesh: StructureMesh) -> float:
         The memory [bytes].
     """
     # graph of nodes that share a cell
-    cell_of_entry = np.repeat(np.arange(len(mesh.cells)), mesh.cells.shape[1])
+    cell_count, nodes_per_cell = mesh.cells.shape
+    cell_of_entry = np.repeat(np.arange(cell_count), nodes_per_cell)
+    node_of_entry = mesh.cells.ravel()
     ones = np.ones(len(cell_of_entry), dtype=np.int32)
-    shape = (len(mesh.cells), len(mesh.points))
-    nodes_of_cells = sparse.coo_array((ones, (cell_of_entry, mesh.cells.ravel())), shape=shape)
+    nodes_of_cells = sparse.coo_array(
+        (ones, (cell_of_entry, node_of_entry)),
+        shape=(cell_count, len(mesh.points)),
+    )
     graph = (nodes_of_cells.T @ nodes_of_cells).tocsr()
-    # fronts of the factorisation
-    fronts = analyse(graph)[1]
-    sizes = [(front.end - front.start, len(front.boundary)) for front in fronts]
-    pivots, boundary = np.array(sizes).T
-    factors = pivots * (pivots + boundary)
-    largest_front = (2 * factors + boundary**2).max()  # the last fronts are the largest
-    most_entries = factors.sum() + largest_front
-    matrix_bytes = _MATRIX_COUNT * _ENTRY_BYTES * 9 * graph.nnz
-    return float(_PROGRAM_BYTES + matrix_bytes + 8 * 9 * most_entries)
+    # nodes in the fronts of the factorisation
+    _, fronts = analyse(graph)
+    pivots = np.array([front.end - front.start for front in fronts])
+    boundary = np.array([len(front.boundary) for front in fronts])
+    # pairs of nodes that are held at once: all factors, and the largest front beside them
+    factor_pairs = pivots * (pivots + boundary)
+    largest_front = (2 * factor_pairs + boundary**2).max()
+    most_pairs = factor_pairs.sum() + largest_front
+    matrix_bytes = _MATRIX_COUNT * _ENTRY_BYTES * _NUMBERS_OF_PAIR * graph.nnz
+    factor_bytes = _NUMBER_BYTES * _NUMBERS_OF_PAIR * most_pairs
+    return float(_PROGRAM_BYTES + matrix_bytes + factor_bytes)
 
 
 def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
@@ -182,7 +190,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     allowed_memory = available_memory() if limit is None else limit
     # An upper estimate first, which takes no time; four times as many entries as remain when they
     # are summed.
-    entries = 9 * mesh.cells.size * mesh.cells.shape[1]
+    entries = _NUMBERS_OF_PAIR * mesh.cells.size * mesh.cells.shape[1]
     matrix_bytes = _MATRIX_COUNT * _ENTRY_BYTES * entries / 4.0
     upper_estimate = _PROGRAM_BYTES + matrix_bytes + _FACTOR_BYTES * mesh.unknowns ** (4.0 / 3.0)
     if upper_estimate <= allowed_memory:

@@ -50,14 +50,14 @@ def read_by_meshio(path: Path) -> Deck:
     if path.suffix.lower() == ".msh":
         _check_element_lines(path)
     points = np.atleast_2d(mesh.points)
-    points = np.pad(
-        points, ((0, 0), (0, 3 - points.shape[1]))
-    )  # those of a plane have two coordinates
-    deck.nodes = {number: tuple(point) for number, point in enumerate(points.tolist(), start=1)}
+    missing_coordinates = 3 - points.shape[1]  # one if the mesh is plane
+    points = np.pad(points, ((0, 0), (0, missing_coordinates)))
+    for number, point in enumerate(points.tolist(), start=1):
+        deck.nodes[number] = tuple(point)
     numbers_of_blocks = _add_elements(deck, mesh)
-    for number, element_numbers in enumerate(numbers_of_blocks):
-        cell_arrays = _NamedArrays(mesh.cell_sets, mesh.cell_data)
-        _add_sets(deck, mesh, "ELSET", element_numbers, cell_arrays, number)
+    cell_arrays = _NamedArrays(mesh.cell_sets, mesh.cell_data)
+    for block, element_numbers in enumerate(numbers_of_blocks):
+        _add_sets(deck, mesh, "ELSET", element_numbers, cell_arrays, block)
     node_numbers = np.array(list(deck.nodes))
     point_arrays = _NamedArrays(
         sets={name: [members] for name, members in mesh.point_sets.items()},
@@ -162,9 +162,12 @@ def _add_sets(
                 named_sets.append((name, indices))
     for name, indices in named_sets:
         members_of_set = numbers[indices]
-        remaining = members_of_set[members_of_set != _LEFT_OUT]
-        if len(remaining) or not len(members_of_set):
-            deck.members(kind, name).extend(remaining.tolist())
+        is_in_deck = members_of_set != _LEFT_OUT
+        members_in_deck = members_of_set[is_in_deck]
+        # a set without members stays, one whose members were all left out does not
+        is_empty_in_file = not len(members_of_set)
+        if len(members_in_deck) or is_empty_in_file:
+            deck.members(kind, name).extend(members_in_deck.tolist())
 
 
 def _sets_of_values(
@@ -227,9 +230,15 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
         return families.get(value, [number_name])
     if label != "gmsh:physical":
         return [number_name]
+    # Gmsh names a pair of number and dimension
     cell_type = mesh.cells[block].type
-    dimension = min(FLAT[cell_type].corner_count, 3) - 1 if cell_type in FLAT else 3
-    names = [name for name, tag in mesh.field_data.items() if tag.tolist() == [value, dimension]]
+    dimension = 3
+    if cell_type in FLAT:
+        dimension = min(FLAT[cell_type].corner_count, 3) - 1
+    names = []
+    for name, number_and_dimension in mesh.field_data.items():
+        if number_and_dimension.tolist() == [value, dimension]:
+            names.append(name)
     return names or [number_name]
 
 
@@ -244,14 +253,15 @@ def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
     if groups is None:
         return [np.zeros(len(block.data), dtype=bool) for block in mesh.cells]
     any_has_group = any(np.any(group) for group in groups)
-    solid_groups = [
-        group for block, group in zip(mesh.cells, groups, strict=True) if block.type not in FLAT
-    ]
-    any_solid_has_group = any(np.any(group) for group in solid_groups)
+    any_solid_has_group = False
+    for block, group in zip(mesh.cells, groups, strict=True):
+        if block.type not in FLAT and np.any(group):
+            any_solid_has_group = True
     outside = []
     for block, group in zip(mesh.cells, groups, strict=True):
         groups_choose_elements = any_has_group if block.type in FLAT else any_solid_has_group
-        outside.append((np.asarray(group) == 0) & groups_choose_elements)
+        has_no_group = np.asarray(group) == 0
+        outside.append(has_no_group & groups_choose_elements)
     return outside
 
 

@@ -315,17 +315,30 @@ def _fields(where: str, text: str) -> list[str]:
         characters.
     """
     if "," not in text:
-        is_wide = "*" in text[:8]
-        count, width = (4, 16) if is_wide else (8, 8)
-        fields = [text[8 + width * index : 8 + width * (index + 1)] for index in range(count)]
-        return [field.strip() for field in (text[:8], *fields, text[72:])]
-    values = [value.strip() for value in text.split(",")]
-    count = 4 if "*" in values[0] else 8
-    marker = values.pop() if _MARKER.match(values[-1]) else ""
-    if len(values) > count + 2:
+        return _fields_in_columns(text)
+    fields = [field.strip() for field in text.split(",")]
+    marker = fields.pop() if _MARKER.match(fields[-1]) else ""
+    value_count = 4 if "*" in fields[0] else 8
+    most_fields = value_count + 2  # beside the values the word and the marker
+    if len(fields) > most_fields:
         fail(
             where,
-            f"a line of at most {count + 2} fields is expected, but {len(values)} were given.",
+            f"a line of at most {most_fields} fields is expected, but {len(fields)} were given.",
         )
-    values += [""] * (count + 2 - len(values))
-    return [*values[:-1], marker or values[-1]]
+    missing_fields = most_fields - len(fields)
+    fields += [""] * missing_fields
+    if marker:
+        fields[-1] = marker
+    return fields
+
+
+def _fields_in_columns(text: str) -> list[str]:
+    """Return the fields of a line in fixed format, see `_fields`."""
+    word = text[:8]
+    marker = text[72:]
+    width = 16 if "*" in word else 8
+    fields = [word]
+    for start in range(8, 72, width):
+        fields.append(text[start : start + width])
+    fields.append(marker)
+    return [field.strip() for field in fields]

@@ -43,19 +43,31 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
     vectors = np.zeros((len(mesh.points), 3))
     areas = np.zeros(len(mesh.points))
     for number in np.unique(surface.face).tolist():
-        cells = surface.cell[surface.face == number]
+        has_number = surface.face == number
+        cells = surface.cell[has_number]
+        # shape functions at the integration points of the face
         rule = kind.face_rule(number)
         tangents = frames.tangents[number]
         local_positions = frames.corner[number] + rule.points @ tangents
         values, gradients = kind.shape_functions(local_positions)
-        edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], gradients, tangents, optimize=True)
-        along_first, along_second = np.moveaxis(edges, 2, 0)
-        normals = np.cross(along_first, along_second) * rule.weights[:, None]
-        # The shape function of a node off the face is zero on it, up to rounding.
-        off_face = [node for node in range(kind.node_count) if node not in kind.face_nodes[number]]
+        # the shape function of a node off the face is zero on it, up to rounding
+        off_face = np.setdiff1d(range(kind.node_count), kind.face_nodes[number])
         values[:, off_face] = 0.0
-        np.add.at(vectors, mesh.cells[cells], np.einsum("nqi,qa->nai", normals, values))
-        np.add.at(areas, mesh.cells[cells], np.linalg.norm(normals, axis=2) @ values)
+        # normals in space, as long as the area of each integration point
+        tangents_in_space = np.einsum(
+            "nai,qaj,tj->nqti",
+            mesh.nodes[cells],
+            gradients,
+            tangents,
+            optimize=True,
+        )
+        along_first, along_second = np.moveaxis(tangents_in_space, 2, 0)
+        normals = np.cross(along_first, along_second) * rule.weights[:, None]
+        # their integrals with the shape functions
+        area_vectors = np.einsum("nqi,qa->nai", normals, values)
+        node_areas = np.linalg.norm(normals, axis=2) @ values
+        np.add.at(vectors, mesh.cells[cells], area_vectors)
+        np.add.at(areas, mesh.cells[cells], node_areas)
     return FaceAreas(vectors, areas)
 
 
@@ -87,8 +99,10 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
         return np.tile(load.acceleration, (len(mesh.points), 1))
     if load.pressure is not None:
         surface = mesh.faces_of(str(load.set), where)
-        return -load.pressure * face_areas(mesh, surface).vectors
-    return np.outer(_force_weights(mesh, load, where), np.asarray(load.force))
+        area_vectors = face_areas(mesh, surface).vectors
+        return -load.pressure * area_vectors  # area vectors point outwards
+    weights = _force_weights(mesh, load, where)
+    return np.outer(weights, np.asarray(load.force))
 
 
 def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:

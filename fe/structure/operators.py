@@ -86,11 +86,16 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     cell_sets = dict(mesh.cell_sets)
     tolerance = 1e-9 * mesh.size
     for box_set in design.set:
+        if box_set.of == "nodes":
+            points = mesh.points
+            sets = node_sets
+        else:
+            points = mesh.centres
+            sets = cell_sets
         low, high = design.unit * np.array(box_set.box)
-        points = mesh.points if box_set.of == "nodes" else mesh.centres
-        is_inside = ((points >= low - tolerance) & (points <= high + tolerance)).all(axis=1)
-        sets = node_sets if box_set.of == "nodes" else cell_sets
-        sets[box_set.name] = np.flatnonzero(is_inside)
+        is_above_low = (points >= low - tolerance).all(axis=1)
+        is_below_high = (points <= high + tolerance).all(axis=1)
+        sets[box_set.name] = np.flatnonzero(is_above_low & is_below_high)
     return replace(mesh, node_sets=node_sets, cell_sets=cell_sets)
 
 
@@ -291,8 +296,12 @@ def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) ->
 
 def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, MeshPort]]) -> sparse.csr_array:
     """Return rows (ports, full) of the displacements of ports, each with its label."""
-    rows = [port_row(mesh, port, label).ravel() for label, port in labelled]
-    return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
+    rows = []
+    for label, port in labelled:
+        row = port_row(mesh, port, label)
+        rows.append(row.ravel())
+    shape = (-1, mesh.unknowns)  # also without ports
+    return sparse.csr_array(np.reshape(rows, shape))
 
 
 def mass_and_centre(structure: Structure) -> tuple[float, FloatArray]:

@@ -96,10 +96,12 @@ def _body_expansion(points: FloatArray, body: RigidSet) -> sparse.coo_array:
     """Return the displacements (3 nodes, m) of all nodes by the m free motions of a rigid body."""
     motions = rigid_motions(points[body.nodes], body.point, 2.0)
     moving = sparse.coo_array(motions[:, ~body.held])
-    node = body.nodes[moving.row // 3]
-    component = moving.row % 3
-    entries = (3 * node + component, moving.col)
-    return sparse.coo_array((moving.data, entries), (points.size, moving.shape[1]))
+    number_in_body, component = np.divmod(moving.row, 3)
+    node = body.nodes[number_in_body]
+    displacement = 3 * node + component
+    free_motions = moving.shape[1]
+    entries = (moving.data, (displacement, moving.col))
+    return sparse.coo_array(entries, (points.size, free_motions))
 
 
 @dataclass
@@ -141,15 +143,20 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
     """
     bodies: dict[str, RigidSet] = {}
     shape = (len(mesh.points), 3)
-    nodal = _NodeSupports(np.zeros(shape, dtype=bool), np.zeros(shape))
+    nodal = _NodeSupports(
+        held=np.zeros(shape, dtype=bool),
+        springs=np.zeros(shape),
+    )
     for label, support in design.numbered("support"):
         nodes = mesh.nodes_of(support.set, label)
         if support.rigid_about is not None:
             bodies[label] = _rigid_set(support, mesh, nodes, label)
             continue
-        nodal.held[nodes] |= np.isin(MOTIONS[:3], support.hold)
+        translations = MOTIONS[:3]
+        nodal.held[nodes] |= np.isin(translations, support.hold)
         if support.springs is not None:
-            nodal.springs[nodes] += np.asarray(support.springs) / len(nodes)
+            spring_of_node = np.asarray(support.springs) / len(nodes)
+            nodal.springs[nodes] += spring_of_node
     nodal.springs[nodal.held] = 0.0
     _check_no_shared_nodes(mesh, nodal, bodies)
     rigid_sets = tuple(bodies.values())
@@ -208,9 +215,10 @@ def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatA
     """
     arm = (points - centre) / (0.5 * size)
     motions = np.zeros((len(points), 3, 6))
-    for axis in range(3):
+    for axis, unit_axis in enumerate(np.eye(3)):
         motions[:, axis, axis] = 1.0
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arm)
+        turned = np.cross(unit_axis, arm)
+        motions[:, :, 3 + axis] = turned
     return motions.reshape(-1, 6)
 
 

@@ -85,10 +85,12 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
     printed_results = _static_results(deck, folder)
     our_frequencies, _ = natural_frequencies(deck.structure, modes, deck.values)
     their_frequencies = _calculix_frequencies(deck, folder, modes)
-    factors = Factorisation(deck.structure.system_at(deck.values).stiffness)
+    system = deck.structure.system_at(deck.values)
+    factors = Factorisation(system.stiffness)
     differences = {}
     for (name, step), results in zip(deck.loads.items(), printed_results, strict=True):
-        differences[name] = _differences(deck, factors.solve(step.load), results)
+        displacement = factors.solve(step.load)
+        differences[name] = _differences(deck, displacement, results)
     return Agreement(differences, our_frequencies, their_frequencies)
 
 

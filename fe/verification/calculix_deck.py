@@ -171,20 +171,21 @@ class CalculixDeck:
         """The materials of the deck in this state: equal cells share one."""
         values_by_kind = self.structure.split_values(self.values)
         theta = self.structure.theta(values_by_kind.parameters, values_by_kind.losses)
+        factor_of_cell = theta[self.body.part]
         constants = self.body.elasticity[:, _ANISOTROPIC_ROWS, _ANISOTROPIC_COLUMNS]
-        scaled_constants = theta[self.body.part][:, None] * constants
+        scaled_constants = factor_of_cell[:, None] * constants
         no_cells = np.zeros(len(scaled_constants))
         graded = no_cells if self.grading is None else self.grading.cells
         properties = np.column_stack((scaled_constants, self.body.density, graded))
         rows, material_of_cell = np.unique(properties, axis=0, return_inverse=True)
-        for number, (*material_constants, density, is_graded) in enumerate(rows):
+        for number, (*constants_of_row, density, is_graded) in enumerate(rows):
+            material_constants = np.array(constants_of_row)
             course = [(0.0, 1.0)]
             if self.grading is not None and is_graded:
                 course = self.grading.course
-            at_temperatures = [
-                (temperature, factor * np.array(material_constants))
-                for temperature, factor in course
-            ]
+            at_temperatures = []
+            for temperature, factor in course:
+                at_temperatures.append((temperature, factor * material_constants))
             cells = np.flatnonzero(material_of_cell == number)
             yield Material(at_temperatures, density, cells)
 
@@ -266,7 +267,8 @@ class CalculixDeck:
         """Yield the equations of displacements that follow the motions of a rigid set."""
         supports = self.body.supports
         moving = np.flatnonzero(np.diff(supports.expansion.indptr))
-        for displacement_number in np.setdiff1d(moving, supports.free_displacements).tolist():
+        driven = np.setdiff1d(moving, supports.free_displacements)
+        for displacement_number in driven.tolist():
             (row,) = supports.expansion[[displacement_number]].toarray()
             node, direction = _node_and_direction(displacement_number)
             yield [Term(node, direction, -1.0), *self.terms(row)]
@@ -302,8 +304,11 @@ def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
     """Yield the equations that make the corners of a block move with the point of its mass."""
     nodes = np.flatnonzero(block.weights).tolist()
     for corner, direction in itertools.product(block.corners, (1, 2, 3)):
-        weighted = [Term(node + 1, direction, float(block.weights[node])) for node in nodes]
-        yield [Term(corner, direction, -1.0), *weighted]
+        equation = [Term(corner, direction, -1.0)]
+        for node in nodes:
+            weight = float(block.weights[node])
+            equation.append(Term(node + 1, direction, weight))
+        yield equation
 
 
 def _groups_of_three(count: int) -> int:
@@ -351,11 +356,13 @@ def _load_step(structure: Structure, load: MeshLoad) -> Step:
     if load.acceleration is not None:
         size = float(np.linalg.norm(load.acceleration))
         direction = np.sign(factor) * np.asarray(load.acceleration) / size
-        lines.append(f"EHEAVY,GRAV,{number_line([abs(factor) * size, *direction])}")
+        size_and_direction = number_line([abs(factor) * size, *direction])
+        lines.append(f"EHEAVY,GRAV,{size_and_direction}")
     elif load.pressure is not None and load.set is not None:
         surface = structure.mesh.faces_of(load.set, load.name)
+        pressure = number_line([factor * load.pressure])
         for cell, face in zip(surface.cell, surface.face, strict=True):
-            lines.append(f"{cell + 1},P{face + 1},{number_line([factor * load.pressure])}")
+            lines.append(f"{cell + 1},P{face + 1},{pressure}")
     else:
         lines.append("EALL,GRAV,0.,0.,0.,1.")
     return Step(structure.load(load.name, factor), lines, nodal=load.force is not None)

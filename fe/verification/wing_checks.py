@@ -59,9 +59,11 @@ def _root_motions(operators: AffineOperators) -> RootMotions:
     entries are heave, flap and yaw of the root: each motion has a one in its own entry.
     """
     motions = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)
-    nodal = motions[operators.body.supports.free_displacements]
-    _, _, along_z, about_x, _, about_z = nodal.T
-    heave, flap, yaw = np.vstack((np.column_stack((along_z, about_x, about_z)), np.eye(3))).T
+    nodal_motions = motions[operators.body.supports.free_displacements]
+    _, _, along_z, about_x, _, about_z = nodal_motions.T
+    at_nodes = np.column_stack((along_z, about_x, about_z))
+    at_root = np.eye(3)
+    heave, flap, yaw = np.vstack((at_nodes, at_root)).T
     return RootMotions(heave, flap, yaw)
 
 
@@ -109,19 +111,24 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     volume = determinants @ rule.weights
     # the kinetic energy of heaving at unit speed is half the total mass
     matrix_mass = motions.heave @ (operators.mass_terms[0] @ motions.heave)
-    # forces and energy of the solution
+    volume_mass = volume @ operators.body.density
+    # forces at the root, from the solution and from the load
     u = static_response(operators, {"load_factor": load_factor}).displacement
     root_heave, root_flap, _ = u[-3:]
     load = operators.turn(load_factor)
+    reaction = root.transverse_spring * root_heave
     net_lift = lift.force * load_factor / lift.load_factor
-    energy = 0.5 * u @ (operators.stiffness() @ u)
+    spring_moment = root.flap_spring * root_flap
+    load_moment = motions.flap @ load
+    # energy of the solution
+    elastic_force = operators.stiffness() @ u
+    energy = 0.5 * u @ elastic_force
+    work = 0.5 * load @ u
     return {
-        "mass": Balance(float(matrix_mass), float(volume @ operators.body.density), "kg"),
-        "reaction": Balance(float(root.transverse_spring * root_heave), net_lift, "N"),
-        "root moment": Balance(
-            float(root.flap_spring * root_flap), float(motions.flap @ load), "N m"
-        ),
-        "energy and work": Balance(float(energy), float(0.5 * load @ u), "J"),
+        "mass": Balance(float(matrix_mass), float(volume_mass), "kg"),
+        "reaction": Balance(float(reaction), net_lift, "N"),
+        "root moment": Balance(float(spring_moment), float(load_moment), "N m"),
+        "energy and work": Balance(float(energy), float(work), "J"),
     }
 
 
@@ -163,12 +170,14 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
         If a refinement lies outside the range of the design.
     """
     results = []
+    nominal_masses = point_masses(design.masses.servo, design.masses.pitot)
     for refinement in refinements:
         operators = assemble(design.changed(mesh={"refinement": refinement}))
-        loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
-        under_lift, under_tip_force = Factorisation(operators.stiffness()).solve(loads).T
-        masses = design.masses
-        modes = natural_frequencies(operators, 4, point_masses(masses.servo, masses.pitot))
+        factors = Factorisation(operators.stiffness())
+        lift = operators.turn(design.lift.load_factor)
+        loads = np.column_stack((lift, operators.load_tip))
+        under_lift, under_tip_force = factors.solve(loads).T
+        modes = natural_frequencies(operators, 4, nominal_masses)
         bending = flapwise_bending_modes(operators, modes)
         first_bending, second_bending = modes.frequency[bending].tolist()
         results.append(
@@ -327,22 +336,28 @@ def convergence_checks(
         order = observed_order(fine / middle, values)
         return "not monotone" if math.isnan(order) else f"order {order:.2f}"
 
-    by_name = {
+    # stiffness and frequencies
+    scalar_results = {
         "tip stiffness": ("N/m", [result.tip_stiffness for result in results]),
         "first bending": ("Hz", [result.first_bending for result in results]),
         "second bending": ("Hz", [result.second_bending for result in results]),
     }
-    for name, (unit, values) in by_name.items():
-        note = f"({values[-1]:.5g} {unit}, {order_in_words(values)})"
-        yield Check(group, name, abs(values[-1] / values[-2] - 1.0), limit, note)
+    for name, (unit, values) in scalar_results.items():
+        *_, middle_value, fine_value = values
+        change = abs(fine_value / middle_value - 1.0)
+        note = f"({fine_value:.5g} {unit}, {order_in_words(values)})"
+        yield Check(group, name, change, limit, note)
+    # gauges
     strain = np.array([result.strain for result in results])
-    change = np.abs(strain[-1] / strain[-2] - 1.0)
-    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
-    for number, (gauge_change, readings) in enumerate(
-        zip(change, strain.T.tolist(), strict=True), start=1
-    ):
-        note = f"({1e6 * readings[-1]:.0f} microstrain, {order_in_words(readings)})"
-        yield Check(group, f"gauge {number}", float(gauge_change), None, note)
+    *_, middle_strain, fine_strain = strain
+    strain_change = np.abs(fine_strain / middle_strain - 1.0)
+    mean_square = np.mean(strain_change**2)
+    yield Check(group, "gauges, rms", float(np.sqrt(mean_square)), limit)
+    readings_of_gauges = strain.T.tolist()
+    for number, readings in enumerate(readings_of_gauges):
+        fine_microstrain = 1e6 * readings[-1]
+        note = f"({fine_microstrain:.0f} microstrain, {order_in_words(readings)})"
+        yield Check(group, f"gauge {number + 1}", float(strain_change[number]), None, note)
     yield Check(group, "unknowns of the finest mesh", results[-1].unknowns)
 
 

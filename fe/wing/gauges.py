@@ -50,7 +50,8 @@ def averaging_points(middle: float, length: float, lines: FloatArray) -> LinePoi
     roots, root_weights = np.polynomial.legendre.leggauss(3)
     intervals = np.diff(breaks)[:, np.newaxis]
     starts = breaks[:-1, np.newaxis]
-    positions = starts + 0.5 * (1.0 + roots) * intervals
+    fractions = 0.5 * (1.0 + roots)
+    positions = starts + fractions * intervals
     weights = 0.5 * root_weights * intervals / length
     return LinePoints(positions.ravel(), weights.ravel())
 

@@ -23,11 +23,13 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     elasticities = np.empty((len(mesh.cells), 6, 6))
     _set_skin_elasticity(mesh, elasticities)
     for index, web in enumerate(mesh.design.webs):
+        is_in_web = mesh.web == index
         compliance = orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
-        elasticities[mesh.web == index] = np.linalg.inv(compliance)
+        elasticities[is_in_web] = np.linalg.inv(compliance)
     for index, rib in enumerate(mesh.design.ribs):
+        is_in_rib = mesh.rib == index
         compliance = isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        elasticities[mesh.rib == index] = np.linalg.inv(compliance)
+        elasticities[is_in_rib] = np.linalg.inv(compliance)
     _add_rod_stiffness(mesh, elasticities)
     return rotate_elasticity(elasticities, cell_axes(mesh))
 
@@ -85,7 +87,8 @@ def cell_axes(mesh: WingMesh) -> FloatArray:
     along_chord, along_span, _ = np.moveaxis(jacobian, 2, 0)
     across = unit_vector(np.cross(along_chord, along_span))
     spanwise = unit_vector(along_span)
-    return np.stack([np.cross(spanwise, across), spanwise, across], axis=1)
+    chordwise = np.cross(spanwise, across)
+    return np.stack([chordwise, spanwise, across], axis=1)
 
 
 def modulus_variation(mesh: WingMesh) -> FloatArray:

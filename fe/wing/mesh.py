@@ -252,11 +252,14 @@ def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: flo
         # shape functions of the cell's rear and front line, and the gap there
         rear = 0.5 * (1.0 + abscissa)
         front = 1.0 - rear
-        height = _half_thickness(behind[:-1] + rear * width, chord, thickness_ratio)
+        position = behind[:-1] + rear * width
+        height = _half_thickness(position, chord, thickness_ratio)
         gap = height - front * height_on_lines[:-1] - rear * height_on_lines[1:]
         fraction = 0.5 * weight
-        moments[:, :-1] += (front * gap * width * fraction).T
-        moments[:, 1:] += (rear * gap * width * fraction).T
+        front_moment = front * gap * width * fraction
+        rear_moment = rear * gap * width * fraction
+        moments[:, :-1] += front_moment.T
+        moments[:, 1:] += rear_moment.T
     return moments
 
 
@@ -289,12 +292,16 @@ def _grid_points(
     # The skin's thickness is measured normal to it, and the grid line is vertical: a slope makes
     # the vertical thickness larger by sqrt(1 + slope^2).
     slope = four_digit_slope(behind / chord, thickness_ratio)
-    inner_surface = outer_surface - design.skin.thickness * np.sqrt(1.0 + slope**2)
+    vertical_thickness = design.skin.thickness * np.sqrt(1.0 + slope**2)
+    inner_surface = outer_surface - vertical_thickness
+    # lower skin, levels between the inner surfaces, upper skin
     levels = np.linspace(-1.0, 1.0, height_cells + 1)
     upper_surface = outer_surface[..., np.newaxis]
     inner_levels = inner_surface[..., np.newaxis] * levels
     z = np.concatenate([-upper_surface, inner_levels, upper_surface], axis=2)
-    x = (behind - planform.straight_chord_line * chord)[..., np.newaxis]
+    # the straight chord line is the y axis
+    behind_chord_line = behind - planform.straight_chord_line * chord
+    x = behind_chord_line[..., np.newaxis]
     y = across[np.newaxis, :, np.newaxis]
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
@@ -324,29 +331,40 @@ def _grid_cells(
     design: WingDesign, across: FloatArray, along: tuple[MeshLine, ...], height_cells: int
 ) -> _GridCells:
     """Return the parts of the grid's cells; parameters are those of `_grid_points`."""
+    # numbers of a cell along the chord, along the span and over the height
     shape = (len(along) - 1, len(across) - 1, height_cells + 2)
     i, j, k = np.indices(shape)
+    # skin, closed leading edge, webs and ribs; where several meet, the first one counts
+    is_lower = k == 0
     is_upper = k == height_cells + 1
-    is_skin = is_upper | (k == 0)
-    leading_edge = ~is_skin & (i == 0) & design.skin.closed_leading_edge
-    web = np.where(is_skin | leading_edge, -1, web_cells(design, along)[i])
+    is_skin = is_upper | is_lower
+    is_foremost = i == 0
+    leading_edge = ~is_skin & is_foremost & design.skin.closed_leading_edge
+    is_shell = is_skin | leading_edge
+    web_of_chord_cell = web_cells(design, along)
+    web = np.where(is_shell, -1, web_of_chord_cell[i])
     is_web = web >= 0
-    rib = np.where(is_skin | leading_edge | is_web, -1, rib_cells(design, across)[j])
+    rib_of_span_cell = rib_cells(design, across)
+    rib = np.where(is_shell | is_web, -1, rib_of_span_cell[j])
     is_rib = rib >= 0
     # webs and ribs follow the damage regions, which are numbered from one
     web_region = len(design.regions) + 1
-    region = np.select([is_web, is_rib], [web_region, web_region + 1], SKIN)
+    rib_region = web_region + 1
+    region = np.select([is_web, is_rib], [web_region, rib_region], SKIN)
     root_chord = design.planform.root_chord
-    fractions = np.array([line.at(root_chord) for line in along]) / root_chord
+    chord_fractions = np.array([line.at(root_chord) for line in along]) / root_chord
     for number, defect in enumerate(design.defects, start=1):
-        along_chord = cells_within(fractions, [(defect.chord_start, defect.chord_end)]) == 0
-        along_span = cells_within(across, [(defect.span_start, defect.span_end)]) == 0
-        region[is_upper & along_chord[i] & along_span[j]] = number
+        chord_interval = (defect.chord_start, defect.chord_end)
+        span_interval = (defect.span_start, defect.span_end)
+        along_chord = cells_within(chord_fractions, [chord_interval]) == 0
+        along_span = cells_within(across, [span_interval]) == 0
+        is_in_defect = is_upper & along_chord[i] & along_span[j]
+        region[is_in_defect] = number
     return _GridCells(
         web=web,
         rib=rib,
         leading_edge=leading_edge,
-        is_kept=is_skin | leading_edge | is_web | is_rib,
+        is_kept=is_shell | is_web | is_rib,
         region=region,
     )
 

@@ -109,12 +109,15 @@ def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatA
     It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
     the chords.
     """
-    gaps = line.at(chords) - np.array([other_line.at(chords) for other_line in lines])
+    other_positions = np.array([other_line.at(chords) for other_line in lines])
+    gaps = line.at(chords) - other_positions
     is_behind = (gaps > 0.0).all(axis=1)
     is_ahead = (gaps < 0.0).all(axis=1)
     lies_between = bool(is_behind.any() and is_ahead.any())
     crosses_none = bool((is_behind | is_ahead).all())
-    return lies_between and crosses_none and bool(np.abs(gaps).min() > room)
+    narrowest_gap = np.abs(gaps).min()
+    keeps_distance = bool(narrowest_gap > room)
+    return lies_between and crosses_none and keeps_distance
 
 
 def _lines_between(
@@ -284,7 +287,8 @@ def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) ->
     middle = 0.5 * (lines[1:] + lines[:-1])
     interval_of_cell = np.full(len(middle), -1, dtype=np.int64)
     for number, (start, end) in enumerate(intervals):
-        interval_of_cell[(middle > start) & (middle < end)] = number
+        is_within = (middle > start) & (middle < end)
+        interval_of_cell[is_within] = number
     return interval_of_cell
 
 
@@ -294,8 +298,11 @@ def web_cells(design: WingDesign, along: Iterable[MeshLine]) -> IntArray:
     intervals = []
     for index in range(len(design.webs)):
         front, rear = web_faces(design, index)
-        intervals.append((float(front.at(root_chord)), float(rear.at(root_chord))))
-    return cells_within(np.array([line.at(root_chord) for line in along]), intervals)
+        start = float(front.at(root_chord))
+        end = float(rear.at(root_chord))
+        intervals.append((start, end))
+    positions = np.array([line.at(root_chord) for line in along])
+    return cells_within(positions, intervals)
 
 
 def rib_cells(design: WingDesign, across: FloatArray) -> IntArray:

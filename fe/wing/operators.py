@@ -134,9 +134,16 @@ def root_support(mesh: WingMesh) -> Supports:
     _, span_position, _ = mesh.points.T
     tolerance = 1e-9 * mesh.design.planform.semi_span
     root_nodes = np.flatnonzero(np.abs(span_position) < tolerance)
-    # of translations and rotations along and about x, y, z
-    springs = np.array([0.0, 0.0, root.transverse_spring, root.flap_spring, 0.0, root.yaw_spring])
-    rib = RigidSet(root_nodes, point=np.zeros(3), held=springs == 0.0, springs=springs)
+    # springs along x, y, z and about x, y, z; motions without a spring are held
+    along_axes = (0.0, 0.0, root.transverse_spring)
+    about_axes = (root.flap_spring, 0.0, root.yaw_spring)
+    springs = np.array([*along_axes, *about_axes])
+    rib = RigidSet(
+        root_nodes,
+        point=np.zeros(3),
+        held=springs == 0.0,
+        springs=springs,
+    )
     nothing_held = no_springs.astype(bool)
     return supports(mesh.points, nothing_held, no_springs, [rib])
 
@@ -228,21 +235,27 @@ def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None
     # integration points on the outer faces
     face = gauss_points(4, 2)
     local_height = 1.0 if upper else 0.0
-    local_positions = np.column_stack([face.points, np.full(len(face.points), local_height)])
+    local_heights = np.full(len(face.points), local_height)
+    local_positions = np.column_stack([face.points, local_heights])
     cells = mesh.skin_cells(upper=upper)
     shape_values, _ = mesh.kind.shape_functions(local_positions)
-    x, y, _ = np.moveaxis(mesh.positions(cells, local_positions), 2, 0)
+    positions = mesh.positions(cells, local_positions)
+    x, y, _ = np.moveaxis(positions, 2, 0)
+    # their areas in the plan view
     jacobian = jacobians(mesh.kind, mesh.nodes[cells], local_positions)
-    area = np.linalg.det(jacobian[..., :2, :2])  # in the plan view
+    plan_jacobian = jacobian[..., :2, :2]
+    area = np.linalg.det(plan_jacobian)
     # pressure at these points
     station = np.clip(y / planform.semi_span, 0.0, 1.0)
     chord = planform.chord(station)
     chord_fraction = x / chord + planform.straight_chord_line
-    span_distribution = DISTRIBUTIONS[lift.distribution](planform, station)
+    lift_per_length = DISTRIBUTIONS[lift.distribution]
+    span_distribution = lift_per_length(planform, station)
     chord_distribution = (1.0 - chord_fraction) ** lift.chordwise_exponent
     pressure = span_distribution * chord_distribution / chord
     force_at_points = pressure * area * face.weights
-    np.add.at(load, mesh.cells[cells], force_at_points @ shape_values)
+    nodal_force = force_at_points @ shape_values
+    np.add.at(load, mesh.cells[cells], nodal_force)
 
 
 def turn_load(body: Body[WingMesh]) -> FloatArray:

@@ -396,21 +396,24 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
     (...,) array
         Lift per length over total lift [1/m].
     """
+    number = np.arange(terms)
     # collocation on the half-wing, without the tip, with the root
-    theta = (np.arange(terms) + 1.0) * np.pi / (2.0 * terms)
-    n = 2.0 * np.arange(terms) + 1.0
+    theta = (number + 1.0) * np.pi / (2.0 * terms)
+    n = 2.0 * number + 1.0
     chord = planform.chord(np.cos(theta))
     mu = chord * 2.0 * np.pi / (8.0 * planform.semi_span)
     sine_of_theta = np.sin(theta)
     harmonics = np.sin(np.outer(theta, n))
-    system = harmonics * (n * mu[:, np.newaxis] + sine_of_theta[:, np.newaxis])
-    amplitude = np.linalg.solve(system, mu * sine_of_theta)
+    induced = n * mu[:, np.newaxis]
+    factors = induced + sine_of_theta[:, np.newaxis]
+    right_hand_side = mu * sine_of_theta
+    amplitude = np.linalg.solve(harmonics * factors, right_hand_side)
     # Only n = 1 contributes to the integral over the half-wing, A_1 pi/4 times the semi-span.
     integral = amplitude[0] * np.pi / 4.0 * planform.semi_span
     # the circulation at the stations
     fraction = np.clip(np.asarray(station, dtype=float), 0.0, 1.0)
-    angle = np.arccos(fraction)
-    harmonics_at_stations = np.sin(angle[..., np.newaxis] * n)
+    angle = np.arccos(fraction)[..., np.newaxis]
+    harmonics_at_stations = np.sin(angle * n)
     circulation = np.tensordot(harmonics_at_stations, amplitude, axes=1)
     return np.asarray(1.0 / integral * circulation)
 

@@ -150,11 +150,13 @@ def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> F
         The weights, which sum to one.
     """
     length = stations[2::2] - stations[:-2:2]
-    last_offset = len(stations) - 2
     weights = np.zeros(len(stations))
-    for offset, simpson_weight in enumerate((1.0, 4.0, 1.0)):
-        weights[offset : last_offset + offset : 2] += simpson_weight * length
-    weights *= root_chord + (tip_chord - root_chord) * stations / stations[-1]
+    # Simpson's weights 1, 4, 1 of each interval; a station between two intervals belongs to both
+    weights[:-2:2] += length
+    weights[1::2] += 4.0 * length
+    weights[2::2] += length
+    chord = root_chord + (tip_chord - root_chord) * stations / stations[-1]
+    weights *= chord
     return np.asarray(weights / weights.sum())
 
 
@@ -294,11 +296,17 @@ def _skin_strips(operators: AffineOperators) -> _SkinStrips:
     mesh = operators.wing_mesh
     _, centre_position, _ = mesh.centres.T
     strip_of_cell = np.searchsorted(mesh.span_lines, centre_position) - 1
-    skin_cells = np.flatnonzero(mesh.stiffness_term <= len(mesh.design.regions))
-    strip_and_term_of_cell = np.stack((strip_of_cell, mesh.stiffness_term), axis=1)[skin_cells]
-    parts, part_of_cell = np.unique(strip_and_term_of_cell, axis=0, return_inverse=True)
-    strip_of, term_of = parts.T
-    stiffness = tuple(
-        operators.body.stiffness(skin_cells[part_of_cell == part]) for part in range(len(parts))
+    is_skin = mesh.stiffness_term <= len(mesh.design.regions)
+    skin_cells = np.flatnonzero(is_skin)
+    strip_and_term = np.stack((strip_of_cell, mesh.stiffness_term), axis=1)
+    parts, part_of_cell = np.unique(
+        strip_and_term[skin_cells],
+        axis=0,
+        return_inverse=True,
     )
-    return _SkinStrips(strip_of, term_of, stiffness)
+    strip_of, term_of = parts.T
+    stiffness = []
+    for part in range(len(parts)):
+        cells_of_part = skin_cells[part_of_cell == part]
+        stiffness.append(operators.body.stiffness(cells_of_part))
+    return _SkinStrips(strip_of, term_of, tuple(stiffness))

@@ -11,12 +11,13 @@ from difflib import get_close_matches
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fmu_asset.errors import BindingError, FmuInputError, visible
 from fmu_asset.instances.plan import FmuIdentity
+from reporting.json_file import JsonObject
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
@@ -379,7 +380,7 @@ def checked_shape(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape)
 
 
-def describe_fmu(description: FmuDescription) -> dict[str, Any]:
+def describe_fmu(description: FmuDescription) -> JsonObject:
     """Return an FMU's description as a record for JSON, as `uav-twin fmu info` prints it."""
     record = _with_visible_texts(asdict(description))
     record["path"] = str(description.path)
@@ -389,7 +390,7 @@ def describe_fmu(description: FmuDescription) -> dict[str, Any]:
     return record
 
 
-def _with_visible_texts(record: Mapping[str, object]) -> dict[str, Any]:
+def _with_visible_texts(record: Mapping[str, object]) -> JsonObject:
     """Return a record with all control characters in its texts, which a terminal obeys, escaped."""
     visible_record = {}
     for name, value in record.items():

@@ -110,9 +110,13 @@ def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
 
     A name without a role is accepted if only one role has an input of this name.
     """
-    inputs = [_InputName(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
+    inputs = []
+    for role in INPUT_ROLES:
+        for name in binding.inputs(role):
+            inputs.append(_InputName(role, name))
     for port_name, port in binding.port.items():
-        inputs += [_InputName("port", f"{port_name}.{quantity}") for quantity in port.quantities]
+        for quantity in port.quantities:
+            inputs.append(_InputName("port", f"{port_name}.{quantity}"))
     name_counts = Counter(entry.name for entry in inputs)
     short_names = {entry.name: entry for entry in inputs if name_counts[entry.name] == 1}
     full_names = {entry.full: entry for entry in inputs}

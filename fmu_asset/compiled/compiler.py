@@ -5,32 +5,22 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
-from fmpy import platform as fmi_platform
+from fmpy import platform_tuple
 
 from fmu_asset.errors import FmuBuildError
-from reporting.choices import require_one_of
+
+from .platforms import HOST_TARGET
 
 COMPILERS = ("cc", "gcc", "clang")
 """Compilers that are tried in this order if the environment variable CC names none."""
 
-
-Platform = Literal["linux64", "win64"]
-"""Platforms that binaries are made for here; others compile the sources inside the FMU."""
-
-
-PLATFORM: Platform = "linux64"
-"""The platform that is compiled for by default, and on which every binary is made."""
-
-
-CROSS_COMPILER = "x86_64-w64-mingw32-gcc"
-"""Makes binaries for 64-bit Windows on Linux."""
-
-
-_COMMON_FLAGS = (
+# The library must not depend on the place or time of the build, nor on what is installed where it
+# runs.
+COMMON_FLAGS = (
     "-std=c11",
     "-O3",
     "-shared",
@@ -39,29 +29,84 @@ _COMMON_FLAGS = (
     "-fno-math-errno",
     "-Wl,-s",
 )
+"""Flags of every compiler of shared libraries."""
 
-
-# The library must not depend on the place or time of the build, nor on what is installed where it
-# runs.
-FLAGS: Mapping[Platform, tuple[str, ...]] = {
-    "linux64": (*_COMMON_FLAGS, "-fPIC", "-Wl,--build-id=none"),
-    "win64": (*_COMMON_FLAGS, "-static-libgcc", "-Wl,--no-insert-timestamp"),
-}
-
-
-_LONGEST_BUILD_SECONDS = 300.0
-
+_HOST_FLAGS = (*COMMON_FLAGS, "-fPIC", "-Wl,--build-id=none")
 
 _SHOWN_ERROR_LINES = 12
 
 
-def find_compiler(platform: Platform = PLATFORM) -> list[str]:
-    """Return the command of a C compiler: `$CC` if it is set, else the first one of `COMPILERS`.
+@dataclass(frozen=True, kw_only=True)
+class Compiler:
+    """A C compiler with its flags, which makes shared libraries.
 
-    Parameters
+    Attributes
     ----------
-    platform : {"linux64", "win64"}
-        The platform that it compiles for; for win64 there is one compiler only.
+    name : str
+        Its name in messages.
+    command : sequence of str
+        The command, with the flags that it is called with.
+    advice : str
+        What to do if it fails, for messages, such as "set CC to another one".
+    environment : mapping of str to str, optional
+        The environment variables that it is called with; by default those of this process.
+    longest_seconds : float
+        The time after which it is stopped.
+    """
+
+    name: str
+    command: Sequence[str]
+    advice: str
+    environment: Mapping[str, str] | None = None
+    longest_seconds: float = 300.0
+
+    def library(self, sources: Mapping[str, bytes], file_name: str) -> bytes:
+        """Return the shared library of C sources.
+
+        Parameters
+        ----------
+        sources : mapping of str to bytes
+            The content of the sources and headers by file name, all in one folder.
+        file_name : str
+            The name of the file that the compiler writes.
+
+        Raises
+        ------
+        FmuBuildError
+            If the compiler cannot be run, or fails.
+        """
+        with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
+            for name, content in sources.items():
+                (Path(folder) / name).write_bytes(content)
+            units = sorted(name for name in sources if name.endswith(".c"))
+            # Names relative to the working folder, so that no path gets into the library.
+            words = [*self.command, "-o", file_name, *units, "-lm"]
+            failure = f"The C compiler {self.name} could not be run ("
+            with FmuBuildError.instead_of(
+                OSError, subprocess.TimeoutExpired, before=failure, after=")."
+            ):
+                process = subprocess.run(
+                    words,
+                    cwd=folder,
+                    env=self.environment,
+                    capture_output=True,
+                    text=True,
+                    timeout=self.longest_seconds,
+                    check=False,
+                )
+            library = Path(folder) / file_name
+            if process.returncode != 0 or not library.is_file():
+                lines = (process.stderr or process.stdout).strip().splitlines()
+                output = "\n  ".join(lines[:_SHOWN_ERROR_LINES])
+                raise FmuBuildError(
+                    f"The C compiler {self.name} failed with exit code {process.returncode}; "
+                    f"{self.advice}. It says:\n  {output}"
+                )
+            return library.read_bytes()
+
+
+def find_compiler() -> list[str]:
+    """Return the command of this host's C compiler: `$CC` if it is set, else one of `COMPILERS`.
 
     Returns
     -------
@@ -73,15 +118,6 @@ def find_compiler(platform: Platform = PLATFORM) -> list[str]:
     FmuBuildError
         If there is no compiler.
     """
-    require_one_of(platform, get_args(Platform), "platform")
-    if platform != PLATFORM:
-        cross_compiler = shutil.which(CROSS_COMPILER)
-        if cross_compiler is None:
-            raise FmuBuildError(
-                f"A binary for 64-bit Windows needs {CROSS_COMPILER}, which was not found; install "
-                "it (such as the package gcc-mingw-w64-x86-64), or build without --windows."
-            )
-        return [cross_compiler]
     command_from_environment = shlex.split(os.environ.get("CC", ""))
     if command_from_environment:
         commands = [command_from_environment]
@@ -95,20 +131,20 @@ def find_compiler(platform: Platform = PLATFORM) -> list[str]:
             return [program, *arguments]
     raise FmuBuildError(
         f"A compiled FMU needs a C compiler, but none was found (looked for: {looked_for}); "
-        "install one (such as the package gcc) or set CC, or build with --kind source and compile "
-        "the FMU elsewhere."
+        "install one (such as the package gcc, or pip install 'uav-twin[cross]' and choose "
+        "platforms) or set CC, or build with --kind source and compile the FMU elsewhere."
     )
 
 
-def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFORM) -> bytes:
-    """Return the shared library of C sources; the same sources and compiler give the same bytes.
+def compile_library(sources: Mapping[str, bytes]) -> bytes:
+    """Return the shared library of C sources for this host.
+
+    The same sources and compiler give the same bytes.
 
     Parameters
     ----------
     sources : mapping of str to bytes
         The content of the sources and headers by file name, all in one folder.
-    platform : {"linux64", "win64"}
-        The platform that the library runs on.
 
     Returns
     -------
@@ -120,38 +156,16 @@ def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFO
     FmuBuildError
         If there is no compiler, this is not 64-bit Linux, or the compiler fails.
     """
-    require_one_of(platform, get_args(Platform), "platform")
-    if fmi_platform != PLATFORM:
+    if platform_tuple != HOST_TARGET:
         raise FmuBuildError(
-            f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with "
-            "--kind source and compile the FMU with `fmpy compile`."
+            f"The C compiler of the host is used on {HOST_TARGET} only, but this is "
+            f"{platform_tuple}; choose the platforms, for which zig compiles, or build with --kind "
+            "source and compile the FMU with `fmpy compile`."
         )
-    compiler = find_compiler(platform)
-    with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
-        for name, content in sources.items():
-            (Path(folder) / name).write_bytes(content)
-        units = sorted(name for name in sources if name.endswith(".c"))
-        # Names relative to the working folder, so that no path gets into the library.
-        command = [*compiler, *FLAGS[platform], "-o", "library.so", *units, "-lm"]
-        failure = f"The C compiler {compiler[0]} could not be run ("
-        with FmuBuildError.instead_of(
-            OSError, subprocess.TimeoutExpired, before=failure, after=")."
-        ):
-            process = subprocess.run(
-                command,
-                cwd=folder,
-                capture_output=True,
-                text=True,
-                timeout=_LONGEST_BUILD_SECONDS,
-                check=False,
-            )
-        library = Path(folder) / "library.so"
-        if process.returncode != 0 or not library.is_file():
-            lines = (process.stderr or process.stdout).strip().splitlines()
-            output = "\n  ".join(lines[:_SHOWN_ERROR_LINES])
-            raise FmuBuildError(
-                f"The C compiler {compiler[0]} failed with exit code {process.returncode}; set CC "
-                "to another one. "
-                f"It says:\n  {output}"
-            )
-        return library.read_bytes()
+    program, *arguments = find_compiler()
+    compiler = Compiler(
+        name=program,
+        command=[program, *arguments, *_HOST_FLAGS],
+        advice="set CC to another one",
+    )
+    return compiler.library(sources, "library.so")

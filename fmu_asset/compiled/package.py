@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 from importlib.metadata import distribution
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -24,7 +24,9 @@ from fmu_asset.slaves.table import StructureRoles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 from reporting.choices import require_one_of
 
-from .compiler import PLATFORM, Platform, compile_library
+from .compiler import compile_library
+from .cross_compiler import cross_compile_library
+from .platforms import FmiVersion, Platform, binary_name, host_binary_name, targets_by_folder
 
 MAGIC = b"UAVTWIN\0"
 VERSION = 2
@@ -51,7 +53,7 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
     bytes
         Magic, version, arrays, CRC-32.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for field in fields(ReducedArrays):
         values[field.name] = getattr(model, field.name)
     names_to_choose = (model.parameters, model.regions, model.masses, model.controls)
@@ -59,9 +61,11 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
     values["gauge_count"] = len(model.gauges)
     arrays = {}
     for name, value in values.items():
-        is_array = not isinstance(value, str | tuple) and np.size(value) > 0
-        if is_array and name not in _NOT_IN_DATA_FILE:
-            arrays[name] = np.asarray(value, dtype=np.float64)
+        if isinstance(value, str | tuple) or name in _NOT_IN_DATA_FILE:
+            continue
+        array = np.asarray(value, dtype=np.float64)
+        if array.size:
+            arrays[name] = array
     return pack_arrays(arrays)
 
 
@@ -139,17 +143,6 @@ def exchange_table(
 
 DATA_FILE = "resources/reduced_model.bin"
 """The name of the data file in the archive."""
-
-FmiVersion = Literal[2, 3]
-"""Versions of FMI that a compiled FMU can be of."""
-
-_BINARY_NAMES: Mapping[tuple[FmiVersion, Platform], str] = {
-    (2, "linux64"): "binaries/linux64/{}.so",
-    (2, "win64"): "binaries/win64/{}.dll",
-    (3, "linux64"): "binaries/x86_64-linux/{}.so",
-    (3, "win64"): "binaries/x86_64-windows/{}.dll",
-}
-"""Names of binaries in the archive, with braces for the model identifier."""
 
 _TIME = FmuVariable("time", 0, "Real", "independent", "continuous", "Time", unit="s")
 
@@ -298,7 +291,7 @@ def compiled_binaries(
     members: Mapping[str, bytes],
     identifier: str,
     fmi: FmiVersion = 2,
-    platforms: Sequence[Platform] = (PLATFORM,),
+    platforms: Sequence[Platform] | None = None,
 ) -> dict[str, bytes]:
     """Return the binaries of a compiled FMU, made from the sources among its files.
 
@@ -310,8 +303,9 @@ def compiled_binaries(
         The model identifier.
     fmi : {2, 3}
         The version of FMI.
-    platforms : sequence of {"linux64", "win64"}
-        The platforms that the FMU runs on.
+    platforms : sequence of str, optional
+        The platforms that the FMU runs on, see `targets_by_folder`; zig compiles for them. By
+        default, the C compiler of this host compiles for this host.
 
     Returns
     -------
@@ -320,18 +314,20 @@ def compiled_binaries(
 
     Raises
     ------
+    InvalidChoiceError
+        If the version or a platform is unknown.
     FmuBuildError
         If a binary cannot be compiled.
     """
     require_one_of(fmi, get_args(FmiVersion), "fmi")
-    for platform in platforms:
-        require_one_of(platform, get_args(Platform), "platforms")
     sources = {}
     for name, content in members.items():
         if name.startswith("sources/"):
             sources[name.removeprefix("sources/")] = content
+    if platforms is None:
+        return {host_binary_name(identifier, fmi): compile_library(sources)}
     binaries = {}
-    for platform in platforms:
-        name = _BINARY_NAMES[fmi, platform].format(identifier)
-        binaries[name] = compile_library(sources, platform=platform)
+    for folder, targets in targets_by_folder(platforms, fmi).items():
+        name = binary_name(folder, targets[0], identifier)
+        binaries[name] = cross_compile_library(sources, targets)
     return binaries

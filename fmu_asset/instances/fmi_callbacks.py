@@ -5,7 +5,7 @@ Instances therefore register by name, and the one logger finds them.
 """
 
 import ctypes
-from typing import Any, Protocol
+from typing import Protocol
 
 from fmpy import calloc, fmi1, fmi2, free
 from fmpy.logging import addLoggerProxy
@@ -41,12 +41,12 @@ def _log(_: object, instance_name: bytes, status: int, category: bytes, message:
 _LOGGERS = {1: fmi1.fmi1CallbackLoggerTYPE(_log), 2: fmi2.fmi2CallbackLoggerTYPE(_log)}
 
 
-def callbacks(fmi_version: int) -> Any:
+def callbacks(fmi_version: int) -> ctypes.Structure:
     """Return new callback functions for FMI 1 or 2, as fmpy's structure of that version."""
     module = _FMPY_MODULES[fmi_version]
     prefix = f"fmi{fmi_version}Callback"
     # functions that are not set, such as `stepFinished`, are null
-    functions = getattr(module, f"{prefix}Functions")()
+    functions: ctypes.Structure = getattr(module, f"{prefix}Functions")()
     functions.logger = _LOGGERS[fmi_version]
     functions.allocateMemory = getattr(module, f"{prefix}AllocateMemoryTYPE")(calloc)
     functions.freeMemory = getattr(module, f"{prefix}FreeMemoryTYPE")(free)

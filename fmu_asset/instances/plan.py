@@ -9,11 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from reporting.arrays import Float
+
+if TYPE_CHECKING:
+    from ctypes import _NamedFuncPointer as CFunction  # a name for type checkers alone
 
 Interface = Literal["co-simulation", "model-exchange"]
 
@@ -155,9 +158,6 @@ class Plan:
 
 CType = Any
 """A simple C type by ctypes, which states none for their common use."""
-CFunction = Any
-"""A C function by ctypes, which has no public type."""
-
 _C_TYPES: dict[str, CType] = {
     "Real": ctypes.c_double,
     "Float64": ctypes.c_double,
@@ -245,7 +245,7 @@ def group_arguments(
 _Function = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
-def prepare_call(function: CFunction, *arguments: object) -> Callable[[], int]:
+def prepare_call(function: "CFunction", *arguments: object) -> Callable[[], int]:
     """Return a call without arguments, so that a step looks up and converts nothing.
 
     Parameters

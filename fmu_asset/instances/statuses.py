@@ -1,8 +1,11 @@
 """Statuses that FMI functions return, and the failure to make an instance."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from fmpy.fmi1 import FMICallException
+
+if TYPE_CHECKING:
+    from ctypes import _NamedFuncPointer as CFunction  # a name for type checkers alone
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
@@ -14,7 +17,7 @@ def status_name(status: int) -> str:
     return STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
 
 
-def refuse_negative(status: int, function: Any, arguments: tuple[object, ...]) -> int:
+def refuse_negative(status: int, function: "CFunction", arguments: tuple[object, ...]) -> int:
     """Raise for a negative status of a C function that fmpy calls (a hook of ctypes)."""
     if status < 0:
         raise FMICallException(function=function.__name__, status=status)

@@ -20,9 +20,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import (
     EVERY_CHANNEL,
     SENSORS,
@@ -37,7 +38,7 @@ from fe.runtime.patch import (
 )
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
-from fmu_asset.slaves.effects import output_channels
+from fmu_asset.slaves.effects import EffectRecord, output_channels
 from reporting.json_file import parse_json, read_json
 from reporting.words import small
 
@@ -68,13 +69,6 @@ class PatchFileEffect(NamedTuple):
 
     id: str
     patch: ModelPatch
-
-
-class EffectRecord(TypedDict):
-    """An effect as `fmu_asset.slaves.effects` takes it."""
-
-    id: str
-    primitives: list[dict[str, object]]
 
 
 @dataclass(frozen=True)
@@ -290,6 +284,12 @@ def _read_effect(row: Mapping[str, object], number: int, file_label: str) -> Pat
                 raise PatchFileError(
                     f"{file_label}: the effect {effect_id!r} is bound to the time of trials "
                     f"({primitive.kind}), which means nothing in an FMU: leave it out."
+                )
+            if isinstance(primitive, INSTALLED_LAWS):
+                raise PatchFileError(
+                    f"{file_label}: the effect {effect_id!r} has the law {primitive.kind!r} of an "
+                    "installed package, but an FMU has the laws of uav-twin only: leave it out, or "
+                    "add the law to fe/runtime/laws."
                 )
             if isinstance(primitive, PortForce) and primitive.magnitude:
                 primitive.check()

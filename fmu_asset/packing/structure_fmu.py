@@ -23,8 +23,10 @@ from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
-from fmu_asset.compiled.package import DATA_FILE, FmiVersion, compiled_binaries, compiled_members
+from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.compiled.cross_compiler import find_cross_compiler
+from fmu_asset.compiled.package import DATA_FILE, compiled_binaries, compiled_members
+from fmu_asset.compiled.platforms import FmiVersion, Platform, targets_by_folder
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
@@ -41,13 +43,13 @@ from fmu_asset.packing.contents import (
     with_identity,
     write_fmu,
 )
-from fmu_asset.slaves.effects import effect_rows, switch_name
+from fmu_asset.slaves.effects import EffectRecord, effect_rows, switch_name
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.choices import require_one_of
 from reporting.files import hash_members
 from reporting.progress import Progress
 
-from .patch_file import EffectRecord, PatchFile
+from .patch_file import PatchFile
 
 FmuKind = Literal["python", "compiled", "source"]
 """The evaluation of the model: by Python, by compiled C, or by C sources that are yet to be
@@ -77,7 +79,7 @@ class FmuOptions(TypedDict, total=False):
     arrays: PatchArrays | None
     fmi: FmiVersion
     interface: Interface
-    platforms: Sequence[Platform]
+    platforms: Sequence[Platform] | None
 
 
 def build_fmu(
@@ -118,8 +120,11 @@ def build_fmu(
         Version of FMI; 3 for the kinds in C.
     interface : {"co-simulation", "model-exchange"}
         The interface of the FMU; model exchange (the modes are states) for the kinds in C.
-    platforms : sequence of {"linux64", "win64"}
-        The platforms of a compiled FMU's binaries; win64 needs a cross compiler.
+    platforms : sequence of str, optional
+        The platforms of a compiled FMU's binaries: "linux64", "win64", "darwin64", which are names
+        of FMI 2; "x86_64-linux", "x86_64-windows", "x86_64-darwin", "aarch64-darwin" and
+        "aarch64-linux", which are names of FMI 3; or "all". The extra `cross` must be installed. By
+        default, the C compiler of this host compiles for this host.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -145,7 +150,7 @@ def build_fmu(
     kind = options.get("kind", "python")
     fmi = options.get("fmi", 2)
     interface = options.get("interface", "co-simulation")
-    platforms = options.get("platforms", (PLATFORM,))
+    platforms = options.get("platforms")
     patch = options.get("patch")
     check_form(kind, fmi, interface, patched=patch is not None, platforms=platforms)
     # variables and start values
@@ -297,7 +302,7 @@ def check_form(
     interface: Interface = "co-simulation",
     *,
     patched: bool = False,
-    platforms: Sequence[Platform] = (PLATFORM,),
+    platforms: Sequence[Platform] | None = None,
 ) -> None:
     """Refuse a combination of kind, FMI version, interface and platform that cannot be built here.
 
@@ -313,7 +318,8 @@ def check_form(
     Raises
     ------
     FmuBuildError
-        If the kind does not exist for that version of FMI, or a compiler is missing.
+        If the kind does not exist for that version of FMI, or has no platforms; if that version of
+        FMI has no folder for a platform; or if a compiler is missing.
     PatchFileError
         If the kind cannot carry missing effects.
     InvalidChoiceError
@@ -322,8 +328,13 @@ def check_form(
     require_one_of(kind, get_args(FmuKind), "kind")
     require_one_of(fmi, get_args(FmiVersion), "fmi")
     require_one_of(interface, get_args(Interface), "interface")
-    for platform in platforms:
-        require_one_of(platform, get_args(Platform), "platforms")
+    if platforms is not None:
+        targets_by_folder(platforms, fmi)
+        if kind != "compiled":
+            raise FmuBuildError(
+                f"Platforms are for the kind 'compiled', but the kind {kind!r} was asked for with "
+                f"{', '.join(platforms)}: build the kind 'compiled', or choose no platforms."
+            )
     if kind == "python" and (fmi != 2 or interface != "co-simulation"):
         raise FmuBuildError(
             f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for "
@@ -335,8 +346,10 @@ def check_form(
             "with this patch."
         )
     if kind == "compiled":
-        for platform in platforms:
-            find_compiler(platform)
+        if platforms is None:
+            find_compiler()
+        else:
+            find_cross_compiler()
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias, TypedDict
 
 import numpy as np
 
@@ -34,8 +34,16 @@ RANGES: Mapping[str, tuple[float, float]] = {"side": (-1.0, 1.0), "element_count
 """Ranges of the whole numbers of primitives; the wing itself refuses impossible other numbers."""
 _TEMPERATURE_RANGE = (-100.0, 100.0)
 
-EffectRecord = Mapping[str, Any]
-"""An effect as JSON: `id`, and `primitives` as `ModelPatch.to_list` gives them."""
+PrimitiveRecord: TypeAlias = dict[str, object]
+"""A primitive, an elementary change of a model or of a sensor, as plain data: its kind, its channel
+or port, and its numbers."""
+
+
+class EffectRecord(TypedDict):
+    """An effect as plain data; `ModelPatch.to_list` gives its primitives."""
+
+    id: str
+    primitives: list[PrimitiveRecord]
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
@@ -88,16 +96,15 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
     return by_name
 
 
-def _unit(primitive: Mapping[str, Any], key: str) -> str:
+def _unit(primitive: PrimitiveRecord, key: str) -> str:
     """Return the unit of a primitive's parameter as FMI spells it, such as "N.s".
 
-    A primitive is an elementary change of a model or of a sensor. The unit is "1" if the parameter
-    has no unit.
+    The unit is "1" if the parameter has no unit.
 
     Parameters
     ----------
-    primitive : mapping
-        The primitive as a table: its kind, its channel or port, and its parameters.
+    primitive : dict
+        The primitive, see `PrimitiveRecord`.
     key : str
         The key of the parameter.
     """
@@ -180,7 +187,7 @@ def _add_switch(table: VariableTable, effect: EffectRecord, start: Mapping[str, 
 def _add_number(
     table: VariableTable,
     name: str,
-    primitive: Mapping[str, Any],
+    primitive: PrimitiveRecord,
     key: str,
     start: Mapping[str, float],
 ) -> None:
@@ -192,14 +199,15 @@ def _add_number(
         The table to which the variable is added.
     name : str
         The name of the variable.
-    primitive : mapping
-        The primitive change that has the number.
+    primitive : dict
+        The primitive change that has the number, see `PrimitiveRecord`.
     key : str
         The key of the number in the primitive.
     start : mapping of str to float
         Start values by variable name; without one, the value in the primitive.
     """
     value = primitive[key]
+    assert isinstance(value, int | float)  # `numbers_of` names no other values
     location = primitive.get("port") or primitive.get("channel") or ""
     location_text = "" if location in ("", "*") else f" at {location}"
     kind = str(primitive["kind"]).replace("_", " ")
@@ -219,7 +227,7 @@ def _add_number(
 
 def active_primitives(
     effects: Sequence[EffectRecord], values: Mapping[str, float]
-) -> list[dict[str, Any]]:
+) -> list[PrimitiveRecord]:
     """Return the primitives of the effects that are switched on, with the present values.
 
     Parameters
@@ -229,7 +237,7 @@ def active_primitives(
     values : mapping of str to float
         The values by variable name. An effect is on if its switch is above one half.
     """
-    active: list[dict[str, Any]] = []
+    active: list[PrimitiveRecord] = []
     for effect in effects:
         if values[switch_name(effect)] <= 0.5:
             continue
@@ -237,8 +245,9 @@ def active_primitives(
         for name, number in numbers_of(effect).items():
             primitive = primitives[number.primitive]
             # Variables are floats; a number that is whole in the patch stays whole.
-            number_type = type(primitive[number.key])
-            primitive[number.key] = number_type(values[name])
+            is_whole = isinstance(primitive[number.key], int)
+            value = values[name]
+            primitive[number.key] = int(value) if is_whole else float(value)
         active += primitives
     return active
 

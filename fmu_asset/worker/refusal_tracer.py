@@ -5,9 +5,9 @@ import json
 import os
 import signal
 import struct
+from collections.abc import Mapping
 from contextlib import suppress
 from errno import EACCES, EPERM, EXDEV
-from typing import Any
 
 from .traced_calls import (
     CALLS_OF_FOLDERS,
@@ -228,7 +228,7 @@ class RefusalTracer:
         """Write the counts to the report, so that they survive the end of this process."""
         self._write({"refused": self._refused})
 
-    def _write(self, record: dict[str, Any]) -> None:
+    def _write(self, record: Mapping[str, object]) -> None:
         """Replace the content of the report."""
         content = json.dumps(record).encode()
         os.pwrite(self._report, content, 0)

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import IO, Any, Literal
+from typing import IO, Literal, TypedDict
 
 from .traced_calls import RefusalKind
 
@@ -24,6 +24,21 @@ _KINDS: dict[RefusalKind, tuple[str, str]] = {
 """Names of each kind, in the singular and in the plural."""
 
 _report: ContextVar[IO[bytes] | None] = ContextVar("report", default=None)
+
+
+class RefusalRecord(TypedDict, total=False):
+    """What the supervisor of a worker writes; both keys are missing if no worker was started.
+
+    Attributes
+    ----------
+    unavailable : str
+        The reason why refusals cannot be counted on this machine.
+    refused : dict
+        The number of refused calls of each kind, and a description of the first of them.
+    """
+
+    unavailable: str
+    refused: dict[RefusalKind, tuple[int, str]]
 
 
 class RefusalReport:
@@ -39,9 +54,9 @@ class RefusalReport:
         self._file = file
 
     @property
-    def _record(self) -> dict[str, Any]:
+    def _record(self) -> RefusalRecord:
         self._file.seek(0)
-        content: dict[str, Any] = json.loads(self._file.read() or b"{}")
+        content: RefusalRecord = json.loads(self._file.read() or b"{}")
         return content
 
     @property
@@ -50,13 +65,12 @@ class RefusalReport:
         record = self._record
         if not record:
             return "no worker was started"
-        return str(record.get("unavailable", ""))
+        return record.get("unavailable", "")
 
     @property
     def counts(self) -> dict[RefusalKind, tuple[int, str]]:
         """How many calls of each kind were refused, and a description of the first one."""
-        refused_calls: dict[RefusalKind, tuple[int, str]] = self._record.get("refused", {})
-        return refused_calls
+        return self._record.get("refused", {})
 
     def verdict(self) -> Literal["ok", "warning", "skipped"]:
         """Return "warning" if something was refused, "skipped" if that could not be counted."""

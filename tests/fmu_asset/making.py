@@ -193,3 +193,10 @@ class Workshop:
     def changed(self, model: str, name: str, *changes: tuple[str, str]) -> Path:
         """Return a copy of a model's FMU with texts of its model description replaced."""
         return edited(self(model), self._folder / f"{name}.fmu", *changes)
+
+
+def run_well(words: Sequence[Any], **options: Any) -> str:
+    """Run a program, which must end well, and return what it prints."""
+    run = subprocess.run(words, capture_output=True, text=True, check=False, **options)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout

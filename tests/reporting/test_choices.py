@@ -14,7 +14,7 @@ import uav_twin
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.wing.lab_data import read_lab_folder
 from fmu_asset.client.binding import Binding
-from fmu_asset.compiled.compiler import compile_library
+from fmu_asset.compiled.cross_compiler import cross_compile_library
 from fmu_asset.compiled.package import compiled_binaries, fmi_headers
 from reporting.choices import require_one_of
 from reporting.errors import InvalidChoiceError
@@ -132,9 +132,11 @@ def test_the_parts_of_a_compiled_fmu_know_two_versions_of_fmi(call):
         call(fmi=1)
 
 
-def test_a_library_is_compiled_for_no_unknown_platform():
-    with pytest.raises(InvalidChoiceError, match=r"'win32' was given; the nearest is 'win64'"):
-        compile_library({}, platform="win32")
+def test_a_library_is_compiled_for_no_unknown_target():
+    with pytest.raises(
+        InvalidChoiceError, match=r"'x86_64-window' was given; the nearest is 'x86_64-windows'"
+    ):
+        cross_compile_library({}, ["x86_64-window"])
 
 
 def test_figures_of_a_laboratory_are_measured_or_published(tmp_path):

@@ -14,13 +14,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
+from typing import TYPE_CHECKING, ClassVar, Literal, NoReturn
 
 import numpy as np
 
 from fmu_asset.errors import FmuCallError
 from reporting.arrays import Float
 from reporting.files import hash_file, write_members
+from reporting.json_file import JsonRecord
 from reporting.progress import Progress
 from reporting.text_file import read_bytes
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
@@ -206,7 +207,7 @@ class FlownAndBelieved:
 
 
 def calibration_sentence(
-    record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
+    record: JsonRecord, asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
     """Return a sentence that says which model was calibrated, and whether the twin believes it.
 

@@ -4,11 +4,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.errors import MissionInputError, check_names
 from twin_master.scenario.mission import Calibration
 from twin_master.seeds import generator, seed_sequence
@@ -48,7 +49,7 @@ class ParameterDraws:
     mean: float
     standard_deviation: float
     source: str
-    record: Mapping[str, Any] | None = None
+    record: JsonRecord | None = None
     others: Mapping[str, Float] = field(default_factory=dict)
 
 
@@ -202,7 +203,7 @@ def _draws_of_load_test(
     )
 
 
-def _plain_density(posterior: "ScalarPosterior") -> dict[str, Any]:
+def _plain_density(posterior: "ScalarPosterior") -> JsonObject:
     """Return the constructor arguments of a posterior as plain data, without derived attributes."""
     from calibration.static.posterior import ScalarPosterior
     from reporting.json_file import plain

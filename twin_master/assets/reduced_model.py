@@ -411,7 +411,8 @@ class ReducedModelSource(NamedStructure):
             outputs = self.prepared_model.static_outputs(inputs)
             return outputs[:, self._observed_outputs].reshape(*shape, -1)
         # Compute modes for the first control only: they do not depend on it.
-        inputs_of_first_control = inputs.reshape(*shape, -1)[:, :, 0]
+        first_control = 0
+        inputs_of_first_control = inputs.reshape(*shape, -1)[:, :, first_control]
         rows = inputs_of_first_control.reshape(-1, inputs.shape[1])
         features = np.array([self._observed_features(row) for row in rows])
         features = features.reshape(*shape[:2], 1, -1)

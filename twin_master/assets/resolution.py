@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeAlias
 
 from pydantic import ConfigDict, Field
 
+from reporting.json_file import JsonRecord
 from reporting.toml_file import read_toml, validate
 from reporting.words import comma_list
 from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
@@ -65,7 +66,11 @@ class Overrides:
     no_notices: bool = False
 
 
-def as_overrides(overrides: Overrides | Mapping[str, Any] | None) -> Overrides:
+OverridesOrMapping: TypeAlias = Overrides | Mapping[str, object]
+"""Overrides, or a mapping from their names to their values."""
+
+
+def as_overrides(overrides: OverridesOrMapping | None) -> Overrides:
     """Return overrides as a record.
 
     Parameters
@@ -85,7 +90,7 @@ def as_overrides(overrides: Overrides | Mapping[str, Any] | None) -> Overrides:
 
 
 def resolve_scenario(
-    loaded_scenario: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+    loaded_scenario: LoadedScenario, overrides: OverridesOrMapping | None = None
 ) -> Scenario:
     """Return the scenario with the overrides and with absolute paths.
 
@@ -385,9 +390,7 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
         table[name] |= learnt_table  # its keys replace those of the scenario
 
 
-def _check_learnt_transition(
-    table: Mapping[str, Any], transition: Mapping[str, Any], path: Path
-) -> None:
+def _check_learnt_transition(table: JsonRecord, transition: JsonRecord, path: Path) -> None:
     """Refuse learnt probabilities that are not for the controls and the kind of a scenario."""
     learnt_controls = transition.get("probability", {})
     controls = sorted(control["name"] for control in table["control"])
@@ -399,9 +402,7 @@ def _check_learnt_transition(
         )
 
 
-def _normal_calibration(
-    calibration: Mapping[str, Any], learnt_parameter: object, path: Path
-) -> Table:
+def _normal_calibration(calibration: JsonRecord, learnt_parameter: object, path: Path) -> Table:
     """Return the table `calibration` for a normal distribution, without parameter and moments.
 
     The caller adds these from the file of learnt tables. An other learnt parameter than that of the

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.json_file import read_json
+from reporting.json_file import JsonDocument, JsonRecord, read_json
 from reporting.words import comma_list
 from twin_master.assets.asset_source import (
     LIBRARY_COPY,
@@ -142,7 +142,7 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
         ) from error
 
 
-def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
+def _parse_library(content: JsonRecord) -> StrainLibrary:
     """Return the library that the authors' file contains.
 
     Its entry `observations[z1][z2][control][draw]` has the strain of each gauge in microstrain; z1
@@ -185,7 +185,7 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
     )
 
 
-def _is_finite_vector(row: Any, length: int) -> bool:
+def _is_finite_vector(row: JsonDocument, length: int) -> bool:
     """Return whether a row of the file is a list of `length` finite numbers."""
     if np.shape(row) != (length,):
         return False
@@ -308,7 +308,8 @@ class StrainLibrarySource(AssetSource):
         """
         states = [tuple(state) for state in model.states.coordinates]
         rows = [self._library.states.index(state) for state in states]
-        return self._library.strain_per_draw[:, rows][:, :, self._control_indices]
+        strain_of_states = self._library.strain_per_draw[:, rows]
+        return strain_of_states[:, :, self._control_indices]
 
     def open(self) -> Asset:
         """Return an asset with the strains at the mean of the parameter, noise-free.

@@ -12,8 +12,9 @@ from pydantic import Field
 
 from reporting.files import hash_file, hash_record
 from reporting.former_names import with_present_names
+from reporting.json_file import JsonObject
 from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
-from twin_master.assets.resolution import Overrides, resolve_scenario
+from twin_master.assets.resolution import Overrides, OverridesOrMapping, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.parts import NO_PARTS, TwinParts
@@ -196,9 +197,9 @@ class Group:
     observations: str = ""
     scenario_file: Mapping[str, str] = field(default_factory=dict)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Return the record of the group for `config.json`."""
-        record: dict[str, Any] = {
+        record: JsonObject = {
             "name": self.name,
             "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
             "parameters": {
@@ -242,7 +243,7 @@ class Fleet:
         """The number of twins."""
         return sum(len(group.members) for group in self.groups)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Return the record of the fleet for `config.json`."""
         record = self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
         parts = self.parts.record()
@@ -331,7 +332,7 @@ def _check_shared_inspections(group: Group, head: FleetSection) -> None:
 def ensemble(
     scenario: LoadedScenario | str | Path,
     seeds: range,
-    overrides: Overrides | Mapping[str, Any] | None = None,
+    overrides: OverridesOrMapping | None = None,
     *,
     shard: int = SHARD,
 ) -> Fleet:

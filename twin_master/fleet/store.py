@@ -3,14 +3,15 @@
 from collections.abc import Mapping, Sequence
 from importlib import util
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.arrays import Float, Index
+from reporting.arrays import AnyArray, Float, Index
 from reporting.files import explained_write_errors
 from reporting.former_names import warn_of_former_names
+from reporting.json_file import JsonObject
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.plan import Fleet, Group, Member
@@ -58,14 +59,14 @@ _NOT_DEFINED = -1
 """Value of `early` if the policy does not depend on the level of one factor alone."""
 
 
-def flown_rows(status: NDArray[Any]) -> Index:
+def flown_rows(status: AnyArray) -> Index:
     """Return the rows of the twins that have flown to the end of the mission or of the asset."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 
 def stored_variables(
     knowledge: Knowledge, flights: Flights, members: Sequence[Member]
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Return the variables that are stored of B flown twins, with B rows each.
 
     Parameters
@@ -339,9 +340,9 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
     return tree
 
 
-def _group_record(folder: Path, group: str) -> dict[str, Any]:
+def _group_record(folder: Path, group: str) -> JsonObject:
     """Return the record of a group in the configuration of a fleet."""
-    records: list[dict[str, Any]] = fleet_config(folder)["fleet"]["groups"]
+    records: list[JsonObject] = fleet_config(folder)["fleet"]["groups"]
     (record,) = (record for record in records if record["name"] == group)
     return record
 

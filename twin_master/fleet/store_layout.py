@@ -7,12 +7,13 @@ under other names, are read in the present layout.
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from reporting.arrays import Float
+from reporting.arrays import AnyArray, Float
+from reporting.json_file import JsonObject
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import SCHEMA, SEVERAL_UNITS
 
@@ -94,7 +95,7 @@ class Coordinate(NamedTuple):
     axis: str
     unit: str
     title: str
-    values: NDArray[Any]
+    values: AnyArray
 
     @property
     def attributes(self) -> dict[str, str]:
@@ -249,9 +250,9 @@ def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
     return columns
 
 
-def stored_values(group: "xr.DataTree", path: str) -> NDArray[Any]:
+def stored_values(group: "xr.DataTree", path: str) -> AnyArray:
     """Return the values of a variable in a group of a store, given its path."""
-    values: NDArray[Any] = np.asarray(group[path].values)
+    values: AnyArray = np.asarray(group[path].values)
     return values
 
 
@@ -312,7 +313,7 @@ def in_present_layout(
         variables[path] = variable
     parameters = [path.partition("/")[2] for path in variables if path.startswith("truth/")]
     layout = stored_layout(scenario, [name for name in parameters if name != "state"])
-    groups: dict[str, dict[str, Any]] = {"": {}}
+    groups: dict[str, JsonObject] = {"": {}}
     for path, variable in variables.items():
         group, _, name = path.rpartition("/")
         entry = variable.variable.copy(deep=False)

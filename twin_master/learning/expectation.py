@@ -338,6 +338,7 @@ class LearntExpectation:
         mean = first_moment_by_state.sum(axis=1)
         variance = np.maximum(second_moment_by_state.sum(axis=1) - mean**2, 0.0)
         quantiles = _quantiles_by_state(state_weight, first_moment_by_state, second_moment_by_state)
+        lower, upper = np.moveaxis(quantiles, 1, 0)
 
         reward_mean, reward_standard_deviation = self.rewards.expectation_of(
             weight, hypotheses.draw, controls, value, value_variance, observation
@@ -345,8 +346,8 @@ class LearntExpectation:
         return Expectation(
             mean=mean + center,
             standard_deviation=np.sqrt(variance),
-            lower=quantiles[:, 0] + center,
-            upper=quantiles[:, 1] + center,
+            lower=lower + center,
+            upper=upper + center,
             noise=self._expected_noise(hypotheses, weight, controls),
             reward_mean=reward_mean,
             reward_standard_deviation=reward_standard_deviation,

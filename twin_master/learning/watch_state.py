@@ -201,6 +201,7 @@ class WatchState:
         gauge_belief = np.zeros(gauge_shape, dtype=np.float32)
         gauge_belief.ravel()[stored_arrays["gauge_place"]] = stored_arrays["gauge"]
         gauge_alarm_raised, free_gains_alarm_raised = stored_arrays["alarmed"].tolist()
+        gauge_sum_cc, gauge_sum_cx = np.moveaxis(stored_arrays["gauge_sums"], -1, 0)
         return cls(
             model_belief=stored_arrays["model"],
             recovered_belief=stored_arrays["mended"],
@@ -216,8 +217,8 @@ class WatchState:
             model_squares=stored_arrays["model_squares"],
             recovered_squares=stored_arrays["mended_squares"],
             gauge_squares=stored_arrays["gauge_squares"],
-            gauge_sum_cc=np.ascontiguousarray(stored_arrays["gauge_sums"][..., 0]),
-            gauge_sum_cx=np.ascontiguousarray(stored_arrays["gauge_sums"][..., 1]),
+            gauge_sum_cc=np.ascontiguousarray(gauge_sum_cc),
+            gauge_sum_cx=np.ascontiguousarray(gauge_sum_cx),
             free_gain_statistics=FreeGainStatistics.from_array(stored_arrays["none_statistics"]),
             observation_count=stored_arrays["count"],
             step_count=float(stored_arrays["steps"][0]),

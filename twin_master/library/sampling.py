@@ -15,7 +15,6 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -26,7 +25,7 @@ from fmu_asset.client.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
 from reporting.folders import closing_lock, lock_folder
-from reporting.json_file import parse_json
+from reporting.json_file import JsonObject, JsonRecord, parse_json
 from reporting.progress import Stage, stage
 from twin_master.assets.library_source import (
     FORMAT,
@@ -245,12 +244,12 @@ def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
     return sensor_count
 
 
-def _library_record(grid: SamplingGrid) -> dict[str, Any]:
+def _library_record(grid: SamplingGrid) -> JsonObject:
     """Return all that determines a library: the grid, the hashes of the files, and the version.
 
     The time limit of a step has no influence, and is left out.
     """
-    record: dict[str, Any] = json.loads(json.dumps(asdict(grid)))
+    record: JsonObject = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
     record["fmu"] = hash_file(Path(grid.fmu))
     record["binding"] = hash_file(Path(grid.binding))
@@ -258,9 +257,7 @@ def _library_record(grid: SamplingGrid) -> dict[str, Any]:
     return record
 
 
-def _prepare_folder(
-    out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool
-) -> Path:
+def _prepare_folder(out: Path, record: JsonObject, *, resume: bool, replace_existing: bool) -> Path:
     """Return the folder for finished blocks: a new one, or that of an interrupted sampling.
 
     An interrupted sampling is continued only if `resume` is set and its record is the same.
@@ -295,7 +292,7 @@ def _prepare_folder(
     return folder
 
 
-def _differing_keys(former_plan: bytes, record: dict[str, Any]) -> str:
+def _differing_keys(former_plan: bytes, record: JsonObject) -> str:
     """Return the keys in which the plan of an earlier sampling differs from the present one."""
     try:
         former_record = parse_json(former_plan, PLAN_NAME, MissionInputError)
@@ -326,7 +323,7 @@ def _rows_on_disk(folder: Path, shape: tuple[int, int]) -> Float:
 
 
 def sampled_dataset(
-    grid: SamplingGrid, binding: Binding, record: Mapping[str, Any], rows: Float
+    grid: SamplingGrid, binding: Binding, record: JsonRecord, rows: Float
 ) -> xr.Dataset:
     """Return the observations of a grid as a labelled dataset.
 

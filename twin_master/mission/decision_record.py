@@ -1,12 +1,9 @@
 """The decision in a line of a journal, as a record and in words for the operator."""
 
-from collections.abc import Mapping
-from typing import Any
-
+from reporting.json_file import JsonObject, JsonRecord
 from twin_master.mission.journal import array_from_json
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.run_folder import JsonObject
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 
@@ -14,9 +11,7 @@ _KEYS_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
 """The entries of a suspicion that are copied into the decision."""
 
 
-def decision_from_line(
-    line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel
-) -> JsonObject:
+def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalModel) -> JsonObject:
     """Return the decision in a line of a journal; empty if the line contains none.
 
     A decision always states the probability of its control. If no state is believed, because most
@@ -60,7 +55,7 @@ def decision_from_line(
 
 
 def _health_record(
-    line: Mapping[str, Any], scenario: Scenario, model: GraphicalModel, *, is_believed: bool
+    line: JsonRecord, scenario: Scenario, model: GraphicalModel, *, is_believed: bool
 ) -> JsonObject:
     """Return believed mean, standard deviation and unit of each state factor, by its name."""
     filtered_belief = array_from_json(line["filtered"])
@@ -76,7 +71,7 @@ def _health_record(
     return health
 
 
-def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
+def health_in_words(decision: JsonRecord) -> dict[str, str]:
     """Return mean and standard deviation of each state factor as text, such as "20 ± 3 %".
 
     For a state that is not believed the text is "not believed".
@@ -94,7 +89,7 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     return texts
 
 
-def decision_line(scenario: Scenario, decision: Mapping[str, Any]) -> str:
+def decision_line(scenario: Scenario, decision: JsonRecord) -> str:
     """Return a decision as a line of text for the operator."""
     health_text = "no state is believed"
     if decision.get("state_believed", True):

@@ -17,17 +17,16 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import BinaryIO, NamedTuple, Self
 
 import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_error
 from reporting.former_names import with_present_names
-from reporting.json_file import plain
+from reporting.json_file import JsonObject, plain
 from twin_master.errors import NotResumableError
 from twin_master.mission.steps import GroundTruth, MissionStep, Reading
-from twin_master.run_folder import JsonObject
 
 JOURNAL_NAME = "journal.jsonl"
 PRESENT_NAMES = {
@@ -294,7 +293,7 @@ def records_in_file(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[Jour
         begin = end
 
 
-def record_of_line(line: bytes, path: Path) -> dict[str, Any] | None:
+def record_of_line(line: bytes, path: Path) -> JsonObject | None:
     """Return the record of a line, or None if the line does not match the hash that it begins with.
 
     If the line was written by an earlier version, its keys are replaced by their present names.

@@ -10,12 +10,13 @@ import importlib.util
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, cast
 
 from numpy.typing import ArrayLike
 
+from fe.runtime.errors import PlugInError
+from fe.runtime.plug_ins import find_plug_in, plug_in_names
 from reporting.arrays import Float
 from reporting.words import listing
 from twin_master.errors import MissionInputError, NotResumableError
@@ -235,7 +236,7 @@ NO_PARTS = TwinParts()
 
 def _is_name_of_policy(text: str) -> bool:
     """Return whether a text is the name of a policy, and not the file of one."""
-    return ":" in text or bool(entry_points(group=ENTRY_POINT_GROUPS["policy"], name=text))
+    return ":" in text or text in plug_in_names(ENTRY_POINT_GROUPS["policy"])
 
 
 def _is_estimator(part: object) -> bool:
@@ -266,13 +267,16 @@ def object_by_name(role: str, name: str) -> object:
     Raises
     ------
     MissionInputError
-        If there is no such object, or if its module cannot be imported.
+        If there is no such object, if its module cannot be imported, or if two installed packages
+        have an entry point with this name.
     """
     words = role.replace("_", " ")
     group = ENTRY_POINT_GROUPS[role]
+    with MissionInputError.instead_of(PlugInError):
+        plug_in = find_plug_in(group, name)
+    if plug_in is not None:
+        return plug_in.value
     try:
-        for point in entry_points(group=group, name=name):
-            return point.load()
         file, colon, attribute = name.rpartition(":")
         if colon and file.endswith(".py"):
             return _object_of_file(Path(file), attribute)
@@ -283,7 +287,7 @@ def object_by_name(role: str, name: str) -> object:
             f"the {words} {name!r} cannot be loaded ({type(error).__name__}: {error}): give "
             "MODULE:NAME of a module that Python finds, or FILE.py:NAME."
         ) from error
-    installed = sorted(point.name for point in entry_points(group=group))
+    installed = plug_in_names(group)
     raise MissionInputError(
         f"there is no {words} {name!r}: give MODULE:NAME, FILE.py:NAME, or the name of an entry "
         f"point of the group {group} (installed: {listing(installed) or 'none'})."

@@ -4,7 +4,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,7 +20,11 @@ from reporting.progress import Progress, SilentProgress
 from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.assets.resolution import (
+    OverridesOrMapping,
+    asset_source,
+    resolve_scenario,
+)
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
@@ -430,7 +434,7 @@ def prepare_knowledge(
 
 def prepare_twin(
     scenario: LoadedScenario | str | Path,
-    overrides: Overrides | Mapping[str, Any] | None = None,
+    overrides: OverridesOrMapping | None = None,
     *,
     progress: Progress | None = None,
 ) -> Knowledge:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from reporting.json_file import JsonObject
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import (
     JournalLine,
@@ -17,7 +18,6 @@ from twin_master.mission.journal import (
 )
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, MissionStep, Reading
-from twin_master.run_folder import JsonObject
 
 
 @dataclass(frozen=True)

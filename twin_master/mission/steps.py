@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
-from reporting.arrays import Float, Index
+from reporting.arrays import AnyArray, Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.network.estimator import Notice, Suspicion
@@ -90,7 +90,7 @@ class _StackedAttribute:
     def __init__(self, path: str) -> None:
         self._attribute_of = attrgetter(path)
 
-    def __get__(self, history: "History", _owner: type) -> NDArray[Any]:
+    def __get__(self, history: "History", _owner: type) -> AnyArray:
         return np.array([self._attribute_of(step) for step in history.steps])
 
 

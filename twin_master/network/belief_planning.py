@@ -78,11 +78,13 @@ class _Bounds:
     def raise_lower_bound_at(self, belief: Float) -> None:
         """Improve the lower bound at a belief (S,), by the vector of the best control there."""
         problem = self.problem
-        next_rows = [problem.next_beliefs(belief, u) for u in range(len(problem.discount))]
+        controls = range(len(problem.discount))
+        next_rows = [problem.next_beliefs(belief, control) for control in controls]
         return_later = np.array([self.lower_bound_at(rows).sum() for rows in next_rows])
         action_value = belief @ problem.reward + problem.discount * return_later
         best_control = int(np.argmax(action_value))
-        if action_value[best_control] > self.lower_bound_at(belief[None])[0] + _LEAST_IMPROVEMENT:
+        present_bound = self.lower_bound_at(belief[None])[0]
+        if action_value[best_control] > present_bound + _LEAST_IMPROVEMENT:
             vector = self.backup(best_control, next_rows[best_control])
             # A vector is dropped if the new one is at least as large in every state.
             is_needed = ~np.all(self.vectors <= vector, axis=1)
@@ -128,8 +130,10 @@ class _Bounds:
         If a first control is given, it is taken in the first step.
         """
         if first is None:
-            rows = belief[None]
-            return float(self.lower_bound_at(rows)[0]), float(self.upper.bound_at(rows)[0])
+            row = belief[None]
+            lower = float(self.lower_bound_at(row)[0])
+            upper = float(self.upper.bound_at(row)[0])
+            return lower, upper
         rows = self.problem.next_beliefs(belief, first)
         reward = float(belief @ self.problem.reward[:, first])
         discount = float(self.problem.discount[first])

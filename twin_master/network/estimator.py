@@ -9,19 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float
+from reporting.arrays import AnyArray, Float
+from reporting.json_file import JsonObject
 from reporting.words import listing
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_sequence, smooth
 from twin_master.scenario.schema import Scenario
 
-CarriedArrays = Mapping[str, NDArray[Any]]
+CarriedArrays = Mapping[str, AnyArray]
 """Arrays of several types by name, which an estimator carries from step to step."""
 BELIEVED = 0.5
 """Largest probability that no state explains the sensors, up to which a state is believed.
@@ -126,7 +127,7 @@ class Notice:
     value: float | None = None
     since: int | None = None
 
-    def as_record(self) -> dict[str, Any]:
+    def as_record(self) -> JsonObject:
         """Return the notice as a record for the journal, with a list for the tuple of sensors."""
         return vars(self) | {"sensors": list(self.sensors)}
 

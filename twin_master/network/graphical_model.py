@@ -172,8 +172,10 @@ class StateSpace:
         grid = table.reshape(*self.shape, *table.shape[1:])
         changes = []
         for axis, factor in enumerate(self.factors):
-            change = _change_within_interval(np.moveaxis(grid, axis, -1), factor.levels)
-            changes.append(np.moveaxis(change, -1, axis).reshape(table.shape))
+            levels_last = np.moveaxis(grid, axis, -1)
+            change = _change_within_interval(levels_last, factor.levels)
+            change_in_place = np.moveaxis(change, -1, axis)
+            changes.append(change_in_place.reshape(table.shape))
         return np.stack(changes, axis=-1)
 
     def marginal(self, belief: ArrayLike, name: str) -> Float:
@@ -213,9 +215,14 @@ def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
     # With m the integral of x (v(x) - v), q that of x², and w the width of the interval, the change
     # is m / q sqrt(q / w) = m / sqrt(q w), where 24 m = sum h² d, 24 q = sum h³, 2 w = sum h.
     moment = step**2 * difference
-    divisor = np.sqrt(12.0 * (step[1:] + step[:-1]) * (step[1:] ** 3 + step[:-1] ** 3))
+    step_below = step[:-1]
+    step_above = step[1:]
+    sum_of_steps = step_above + step_below
+    sum_of_cubes = step_above**3 + step_below**3
+    sum_of_moments = moment[..., 1:] + moment[..., :-1]
+    divisor = np.sqrt(12.0 * sum_of_steps * sum_of_cubes)
     safe_divisor = np.where(divisor > 0.0, divisor, 1.0)
-    return np.asarray((moment[..., 1:] + moment[..., :-1]) / safe_divisor)
+    return np.asarray(sum_of_moments / safe_divisor)
 
 
 @dataclass(frozen=True)
@@ -360,7 +367,8 @@ def repaired_table(table: Float, success: float) -> Float:
         The probability that the repair succeeds.
     """
     result = (1.0 - success) * table
-    result[:, 0] += success
+    undamaged = 0  # the lowest level
+    result[:, undamaged] += success
     # Rows sum to one but for rounding, which the division removes.
     return np.asarray(result / result.sum(axis=1, keepdims=True), dtype=np.float64)
 

@@ -182,7 +182,8 @@ def log_forecast(transition: TransitionModel, control: Index, log_filtered: Floa
     beliefs, _ = filter_many(transition, control[:, None], no_information, log_filtered, control)
     # The filter normalises each belief. Without information, the evidence is the sum of the belief
     # before that: adding its logarithm restores the sum.
-    return np.asarray(beliefs.log_filtered[:, 0] + beliefs.log_evidence)
+    log_filtered_of_step = beliefs.log_filtered.squeeze(axis=1)
+    return np.asarray(log_filtered_of_step + beliefs.log_evidence)
 
 
 def smooth_many(

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, Index
+from reporting.arrays import AnyArray, Float, Index
 from reporting.words import comma_list
 from twin_master.errors import PlanningError
 from twin_master.network.kernels import sweep_bellman
@@ -50,7 +49,7 @@ class BeliefPolicy:
     control: Index
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> BeliefPolicy:
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], prefix: str = "") -> BeliefPolicy:
         """Return the policy whose two arrays were read from a file.
 
         Parameters
@@ -168,7 +167,8 @@ def decision_probability(
         controls = [on_belief.decide(row) for row in belief]
         return np.eye(policy.shape[1])[controls]
     # One product for each twin, so that its last bit does not depend on the number of twins.
-    return np.asarray(np.matmul(belief[:, None, :], policy)[:, 0])
+    row_vectors = belief[:, None, :]
+    return np.asarray(np.matmul(row_vectors, policy).squeeze(axis=1))
 
 
 def ration_controls(

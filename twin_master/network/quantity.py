@@ -188,9 +188,11 @@ class QuantityModel:
         mean = weight @ mean_table
         # Variance within a pair of state and control, plus that of the means. The latter is
         # centred, so that a certain belief gives the variance of the draws without cancellation.
-        variance = weight @ self.variance.reshape(-1, self.sensor_count)
+        variance_table = self.variance.reshape(-1, self.sensor_count)
+        variance = weight @ variance_table
         for row in range(len(weight)):
-            variance[row] += weight[row] @ (mean_table - mean[row]) ** 2
+            squared_distance = (mean_table - mean[row]) ** 2
+            variance[row] += weight[row] @ squared_distance
         shape = (*joint.shape[:-2], self.sensor_count)
         return mean.reshape(shape), np.sqrt(variance).reshape(shape)
 
@@ -214,7 +216,8 @@ class QuantityModel:
         joint = self.check_joint(joint)
         levels = np.array(levels, dtype=np.float64)
         is_increasing = levels.ndim == 1 and not np.any(np.diff(levels) < 0)
-        if not is_increasing or not np.all((levels > 0.0) & (levels <= 1.0)):
+        is_probability = (levels > 0.0) & (levels <= 1.0)
+        if not is_increasing or not np.all(is_probability):
             raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {levels}")
         weight = joint.reshape(-1, self.state_count * self.control_count)
         weight = np.require(weight, np.float64, ["C", "W"])  # as the compiled loop expects it
@@ -247,15 +250,17 @@ def _error_moments(
     standard_deviation = np.sqrt(variance)
     standardized = np.full_like(distance, np.inf)  # for a value without variance
     np.divide(distance, standard_deviation, out=standardized, where=standard_deviation > 0.0)
+    # moments of the folded normal distribution
+    gaussian = np.exp(-0.5 * standardized**2)
     folded_mean = distance * (1.0 - 2.0 * ndtr(-standardized))
-    folded_mean += standard_deviation * np.sqrt(2.0 / np.pi) * np.exp(-0.5 * standardized**2)
+    folded_mean += standard_deviation * np.sqrt(2.0 / np.pi) * gaussian
     folded_variance = np.maximum(distance**2 + variance - folded_mean**2, 0.0)
-    cost_per_distance = 1.0 / (
-        np.broadcast_to(scale, mean.shape)[..., is_present] * is_present.sum()
-    )
-    return -(folded_mean * cost_per_distance).sum(axis=-1), (
-        folded_variance * cost_per_distance**2
-    ).sum(axis=-1)
+    # the mean over the present sensors, in units of their scales
+    scale_of_present = np.broadcast_to(scale, mean.shape)[..., is_present]
+    cost_per_distance = 1.0 / (scale_of_present * is_present.sum())
+    cost = (folded_mean * cost_per_distance).sum(axis=-1)
+    cost_variance = (folded_variance * cost_per_distance**2).sum(axis=-1)
+    return -cost, cost_variance
 
 
 def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float, Float]:

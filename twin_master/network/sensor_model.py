@@ -305,7 +305,7 @@ class GaussianSensorModel(QuantityModel):
             If the shape is wrong, if a value is infinite, or if there is no such control.
         """
         values, other_log_density = self.split_observation(observation)
-        log_density = self._log_densities(values[None], [control_index], 1)[0, :, 0]
+        log_density = self._log_densities(values[None], [control_index], 1).squeeze(axis=(0, 2))
         return np.asarray(log_density + other_log_density)
 
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
@@ -317,7 +317,7 @@ class GaussianSensorModel(QuantityModel):
             As `log_likelihood`.
         """
         values, other_log_density = self.split_observation(observations)
-        log_density = self._log_densities(values, control_index, 1)[..., 0]
+        log_density = self._log_densities(values, control_index, 1).squeeze(axis=-1)
         return np.asarray(log_density + other_log_density)
 
     def log_density_of_draws(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
@@ -374,7 +374,7 @@ class GaussianSensorModel(QuantityModel):
         Steps with the same control and the same sensors are computed together.
         """
         # The row of truth values as bytes is a key of a dictionary.
-        present_bytes = is_present.view(f"V{self.sensor_count}")[:, 0].tolist()
+        present_bytes = is_present.view(f"V{self.sensor_count}").squeeze(axis=1).tolist()
         rows_by_control_and_sensors: dict[tuple[int, bytes], list[int]] = {}
         for row, control_and_sensors in enumerate(
             zip(control.tolist(), present_bytes, strict=True)
@@ -488,8 +488,8 @@ class GaussianSensorModel(QuantityModel):
         normal_matrix = np.eye(design.shape[-1]) + design.swapaxes(1, 2) @ design
         covariance = np.linalg.inv(normal_matrix)  # (S, F, F)
         regression = covariance @ design.swapaxes(1, 2)  # (S, F, G)
-        point = (regression @ residual[..., None])[..., 0]  # (E, S, F)
-        change = (interval @ point[..., None])[..., 0]  # (E, S, G)
+        point = (regression @ residual[..., None]).squeeze(axis=-1)  # (E, S, F)
+        change = (interval @ point[..., None]).squeeze(axis=-1)  # (E, S, G)
 
         # Leave-one-out residual of a linear regression: the residual over (1 - leverage), where the
         # leverage is the derivative of the fitted value by the observed one.

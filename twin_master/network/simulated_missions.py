@@ -48,8 +48,7 @@ def simulated_returns(
     # For each step and mission one number for the transition and one for the observation; the last
     # row draws the first state.
     uniform = generator.random((steps + 1, 2, missions))
-    uniform_transition = uniform[:, 0]
-    uniform_observation = uniform[:, 1]
+    uniform_transition, uniform_observation = uniform.swapaxes(0, 1)
     belief = np.tile(problem.prior, (missions, 1))
     states = _draw_indices(belief, uniform_transition[steps])
     filtered_beliefs = belief.copy()

@@ -178,17 +178,27 @@ def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
         For each block p(next level | level) under each of U controls; the number L of levels may
         differ from block to block.
     """
-    # Tables (U L, L) of each block: row (control, next level), column level.
-    tables = [block.transpose(0, 2, 1).reshape(-1, block.shape[1]) for block in blocks]
-    non_zero_counts = np.concatenate([np.count_nonzero(table, axis=1) for table in tables])
-    probability = np.concatenate([table[table != 0.0] for table in tables])
-    predecessor = np.concatenate([np.nonzero(table)[1] for table in tables])
+    level_counts = [block.shape[1] for block in blocks]
+    row_counts = []
+    entry_counts = []
+    predecessors = []
+    probabilities = []
+    for block, level_count in zip(blocks, level_counts, strict=True):
+        # table (U L, L) of the block: row (control, next level), column level
+        table = block.transpose(0, 2, 1).reshape(-1, level_count)
+        row, level = np.nonzero(table)
+        row_counts.append(len(table))
+        entry_counts.append(np.count_nonzero(table, axis=1))
+        predecessors.append(level)
+        probabilities.append(table[row, level])
     # The rows of all blocks stand one after the other, and so do the entries of all rows.
-    first_row = np.cumsum([0, *map(len, tables)])[:-1]
-    first_entry = np.cumsum([0, *non_zero_counts])
+    first_row = np.cumsum([0, *row_counts])[:-1]
+    first_entry = np.cumsum([0, *np.concatenate(entry_counts)])
+    predecessor = np.concatenate(predecessors)
+    probability = np.concatenate(probabilities)
     # Indices are unsigned, so that the compiled loops need not test for negative ones.
     return PredecessorLists(
-        levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
+        levels=np.array(level_counts, dtype=np.int64),
         first_row=first_row,
         start=first_entry.astype(np.uint64),
         predecessor=predecessor.astype(np.uint64),

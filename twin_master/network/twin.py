@@ -9,14 +9,14 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from reporting.arrays import Float
+from reporting.arrays import AnyArray, Float
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
@@ -402,7 +402,7 @@ class Twin:
 
     def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
         """Return the state after a number of steps, with some of them kept."""
-        arrays: dict[str, NDArray[Any]] = {"steps": np.array([steps, self._proposed])}
+        arrays: dict[str, AnyArray] = {"steps": np.array([steps, self._proposed])}
         for index, kept_step in enumerate(kept_steps):
             arrays[f"{index}/observation"] = kept_step.observation
             arrays[f"{index}/control"] = np.array(kept_step.carried.control_index)
@@ -544,7 +544,7 @@ class Twin:
         return np.asarray(probability[0])
 
 
-def _kept_step_from_arrays(arrays: Mapping[str, NDArray[Any]], index: int) -> _KeptStep:
+def _kept_step_from_arrays(arrays: Mapping[str, AnyArray], index: int) -> _KeptStep:
     """Return the kept step of an index among the arrays of a saved state."""
     prefix = f"{index}/carried/"
     carried_arrays = {

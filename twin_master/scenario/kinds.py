@@ -3,11 +3,13 @@
 What flies (`asset`) and what the twin believes (`belief`) are each one of several kinds. A kind is
 one class in one file: a subclass of `AssetSection` or `BeliefSection` in a file whose name ends in
 `_source`, beside `assets/asset_source.py`. Its fields are the keys that a user writes; its method
-`source` makes of them what the mission needs. No other code names the kinds.
+`source` makes of them what the mission needs. No other code names the kinds. An installed package
+adds a kind by an entry point for such a class.
 """
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -16,6 +18,8 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import GetJsonSchemaHandler, ModelWrapValidatorHandler, model_validator
 from pydantic_core import CoreSchema
 
+from fe.runtime.errors import PlugInError
+from fe.runtime.plug_ins import load_plug_ins
 from reporting.toml_file import missing_keys, short_repr
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.scenario.section import Section, Table
@@ -99,6 +103,8 @@ class KindSection(FileSection):
 
     kind: str
     """The kind of the table, which decides its other keys."""
+    entry_point_group: ClassVar[str]
+    """Group of the entry points of kinds: the name is the kind, the object is its class."""
     has_unique_model: ClassVar[bool] = False
     """Whether its observations come from a model that no other kind flies or believes."""
 
@@ -110,10 +116,17 @@ class KindSection(FileSection):
 
     @classmethod
     def kinds(cls) -> dict[str, type[Self]]:
-        """Import the modules that define kinds; return the subclasses by their kinds."""
+        """Import the modules that define kinds; return the subclasses by their kinds.
+
+        Raises
+        ------
+        PlugInError
+            If a kind of an installed package cannot be loaded, or does not fit.
+        """
         for module in iter_modules([str(KIND_FOLDER)]):
             if module.name.endswith("_source"):
                 import_module(f"{KIND_PACKAGE}.{module.name}")
+        check_installed_kinds(cls)
         kinds = {}
         for subclass in _all_subclasses(cls):
             kind = subclass.kind_of_class()
@@ -179,6 +192,8 @@ _Section = TypeVar("_Section", bound=KindSection)
 class BeliefSection(KindSection):
     """What the twin believes: the model that predicts its observations."""
 
+    entry_point_group = "uav_twin.beliefs"
+
     @abstractmethod
     def source(self, scenario: Any, flown_source: Any) -> Any:
         """Return the source of the twin's predictions.
@@ -200,6 +215,7 @@ class BeliefSection(KindSection):
 class AssetSection(KindSection):
     """What flies."""
 
+    entry_point_group = "uav_twin.assets"
     is_fmu: ClassVar[bool] = False
     """Whether one or several FMUs fly; an FMU may carry damage and sensors of its own."""
 
@@ -227,6 +243,41 @@ class AssetSection(KindSection):
         AssetSource
             The source, which prepares and opens the asset.
         """
+
+
+@cache
+def check_installed_kinds(base: type[KindSection]) -> None:
+    """Load the kinds of installed packages, once in a process, and refuse what does not fit.
+
+    Parameters
+    ----------
+    base : type
+        `AssetSection` or `BeliefSection`. The classes that are loaded are subclasses of it.
+
+    Raises
+    ------
+    PlugInError
+        If two entry points have the same name, if one cannot be loaded, or if one is not a class
+        for its kind or has a kind of uav-twin.
+    """
+    own_kinds = []
+    for subclass in _all_subclasses(base):
+        if subclass.__module__.startswith(KIND_PACKAGE):
+            own_kinds.append(subclass.kind_of_class())
+    for plug_in in load_plug_ins(base.entry_point_group):
+        section = plug_in.value
+        if not (isinstance(section, type) and issubclass(section, base)):
+            raise PlugInError(
+                f"{plug_in.subject} must be a subclass of {base.__name__}, but is {section!r}."
+            )
+        kind = section.kind_of_class()
+        if kind in own_kinds:
+            raise PlugInError(
+                f"{plug_in.subject} has the kind {kind!r}, which uav-twin has itself: choose "
+                "another `kind`."
+            )
+        if kind != plug_in.name:
+            raise PlugInError(f"{plug_in.subject} has another name than its kind, {kind!r}.")
 
 
 def _all_subclasses(cls: type[_Section]) -> Iterator[type[_Section]]:

@@ -4,13 +4,14 @@ A key may carry its unit in its name (`levels_percent`); the value is converted 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
 
 from reporting import toml_file
 from reporting.choices import nearest_word
+from reporting.json_file import JsonDocument
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
 
 Table: TypeAlias = toml_file.TomlTable
@@ -177,7 +178,7 @@ def _relax_required_keys(table: Table, keys: set[str]) -> None:
         table["required"] = [key for key in table["required"] if key not in keys]
 
 
-def _schema_in_unit(schema: Any, divisor: float) -> Any:
+def _schema_in_unit(schema: JsonDocument, divisor: float) -> JsonDocument:
     """Return the JSON Schema of a value in SI for the same value in a unit.
 
     Parameters

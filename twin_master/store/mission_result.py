@@ -11,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.json_file import plain
+from reporting.json_file import JsonObject, plain
 from reporting.words import capital, parameter_title
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, spans_of_models
 from twin_master.mission.steps import History, Truth
 from twin_master.network.estimator import Learnt
-from twin_master.run_folder import JsonObject
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 

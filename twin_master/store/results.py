@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from reporting.arrays import Float
+from reporting.arrays import AnyArray, Float
 from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import Expectation, concatenate_expectations
@@ -38,7 +38,7 @@ class Entry(NamedTuple):
     """
 
     name: str
-    values: NDArray[Any]
+    values: AnyArray
     fields: SchemaFields = _NO_FIELDS
 
 
@@ -340,7 +340,7 @@ def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:
         yield Entry("{monitor}", values, fields)
 
 
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, AnyArray]
 """The numbers or texts of each column of a table, by its heading."""
 
 
@@ -365,7 +365,7 @@ class _TableMaker:
         return {"step": np.array([str(step) for step in self.groups["observed"]["step"].values])}
 
     @property
-    def controls(self) -> NDArray[Any]:
+    def controls(self) -> AnyArray:
         """The names of the controls."""
         return self.groups["policy"]["control"].values
 
@@ -456,7 +456,7 @@ def csv_tables(
     return texts
 
 
-def _columns(heading: str, names: Iterable[str], values: NDArray[Any]) -> Columns:
+def _columns(heading: str, names: Iterable[str], values: AnyArray) -> Columns:
     """Return the N columns of an array (T, N), each under its heading.
 
     Parameters
@@ -471,7 +471,7 @@ def _columns(heading: str, names: Iterable[str], values: NDArray[Any]) -> Column
     return {heading.format(name): column for name, column in zip(names, values.T, strict=True)}
 
 
-def _cells(values: NDArray[Any]) -> list[str]:
+def _cells(values: AnyArray) -> list[str]:
     """Return the cells of a column, with six digits; empty if the value is NaN."""
     if isinstance(values[0], str):
         return [str(value) for value in values]

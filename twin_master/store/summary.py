@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
+from reporting.json_file import JsonObject
 from reporting.words import counted, parameter_title
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
-from twin_master.run_folder import JsonObject
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (

@@ -11,13 +11,13 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text, hash_record
 from reporting.folders import restore_folder
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from reporting.notebook import html_table
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.pictures import plot_belief
-from twin_master.run_folder import FIELD_NAME, JsonObject, read_config, to_json
+from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.printed_figures import printed_figures
 from twin_master.store.results import csv_tables, run_groups

@@ -12,12 +12,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
+from reporting.json_file import JsonObject
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import (
     Expectation,
@@ -35,7 +36,7 @@ from twin_master.viewer.force_drawing import ForceDrawing, find_force_drawing
 MOST_NEW_LINES = 200
 """Largest number of lines that an update reads, so that viewers are answered in between."""
 
-StepRecord = dict[str, Any]
+StepRecord = JsonObject
 """The line of a step in the journal; `docs/reference/run_folder.md` lists its keys."""
 
 

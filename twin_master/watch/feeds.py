@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from twin_master.watch.lines import Pipe
 from twin_master.watch.message import FeedItem, MessageReader, Refused
 from twin_master.watch.recorded_feeds import FolderFeed, RunFeed, beginning_of
 
-Observations = Iterable[Mapping[str, Any]] | str | Path
+Observations = Iterable[Mapping[str, object]] | str | Path
 """Messages of a program, or a file, an address, or "-" for standard input."""
 STANDARD_INPUT = "-"
 
@@ -52,7 +52,7 @@ def feed_of_json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
     return Feed(_read_messages(scenario, Pipe(stream, polls=notices_silence)))
 
 
-def feed_of_mappings(scenario: Scenario, messages: Iterable[Mapping[str, Any]]) -> Feed:
+def feed_of_mappings(scenario: Scenario, messages: Iterable[Mapping[str, object]]) -> Feed:
     """Return the feed of the messages of a program, which may have arrays in the place of lists."""
     contents = (json.dumps(message, default=_as_list).encode() for message in messages)
     return Feed(_read_messages(scenario, contents))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
+from reporting.json_file import JsonObject
 from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
@@ -46,13 +47,7 @@ from twin_master.watch.patch_trial import (
     outcome_of_patch,
     patched_model,
 )
-from twin_master.watch.records import (
-    Decision,
-    DecisionSink,
-    JournalLine,
-    JsonObject,
-    ModelRecord,
-)
+from twin_master.watch.records import Decision, DecisionSink, JournalLine, ModelRecord
 from twin_master.watch.rejected import REJECTED_NAME
 from twin_master.watch.signals import call_on_end_signal
 from twin_master.watch.teaching import Teaching

@@ -2,15 +2,15 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import encode_state, step_record
@@ -22,7 +22,6 @@ from twin_master.watch.clock import Clock
 from twin_master.watch.feed import Feed
 from twin_master.watch.lines import Position
 from twin_master.watch.message import FeedItem, Message, Refused
-from twin_master.watch.records import JsonObject
 from twin_master.watch.rejected import RejectedFile
 from twin_master.watch.step_status import StepStatus
 from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices, unit_advice
@@ -222,7 +221,7 @@ class Intake:
             record["notices"] = record.get("notices", []) + new_notices
         return record
 
-    def restore(self, state: Mapping[str, Any] | None) -> None:
+    def restore(self, state: JsonRecord | None) -> None:
         """Restore the state of an earlier process of the watch, so that reading goes on after it.
 
         If the feed is the file that was read before, reading goes on at the recorded position.

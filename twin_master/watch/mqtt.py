@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from reporting.files import atomic_write_text, explained_write_errors
+from reporting.json_file import JsonObject
 from twin_master.mission.journal import JOURNAL_NAME, last_step, records
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker_address import Broker
@@ -16,7 +17,7 @@ from twin_master.watch.lines import Position
 from twin_master.watch.message import FeedItem, Message, MessageReader, Refused
 from twin_master.watch.mqtt_session import LONGEST_RETRY_SECONDS, Session
 from twin_master.watch.recorded_feeds import beginning_of
-from twin_master.watch.records import Decision, JsonObject
+from twin_master.watch.records import Decision
 
 PUBLISHED_NAME = "published"
 """The file of a watch with the size of that part of the journal whose decisions the broker has."""

@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from reporting.errors import DamagedFileError
-from reporting.json_file import read_json
+from reporting.json_file import JsonObject, read_json
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
 from twin_master.assets.resolution import (
     Overrides,
+    OverridesOrMapping,
     as_overrides,
     believed_source,
     resolve_scenario,
@@ -35,7 +36,7 @@ from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
 from twin_master.watch.recorded_feeds import RecordedFeed
-from twin_master.watch.records import Decision, DecisionSink, JsonObject
+from twin_master.watch.records import Decision, DecisionSink
 from twin_master.watch.result import STORED_STEPS, store_watch
 from twin_master.watch.teaching import check_teachable
 from twin_master.watch.tutor import Tutor
@@ -250,7 +251,7 @@ def watch(
     scenario: LoadedScenario | str | Path | None = None,
     observations: Observations | None = None,
     folder: Path | str | None = None,
-    overrides: Overrides | Mapping[str, Any] | None = None,
+    overrides: OverridesOrMapping | None = None,
     *,
     decide: DecisionSink = _ignore_decision,
     resume: bool = False,

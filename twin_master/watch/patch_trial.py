@@ -14,6 +14,7 @@ import numpy as np
 
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
+from reporting.json_file import JsonObject
 from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
@@ -24,7 +25,6 @@ from twin_master.mission.residuals import residual_summary
 from twin_master.mission.steps import History
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.watch.records import JsonObject
 
 PATCH_ERRORS = (TwinMasterError, FmuError, FiniteElementError)
 """The errors that say that a twin cannot believe a patch."""

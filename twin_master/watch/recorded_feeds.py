@@ -12,6 +12,7 @@ import xarray as xr
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
+from reporting.json_file import JsonObject
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_from_json, record_of_line
@@ -26,7 +27,7 @@ from twin_master.watch.message import (
     MessageReader,
     Refused,
 )
-from twin_master.watch.records import JournalLine, JsonObject
+from twin_master.watch.records import JournalLine
 from twin_master.watch.step_status import StepStatus
 
 _TEXT_CHARACTERS = 300

@@ -1,13 +1,13 @@
 """What a watch writes and publishes as JSON: lines of its journal, decisions, verdicts, models."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, NotRequired, TypedDict
+from collections.abc import Callable
+from typing import NotRequired, TypedDict
 
-JsonObject = dict[str, Any]
-"""An object of JSON, whose keys the function says that makes it."""
-JournalLine = Mapping[str, Any]
+from reporting.json_file import JsonObject, JsonRecord
+
+JournalLine = JsonRecord
 """A line of `journal.jsonl`; `docs/reference/run_folder.md` lists its keys."""
-Decision = Mapping[str, Any]
+Decision = JsonRecord
 """A decision as it is published; `docs/how_to/watch.md` lists its keys."""
 DecisionSink = Callable[[Decision], object]
 """A function that is called with each decision, once its step is in the journal."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
 
+from reporting.json_file import JsonObject
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.mission.journal import last_step, records_backwards
 from twin_master.mission.replay import replay
@@ -13,7 +14,7 @@ from twin_master.store.summary import FigureGroup
 from twin_master.store.writing import store_flight
 from twin_master.watch.folder import WATCHED_ASSET, Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.records import JournalLine, JsonObject
+from twin_master.watch.records import JournalLine
 from twin_master.watch.rejected import REJECTED_NAME
 
 STORED_STEPS = 1_000

@@ -1,11 +1,10 @@
 """Notices about a stream of messages as a whole, each given once until its cause is over."""
 
 from collections.abc import Mapping
-from typing import Any
 
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.words import counted, listing
 from twin_master.network.estimator import Notice, NoticeWording
-from twin_master.watch.records import JsonObject
 
 REFUSALS_IN_A_ROW = 3
 """Number of messages refused in a row after which the operator gets a notice."""
@@ -83,7 +82,7 @@ class StreamNotices:
         # A journal leaves out what is zero, false or empty
         return {key: value for key, value in state.items() if value}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def restore(self, state: JsonRecord) -> None:
         """Restore a state that `state` returned; what it leaves out gets its initial value."""
         self._gap_end = state.get("gap_end", -1)
         self._clock_is_reported = state.get("clock", False)

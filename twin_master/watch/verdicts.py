@@ -1,12 +1,11 @@
 """Verdicts of searches for the cause of an alarm: which patch is tried, and which is adopted."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from fe.runtime.patch import SensorSaturation
 from reporting.errors import DamagedFileError
-from reporting.json_file import read_json
+from reporting.json_file import JsonRecord, read_json
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.watch.patch_trial import PatchOutcome
@@ -31,7 +30,7 @@ and at no other.
 ABSOLUTE_FIT = "absolute fit"
 """The gate of a verdict that says whether only noise is left unexplained by the named cause."""
 
-VerdictJson = Mapping[str, Any]
+VerdictJson = JsonRecord
 """The object `verdict` of `verdict.json`; `docs/reference/verdict.md` lists its keys."""
 
 

@@ -470,7 +470,7 @@ def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, coarse_patch_a
 def test_a_port_turns_as_what_is_measured_or_prescribed_of_it():
     model = model_of(INPUTS.text("turning.toml"))
     units = {name: model.port_units(name)[0] for name in model.ports}
-    known = {"measured": "N m", "driven": "N m", "straight": "N"}
+    known = {"measured": "N m", "driven": "N m", "straight": "N", "stretch": "N"}
     assert units == known | dict.fromkeys(("free", "half known", "mixed"), "N or N m")
 
 

@@ -13,6 +13,7 @@ from discrepancy.errors import ModelError
 from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.model_choice import choose_model
+from discrepancy.sources.examples import example_campaign, usual_plan
 from discrepancy.system.load_change import DEFAULT_PLACE
 from discrepancy.system.names_of_model import campaign_in_names_of
 from discrepancy.system.structures import WingModel
@@ -61,6 +62,24 @@ def test_a_loss_in_a_region_is_named_with_its_size(kind, beam_model) -> None:
     effects = library() if kind == "static" else RIVALS
     campaign = simulated(beam_model, kind, 3, ("region_stiffness_loss", {"loss": LOSS}, "z2"))
     check_that_the_loss_is_named(investigate(campaign, beam_model, effects, seed=3).verdict)
+
+
+def test_losses_in_two_regions_at_once_are_named_with_their_sizes(beam_model) -> None:
+    campaign = example_campaign(beam_model, "static", 3, usual_plan(beam_model))
+    hidden = {"z1": 0.3, "z2": 0.2}
+    patches = [
+        hiding(campaign, beam_model, "region_stiffness_loss", {"loss": loss}, region)
+        for region, loss in hidden.items()
+    ]
+    both = ModelPatch(tuple(primitive for one in patches for primitive in one))
+    damaged = example_campaign(beam_model, "static", 3, usual_plan(beam_model), both)
+    verdict = investigate(damaged, beam_model, library(), seed=3).verdict
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    found = {effect.place: effect.parameters[0] for effect in verdict.effects}
+    assert {effect.identifier for effect in verdict.effects} == {"region_stiffness_loss"}
+    assert found.keys() == hidden.keys()
+    for region, loss in hidden.items():
+        assert found[region].low - 0.01 < loss < found[region].high + 0.01
 
 
 def test_without_a_loss_nothing_is_named(beam_model) -> None:

@@ -18,12 +18,13 @@ from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, Window
+from fe.runtime.patch import PowerDamping, PowerStiffness, Primitive, StiffnessDrift, Window
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, integrated, model_of, one_mass, seen
 from tests.fe.runtime.stepping import exact
 
 HEIGHT, LOWER, CELL = {"height": Quantity.DISPLACEMENT}, {"lower": Quantity.LEVEL}, {"cell": Quantity.FORCE}
 FRICTION = PowerDamping("piston", 3.0, 0.0, 0.0, 1.0, 1.0)
+GUIDE_FRICTION = PowerDamping("guide", 5.0, 0.0, 0.0, 1.0, 1.0)
 
 
 def rig(name: str, *changes: tuple[str, str]) -> LumpedModel:
@@ -195,6 +196,40 @@ def test_a_shaken_base_and_a_hand_on_the_mass() -> None:
     x, v = solution[0] - w0(time), solution[1] - w1(time)
     drive = shake - 400.0 * x - 1.5 * v - 4.0 * np.abs(v) * v - 0.5 * hand
     np.testing.assert_allclose(found[:, 1], drive, atol=5e-3)
+
+
+@pytest.fixture
+def travelling_base() -> Any:
+    """A record of a base that is shaken while it travels by ten metres, and its position."""
+    time = np.linspace(0.0, 3.0, 601)
+    shake = 2.0 + 3.0 * np.sin(12.0 * time)
+    base = RecordedInput("base", Quantity.ACCELERATION, shake, Hold.SMOOTH)
+    return trial(time, base), CubicSpline(time, shake).antiderivative(2)(time)
+
+
+def test_a_stiffness_drifts_in_the_stretch_of_a_spring_not_in_the_way_of_its_base(travelling_base) -> None:
+    what, way = travelling_base
+
+    def slope(t: float, y: FloatArray) -> list[float]:
+        inertia = 2.0 * (2.0 + 3.0 * np.sin(12.0 * t))
+        return [y[1], (-400.0 * (1.0 + 0.1 * t) * y[0] - 1.5 * y[1] - inertia) / 2.0]
+
+    stretch = integrated(slope, what.time, [0.0, 0.0], max_step=0.004).T[0]
+    outputs = {"mass": Quantity.DISPLACEMENT}
+    found = seen(rig("base"), what, outputs, StiffnessDrift(0.1), refinement=4)[:, 0]
+    np.testing.assert_allclose(found - way, stretch, atol=2e-5)
+
+
+def test_friction_at_a_travelling_base_acts_as_on_a_base_at_rest_under_the_force_of_inertia(
+    travelling_base,
+) -> None:
+    what, way = travelling_base
+    found = seen(rig("base"), what, {"mass": Quantity.DISPLACEMENT}, GUIDE_FRICTION)[:, 0]
+    inertia = RecordedInput("hand", Quantity.FORCE, -2.0 * what.inputs[0].values, Hold.SMOOTH)
+    at_rest = RecordedInput("base", Quantity.ACCELERATION, np.zeros(len(way)), Hold.SMOOTH)
+    pushed = replace(what, inputs=(at_rest, inertia))
+    stretch = seen(rig("base"), pushed, {"mass": Quantity.DISPLACEMENT}, GUIDE_FRICTION)[:, 0]
+    np.testing.assert_allclose(found - way, stretch, rtol=0.0, atol=1e-10)
 
 
 def test_plain_models_take_driven_trials_and_other_begins() -> None:

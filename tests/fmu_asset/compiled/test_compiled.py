@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,8 @@ import pytest
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled import package
-from fmu_asset.compiled.compiler import CROSS_COMPILER
 from fmu_asset.compiled.package import data_file_bytes, pack_arrays
-from fmu_asset.packing.structure_fmu import build_fmu
-from tests.fmu_asset.making import DESCRIPTION, ROOT, members, run_python, tables
+from tests.fmu_asset.making import ROOT, members, run_python, run_well, tables
 from tests.test_documented_python import blocks
 
 DRIVER = Path(__file__).with_name("driver.c")
@@ -38,13 +35,6 @@ WARNINGS = (
     "-Wstrict-prototypes",
     "-Werror",
 )
-
-
-def run_well(words: list[Any], **options: Any) -> str:
-    """Run a program, which must end well, and return what it prints."""
-    run = subprocess.run(words, capture_output=True, text=True, check=False, **options)
-    assert run.returncode == 0, run.stdout + run.stderr
-    return run.stdout
 
 
 @pytest.fixture(scope="module")
@@ -218,80 +208,6 @@ def test_a_host_without_python_needs_nothing_else(
 
     expected = model.static_response({"load_factor": 1.0}).strain
     np.testing.assert_allclose([float(line) for line in output.split()], expected, rtol=1e-12)
-
-
-# ---------------------------------------------------------------------- Windows
-
-
-@pytest.fixture(scope="module")
-def windows_fmu(compiler, model, tmp_path_factory) -> Path:
-    """The compiled wing with binaries for Linux and Windows.
-
-    Skips if nothing compiles for Windows.
-    """
-    if shutil.which(CROSS_COMPILER) is None:
-        pytest.skip(f"{CROSS_COMPILER} is not installed")
-    path = tmp_path_factory.mktemp("windows") / "wing.fmu"
-    return build_fmu(model, path, kind="compiled", platforms=("linux64", "win64")).path
-
-
-@pytest.fixture(scope="module")
-def run_in_wine(tmp_path_factory) -> Callable[..., str]:
-    """A function that runs a program for Windows and returns what it prints.
-
-    Skips if wine is not installed.
-    """
-    if shutil.which("wine") is None:
-        pytest.skip("wine is not installed")
-    prefix = tmp_path_factory.mktemp("wine")
-    environment = {
-        **os.environ,
-        "WINEPREFIX": str(prefix),
-        "WINEDEBUG": "-all",
-        "LC_ALL": "C.UTF-8",
-    }
-    return lambda *words, **options: run_well(
-        ["wine", *words], timeout=120, env=environment, **options
-    )
-
-
-def test_binaries_of_further_platforms_leave_the_description(windows_fmu, compiled_fmu):
-    assert members(windows_fmu)[DESCRIPTION] == members(compiled_fmu)[DESCRIPTION]
-
-
-def test_the_windows_binary_needs_only_libraries_of_every_windows(windows_fmu, tmp_path):
-    shutil.unpack_archive(windows_fmu, tmp_path, "zip")
-    binary = next((tmp_path / "binaries" / "win64").glob("*.dll"))
-
-    headers = run_well([CROSS_COMPILER.replace("gcc", "objdump"), "-p", binary]).splitlines()
-
-    libraries = sorted(line.split()[-1].lower() for line in headers if "DLL Name" in line)
-    assert libraries == ["kernel32.dll", "msvcrt.dll"]
-
-
-@pytest.mark.parametrize("folder_name", ["plain", "Flügel Ω 100%"])
-def test_the_windows_binary_gives_the_same_under_wine(
-    windows_fmu, compiler, run_in_wine, tmp_path, folder_name
-):
-    """Statics, bound and modes to the last bit, also from a folder with letters beyond ASCII."""
-    folder = tmp_path / folder_name
-    shutil.unpack_archive(windows_fmu, folder, "zip")
-    host = folder / "host"
-    include = f"-I{folder / 'sources'}"
-    subprocess.run([*compiler, include, HOST, "-o", host, "-ldl"], check=True)
-    subprocess.run([CROSS_COMPILER, include, HOST, "-o", f"{host}.exe"], check=True)
-    shared = next((folder / "binaries").glob("linux64/*.so")).relative_to(folder)
-    dll = next((folder / "binaries").glob("win64/*.dll")).relative_to(folder)
-    references = [str(reference) for reference in (*range(11, 37), *range(38, 51))]
-    identity = read_fmu(windows_fmu).guid
-    arguments = [identity, (folder / "resources").as_uri(), "3", *references]
-
-    on_linux = run_well([host, f"./{shared}", *arguments], cwd=folder).split()
-    # By a relative path: loading the library is the host's work, and this host speaks no UTF-8.
-    on_windows = run_in_wine("host.exe", str(dll), *arguments, cwd=folder).split()
-
-    assert len(on_linux) == len(references)
-    assert on_windows == on_linux
 
 
 # ---------------------------------------------------------------------- libcosim

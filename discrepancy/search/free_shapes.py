@@ -1,0 +1,75 @@
+"""Laws of free shape: the best single effects, fitted again with their shape parameters."""
+
+from discrepancy.fits.fitting import CandidateFit, fit_free_shape
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit
+from discrepancy.search_settings import SEARCH
+
+from .fitted_candidates import FittedCandidates
+
+
+def fits_of_free_shape(candidates: FittedCandidates) -> list[CandidateFit]:
+    """Return the best single effects, fitted with free shapes, that explain the data better.
+
+    Effects of one family at one place lead to the same free law; of their fits, the one with the
+    highest score is returned.
+
+    Parameters
+    ----------
+    candidates : FittedCandidates
+        All candidates that were fitted so far, with the problem.
+    """
+    problem = candidates.problem
+    best_by_family: dict[tuple[str, str], CandidateFit] = {}
+    for single_fit in _single_fits_to_free(candidates):
+        free_fit = fit_free_shape(problem, single_fit, term_index=0)
+        if free_fit is None:
+            continue
+        evidence_gain = free_fit.log_evidence - single_fit.log_evidence
+        if evidence_gain <= LEAST_SHAPE_GAIN:
+            continue
+        (term,) = free_fit.candidate.terms
+        key = (term.effect.family, term.place)
+        previous_best = best_by_family.get(key)
+        is_best = previous_best is None or candidates.score(previous_best) < candidates.score(
+            free_fit
+        )
+        if is_best and _is_not_refuted(candidates, free_fit):
+            best_by_family[key] = free_fit
+    return list(best_by_family.values())
+
+
+def _is_not_refuted(candidates: FittedCandidates, fit: CandidateFit) -> bool:
+    """Return whether a fit passes the test of absolute fit, or cannot be tested.
+
+    It cannot be tested if there is no noise record (`passed` is then None).
+    """
+    return check_absolute_fit(candidates.problem, fit).passed is not False
+
+
+def _single_fits_to_free(candidates: FittedCandidates) -> list[CandidateFit]:
+    """Return the single effects that are to be fitted with a free shape, the best first.
+
+    If the best effect does not explain the data, these are the best ones, at most
+    `SEARCH.most_exact_fits`. If it does, these are the effects that explain the data too, with a
+    score at most `SEARCH.family_fit_range` below that of the best. There are none if there is only
+    one such effect, or if the model without effect explains the data: the test of shape
+    (`gates.check_shape`) then examines the best effect later.
+
+    Parameters
+    ----------
+    candidates : FittedCandidates
+        All candidates that were fitted so far, with the problem.
+    """
+    single_fits = []
+    for fit in candidates.exact_fits.values():
+        if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
+            single_fits.append(fit)
+    single_fits = sorted(single_fits, key=candidates.score, reverse=True)[: SEARCH.most_exact_fits]
+    explaining_fits = [fit for fit in single_fits if _is_not_refuted(candidates, fit)]
+    if not explaining_fits or explaining_fits[0] is not single_fits[0]:
+        return single_fits
+    least_score = candidates.score(single_fits[0]) - SEARCH.family_fit_range
+    competing_fits = [fit for fit in explaining_fits if candidates.score(fit) > least_score]
+    if len(competing_fits) == 1 or _is_not_refuted(candidates, candidates.no_effect):
+        return []
+    return competing_fits

@@ -1,0 +1,119 @@
+"""Compiling the C sources of an FMU for other platforms, by the compiler zig from PyPI."""
+
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import get_args
+
+from fe.reduction.built_once import cache_folder
+from fmu_asset.errors import FmuBuildError
+from reporting.choices import require_one_of
+from reporting.log import module_logger
+from reporting.progress import stage
+
+from .compiler import COMMON_FLAGS, Compiler
+from .mach_o import fat_library
+from .platforms import Target, suffix_of
+
+_logger = module_logger(__name__)
+
+# The oldest systems on which the libraries run: glibc 2.17 is of 2012, macOS 11 of 2020.
+_ZIG_TARGETS: Mapping[Target, str] = {
+    "x86_64-linux": "x86_64-linux-gnu.2.17",
+    "x86_64-windows": "x86_64-windows-gnu",
+    "x86_64-darwin": "x86_64-macos.11.0",
+    "aarch64-darwin": "aarch64-macos.11.0",
+    "aarch64-linux": "aarch64-linux-gnu.2.17",
+}
+
+# The first library for Windows takes two minutes, as zig compiles parts of its C library.
+_LONGEST_BUILD_SECONDS = 1800.0
+
+
+def find_cross_compiler() -> list[str]:
+    """Return the command of the C compiler of the package ziglang.
+
+    Raises
+    ------
+    FmuBuildError
+        If the package is not installed.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise FmuBuildError(
+            "Binaries for chosen platforms need the compiler zig, which is not installed: "
+            "pip install 'uav-twin[cross]', or choose no platforms to compile for this host alone."
+        )
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def cross_compile_library(sources: Mapping[str, bytes], targets: Sequence[Target]) -> bytes:
+    """Return the shared library of C sources for another platform than this host.
+
+    The same sources and version of ziglang give the same bytes.
+
+    Parameters
+    ----------
+    sources : mapping of str to bytes
+        The content of the sources and headers by file name, all in one folder.
+    targets : sequence of str
+        The processor and system that the library runs on, such as ["x86_64-windows"]. Several
+        processors are possible on macOS, whose file then holds the library of each.
+
+    Raises
+    ------
+    InvalidChoiceError
+        If a target is unknown.
+    FmuBuildError
+        If ziglang is not installed, or the compiler fails.
+    """
+    for target in targets:
+        require_one_of(target, get_args(Target), "targets")
+    command = find_cross_compiler()
+    libraries = []
+    for target in targets:
+        flags = ["-target", _ZIG_TARGETS[target], *COMMON_FLAGS]
+        if not target.endswith("-windows"):  # whose libraries need no such flag
+            flags.append("-fPIC")
+        with stage(f"Compiling for {target}"), zig_environment() as environment:
+            compiler = Compiler(
+                name="zig",
+                command=[*command, *flags],
+                advice="try another version of ziglang",
+                environment=environment,
+                longest_seconds=_LONGEST_BUILD_SECONDS,
+            )
+            # macOS keeps the name of the file inside the library.
+            libraries.append(compiler.library(sources, f"library{suffix_of(target)}"))
+    return libraries[0] if len(libraries) == 1 else fat_library(libraries)
+
+
+@contextmanager
+def zig_environment() -> Iterator[dict[str, str]]:
+    """Return a context with the environment variables of a run of zig.
+
+    zig keeps what it compiles of its own C libraries in the folder `zig` of the cache of uav-twin,
+    or in a temporary folder if that one cannot be written. The objects of the FMU are always in a
+    temporary folder, so the cache grows with new targets and versions of zig alone.
+    """
+    cache = cache_folder() / "zig"
+    with tempfile.TemporaryDirectory(prefix="uav-twin-zig-") as scratch:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=cache):  # whether files can be written
+                pass
+        except OSError as error:
+            _logger.warning(
+                "The folder %s cannot be written (%s), so zig compiles its C libraries anew.",
+                cache,
+                error.strerror,
+            )
+            cache = Path(scratch) / "libraries"
+        yield {
+            **os.environ,
+            "ZIG_GLOBAL_CACHE_DIR": str(cache),
+            "ZIG_LOCAL_CACHE_DIR": str(Path(scratch) / "objects"),
+        }
