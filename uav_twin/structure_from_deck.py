@@ -109,7 +109,7 @@ def _record(file: Path, report: "DeckReport") -> dict[str, object]:
         "unknowns": report.unknowns,
         "regions": {region.name: len(region.elements) for region in report.regions},
         "displacement_deviation": report.load_deviations,
-        "frequencies": report.frequencies.tolist(),
+        "frequencies": report.frequencies.tolist() if report.has_mass else [],
         "frequency_deviation": report.frequency_deviation,
         "remarks": report.remarks,
     }
@@ -122,12 +122,18 @@ def _print_report(file: Path, report: "DeckReport", tolerance: float) -> None:
         terminal.say(
             f"region {region.name}: {len(region.elements):,} elements of {region.set_name}"
         )
+    from fe.solver_deck.regions import COMPARED_DENSITY
+
     rows = [
         (f"displacements under {name}", f"{value:.1e}", f"{tolerance:.0e}")
         for name, value in report.load_deviations.items()
     ]
     if len(report.frequencies):
         frequency_row = f"{len(report.frequencies)} frequencies from {report.frequencies[0]:.6g} Hz"
+        if not report.has_mass:
+            frequency_row = (
+                f"{len(report.frequencies)} frequencies with a density of {COMPARED_DENSITY}"
+            )
         rows.append((frequency_row, f"{report.frequency_deviation:.1e}", f"{tolerance:.0e}"))
     if rows:
         terminal.print_table(("of", "deviation from CalculiX", "limit"), rows)

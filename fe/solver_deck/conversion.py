@@ -1,13 +1,16 @@
 """From a deck of CalculiX to a structure from matrices, checked against CalculiX itself."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import ArpackError
 
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import CalculixError, MeshError
+from fe.runtime.errors import CalculixError, FiniteElementError, SolutionError
 from fe.structure.abaqus import KeywordBlock
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.matrix_files import READ_WEIGHTS
@@ -26,6 +29,7 @@ from .regions import (
     with_scaled_modulus,
 )
 from .structure_file import (
+    MASS_FILE,
     DeckStructure,
     choose_output_sets,
     has_rows_for,
@@ -80,8 +84,11 @@ class DeckReport:
     load_deviations : dict of str to float
         For each load the largest difference of a nodal displacement to that of CalculiX, over the
         largest displacement.
+    has_mass : bool
+        Whether the deck has a density.
     frequencies : (m,) array
-        Lowest frequencies [Hz]; empty if the deck has no density.
+        Lowest frequencies [Hz]. If the deck has no density, they are those with the density
+        `COMPARED_DENSITY`, and serve for the comparison alone.
     frequency_deviation : float
         Largest relative difference of a frequency to that of CalculiX.
     remarks : list of str
@@ -91,6 +98,7 @@ class DeckReport:
     unknowns: int
     regions: list[Region]
     load_deviations: dict[str, float]
+    has_mass: bool
     frequencies: FloatArray
     frequency_deviation: float
     remarks: list[str]
@@ -113,11 +121,35 @@ def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> D
     Raises
     ------
     CalculixError
-        If CalculiX is not installed or fails, or if the structure deviates from it by more than
-        the tolerance.
+        If CalculiX is not installed or fails, if the structure deviates from it by more than the
+        tolerance, or if nothing of the structure can be compared with it.
     MeshError
-        If the deck cannot be read, or is not one of an elastic structure that is held.
+        If the deck cannot be read, or is not one of an elastic structure.
+    SolutionError
+        If the structure is not held.
     """
+    try:
+        return _convert(deck, folder, name, options)
+    except FiniteElementError as error:
+        raise type(error)(_sentence_on_deck(deck, folder, str(error))) from None
+    except (np.linalg.LinAlgError, ArpackError) as error:
+        raise SolutionError(
+            f"{deck}: the matrices of CalculiX cannot be solved ({error}); see that every part of "
+            "the structure is held and has stiffness."
+        ) from None
+
+
+def _sentence_on_deck(deck: Path, folder: Path, message: str) -> str:
+    """Return a message that names the deck in place of files in the scratch folder."""
+    scratch_file = re.escape(str(folder)) + r"[^\s:,;()\[\]]*[^\s:,;()\[\].]"
+    sentence = re.sub(scratch_file, lambda _: str(deck), message)
+    if str(deck) in sentence:
+        return sentence
+    return f"{deck}: {sentence}"
+
+
+def _convert(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
+    """Write a deck as a structure; the parameters are those of `convert_deck`."""
     required_calculix()
     model = read_linear_model(deck, options.contact)
     regions = choose_regions(model, options.regions)
@@ -127,6 +159,8 @@ def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> D
     file = write_structure_files(structure, folder, name)
     report = _compare(file, structure, jobs, blocks, [*model.remarks, *remarks])
     _refuse_deviations(deck, report, options.tolerance)
+    if not model.has_mass:
+        sparse.save_npz(folder / MASS_FILE, 0.0 * structure.matrices.mass)
     return report
 
 
@@ -159,7 +193,9 @@ def _structure_of_deck(
     counts = row_counts(matrices.places)
     loads = []
     for load in deck_loads.loads:
-        if has_rows_for(load, counts, set(model.held)):
+        if load.acceleration is not None and not model.has_mass:
+            remarks.append(f"the load {load.name} is left out: the deck has no *DENSITY")
+        elif has_rows_for(load, counts, set(model.held)):
             loads.append(load)
         else:
             remarks.append(
@@ -167,7 +203,6 @@ def _structure_of_deck(
                 "have, such as those of a tied surface"
             )
     if not model.has_mass:
-        matrices = StoredMatrices(matrices.stiffness, 0.0 * matrices.mass, matrices.places)
         remarks.append("the deck has no *DENSITY: the structure has no mass, hence no modes")
     structure = DeckStructure(
         model=model,
@@ -237,29 +272,29 @@ def _compare(
     remarks: list[str],
 ) -> DeckReport:
     """Return how a structure file agrees with CalculiX in statics and frequencies."""
-    try:
-        assembled = assemble_structure(file)
-    except MeshError as error:
-        raise MeshError(f"{structure.model.path}: {error}") from None
+    assembled = assemble_structure(file)
     deviations = {}
     if structure.loads:
-        printed = jobs.displacements(structure.loads, blocks)
+        # Our factors come first: they refuse a mechanism, on which CalculiX computes nonsense.
         responses = static_responses(assembled)
+        printed = jobs.displacements(structure.loads, blocks)
         for load, theirs in zip(structure.loads, printed, strict=True):
             ours = assembled.full_displacement(responses[load.name].displacement)
             scale = UNITS[structure.length_unit]
             deviations[load.name] = _largest_deviation(structure, ours / scale, theirs)
     frequencies = np.empty(0)
     frequency_deviation = 0.0
-    if structure.model.has_mass:
+    if assembled.unknowns > 1:
         count = min(_COMPARED_MODES, max(1, assembled.unknowns // 4))
         frequencies = natural_frequencies(assembled, count).frequency
         calculix_frequencies = jobs.frequencies(count, blocks)
+        frequencies = frequencies[: len(calculix_frequencies)]
         frequency_deviation = float(np.abs(frequencies / calculix_frequencies - 1.0).max())
     return DeckReport(
         unknowns=assembled.unknowns,
         regions=list(structure.region_stiffness),
         load_deviations=deviations,
+        has_mass=structure.model.has_mass,
         frequencies=frequencies,
         frequency_deviation=frequency_deviation,
         remarks=remarks,
@@ -284,7 +319,13 @@ def _largest_deviation(
 
 
 def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
-    """Raise `CalculixError` if the structure deviates from CalculiX by more than the tolerance."""
+    """Raise `CalculixError` if the structure deviates from CalculiX, or nothing was compared."""
+    if not report.load_deviations and not len(report.frequencies):
+        raise CalculixError(
+            f"{deck}: a structure of {report.unknowns} unknown has no frequency that could be "
+            "compared with CalculiX, and no load of the deck was read; add a *STEP with *STATIC "
+            "and a *CLOAD."
+        )
     deviations = {
         f"displacements under {name}": value for name, value in report.load_deviations.items()
     }

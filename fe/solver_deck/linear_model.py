@@ -184,6 +184,10 @@ def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearMode
         If the deck cannot be read, is not one of an elastic structure, or has no element.
     """
     all_blocks = list(read_blocks(path))
+    if not all_blocks:
+        raise MeshError(
+            f"{path}: a deck with *NODE, *ELEMENT and *MATERIAL is expected, but it has no keyword."
+        )
     _refuse_other_models(path, all_blocks)
     before_steps, steps = _split_steps(all_blocks)
     blocks: list[KeywordBlock] = []
@@ -231,7 +235,7 @@ def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:
             for block in blocks
             if block.keyword in ("HYPERELASTIC", "HYPERFOAM", "USER MATERIAL", "CONDUCTIVITY")
         ]
-        found = comma_list(list(dict.fromkeys(materials))) if materials else "no material"
+        found = comma_list(list(dict.fromkeys(materials))) if materials else "none"
         raise MeshError(
             f"{path}: a material with *ELASTIC is expected, but the deck has {found}; give "
             "its materials an elastic modulus."

@@ -9,7 +9,7 @@ from fe.elements.cells import CellMesh
 from fe.elements.kinds import DECK_KINDS, ElementKind
 from fe.runtime.arrays import FloatArray
 from fe.structure.abaqus import KeywordBlock
-from fe.structure.deck_text import real, whole
+from fe.structure.deck_text import fail, real, whole
 from fe.structure.mesh import Surface
 from fe.structure.nodal_loads import face_areas
 
@@ -163,6 +163,8 @@ def _gravity(model: LinearModel, where: str, values: Sequence[str]) -> FloatArra
             f"{len(model.mesh.elements)}; let it act on all"
         )
     axis = np.array(direction)
+    if not axis.any():
+        fail(where, "gravity needs a direction, but its three components are zero.")
     return np.asarray(size * axis / np.linalg.norm(axis))
 
 
@@ -205,11 +207,22 @@ def _face_forces(
     normal of a shell and against the outward normal of a solid, which for the first face is the
     same direction.
     """
+    if not 0 <= face < len(kind.face_nodes):
+        raise _NotReadError(
+            f"a load P{face + 1} on elements {element.type_name} is left out: they have the faces "
+            f"1 to {len(kind.face_nodes)}"
+        )
     face_nodes = kind.face_nodes[face]
-    if len(element.nodes) == kind.node_count:
+    is_shell = element.type_name in _SHELL_SOLIDS
+    expected_count = len(face_nodes) if is_shell else kind.node_count
+    if len(element.nodes) != expected_count:
+        raise _NotReadError(
+            f"pressure is left out: an element {element.type_name} has {expected_count} nodes, but "
+            f"one here has {len(element.nodes)}"
+        )
+    numbers = list(element.nodes)
+    if not is_shell:
         numbers = [element.nodes[node] for node in face_nodes]
-    else:
-        numbers = list(element.nodes)
     positions = np.zeros((kind.node_count, 3))
     positions[list(face_nodes)] = [mesh.points[number] for number in numbers]
     cell = np.arange(kind.node_count)[None]

@@ -37,6 +37,12 @@ _CONSTANTS = {
 }
 """Number of constants of a temperature, by the TYPE of *ELASTIC."""
 
+COMPARED_DENSITY = "1e-9"
+"""Density of a deck without any, with which its frequencies are compared with those of CalculiX.
+
+CalculiX looks for eigenvalues near 1 (rad/s)^2 and misses smaller ones. A small density makes all
+eigenvalues large.
+"""
 _NUMBERS_IN_LINE = 8
 _MEMBERS_IN_LINE = 10
 
@@ -145,9 +151,9 @@ def with_scaled_modulus(
 def with_densities(model: LinearModel, blocks: Sequence[KeywordBlock]) -> list[KeywordBlock]:
     """Return blocks in which each elastic material has a density, which CalculiX asks for.
 
-    If the deck has no density at all, it is one and the mass is not used; else it is negligible.
+    If the deck has no density at all, it is `COMPARED_DENSITY`; else it is negligible.
     """
-    density = "1e-30" if model.has_mass else "1."
+    density = "1e-30" if model.has_mass else COMPARED_DENSITY
     with_density = {name for name, keyword in _properties(blocks) if keyword == "DENSITY"}
     completed = []
     for block in blocks:

@@ -19,6 +19,8 @@ from .linear_model import TRANSLATIONS, HeldMotion, LinearModel
 from .loads import DeckLoad
 from .regions import Region, name_in_file
 
+MASS_FILE = "mass.npz"
+"""Name of the file of the mass matrix."""
 PARAMETER = "e"
 """Name of the parameter that scales the moduli of all regions."""
 LARGEST_NAME = 28
@@ -175,14 +177,14 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
         The structure file.
     """
     sparse.save_npz(folder / "stiffness.npz", structure.matrices.stiffness)
-    sparse.save_npz(folder / "mass.npz", structure.matrices.mass)
+    sparse.save_npz(folder / MASS_FILE, structure.matrices.mass)
     unknowns = "".join(f"{node}.{axis}\n" for node, axis in structure.matrices.places)
     (folder / "unknowns.dof").write_text(unknowns, encoding="ascii")
     lines = [
         f"name = {json.dumps(name)}",
         f"length_unit = {json.dumps(structure.length_unit)}",
         'stiffness_matrix = "stiffness.npz"',
-        'mass_matrix = "mass.npz"',
+        f'mass_matrix = "{MASS_FILE}"',
         'unknowns = "unknowns.dof"',
     ]
     if structure.region_stiffness:
