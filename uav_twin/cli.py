@@ -18,6 +18,7 @@ from uav_twin import (
     fmu_simulation,
     schema_command,
     structure,
+    structure_from_deck,
     watch_command,
     wing_commands,
 )
@@ -202,6 +203,7 @@ structure_group.command("verify")(structure.verify)
 structure_group.command("field")(structure.field)
 structure_group.command("reduce")(structure.reduce)
 structure_group.command("fmu")(structure.fmu)
+structure_group.command("from-deck")(structure_from_deck.from_deck)
 
 
 app.command("schema", rich_help_panel=MODELS)(schema_command.schema)

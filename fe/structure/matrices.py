@@ -379,6 +379,6 @@ def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
     largest = int(np.abs(scale @ lowest_shape).argmax())
     raise MeshError(
         f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
-        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]], or "
-        "before its matrices are written."
+        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]] "
+        "in its structure file, or before its matrices are written (in a deck: *BOUNDARY)."
     )

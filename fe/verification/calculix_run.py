@@ -95,7 +95,7 @@ def read_frequencies(text: str) -> FloatArray:
     return np.array(frequencies, dtype=np.float64)
 
 
-def run_calculix(text: str, folder: Path, name: str) -> str:
+def run_calculix(text: str, folder: Path, name: str, time_limit: float = _TIME_LIMIT) -> str:
     """Run CalculiX on an input and return the content of its `.dat` file.
 
     Parameters
@@ -106,15 +106,17 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
         Where input, results and messages (`NAME.log`) are written; it is made if it is missing.
     name : str
         Name of the job.
+    time_limit : float
+        Time that CalculiX may take [s]; an hour by default.
 
     Raises
     ------
     CalculixError
-        If CalculiX is not installed, ends with an error or takes more than an hour.
+        If CalculiX is not installed, ends with an error or takes longer than the time limit.
     """
     program = required_calculix()
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.inp").write_text(text, encoding="ascii")
+    (folder / f"{name}.inp").write_text(text, encoding="latin-1")
     try:
         process = subprocess.run(
             [program, "-i", name],
@@ -123,12 +125,12 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=_TIME_LIMIT,
+            timeout=time_limit,
             check=False,
         )
     except subprocess.TimeoutExpired:
         raise CalculixError(
-            f"CalculiX took more than {_TIME_LIMIT:g} s for {folder / name}.inp."
+            f"CalculiX took more than {time_limit:g} s for {folder / name}.inp."
         ) from None
     log = folder / f"{name}.log"
     log.write_text(process.stdout + process.stderr, encoding="utf-8")

@@ -1,0 +1,1 @@
+"""A structure from a deck of CalculiX, whose matrices CalculiX itself writes."""

@@ -1,0 +1,177 @@
+"""Runs of CalculiX on variants of a deck, whose faults are said with the line of the deck."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import CalculixError
+from fe.structure.abaqus import DataLine, KeywordBlock
+from fe.structure.matrix_tables import Place, read_matrix, read_unknowns
+from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
+
+from .linear_model import LinearModel, block_lines
+from .loads import DeckLoad
+
+ALL_NODES = "UAVALL"
+"""Name of the set of all nodes, whose displacements are printed."""
+_STORE_MATRICES = ("*FREQUENCY, SOLVER=MATRIXSTORAGE",)
+_MEMBERS_IN_LINE = 10
+
+
+@dataclass(frozen=True)
+class StoredMatrices:
+    """Matrices that CalculiX has written, with n rows, in the units of the deck.
+
+    Attributes
+    ----------
+    stiffness, mass : sparse (n, n) array
+        The matrices.
+    places : list of Place
+        Node and direction of each row. Nodes that CalculiX made have numbers beyond the deck's.
+    """
+
+    stiffness: sparse.csr_array
+    mass: sparse.csr_array
+    places: list[Place]
+
+
+@dataclass(frozen=True)
+class CalculixJobs:
+    """CalculiX at work on a deck.
+
+    Attributes
+    ----------
+    model : LinearModel
+        The model of the deck.
+    folder : Path
+        Where CalculiX writes its files.
+    time_limit : float
+        Time that one run may take [s].
+    """
+
+    model: LinearModel
+    folder: Path
+    time_limit: float
+
+    def matrices(
+        self, name: str, blocks: Sequence[KeywordBlock], *, free: bool = False
+    ) -> StoredMatrices:
+        """Return the matrices of the model with other blocks; `free` as in `LinearModel.text`.
+
+        Raises
+        ------
+        CalculixError
+            If CalculiX fails.
+        """
+        self._run(name, self.model.text(_STORE_MATRICES, blocks=blocks, free=free))
+        if not (self.folder / f"{name}.sti").is_file():
+            raise CalculixError(
+                f"{self.model.path}: CalculiX has stored no stiffness matrix; the deck needs "
+                "elements that deform."
+            )
+        places = read_unknowns(self.folder / f"{name}.dof")
+        stiffness, _ = read_matrix(self.folder, f"{name}.sti")
+        mass, _ = read_matrix(self.folder, f"{name}.mas")
+        size = len(places)
+        stiffness.resize((size, size))
+        mass.resize((size, size))
+        return StoredMatrices(stiffness, mass, places)
+
+    def displacements(
+        self, loads: Sequence[DeckLoad], blocks: Sequence[KeywordBlock]
+    ) -> list[dict[int, FloatArray]]:
+        """Return the displacement (3,) of each node under each load alone, in the deck's unit.
+
+        Raises
+        ------
+        CalculixError
+            If CalculiX fails.
+        """
+        steps = []
+        for load in loads:
+            other_loads_end = ["*CLOAD, OP=NEW", "*DLOAD, OP=NEW"]
+            prints = [f"*NODE PRINT, NSET={ALL_NODES}, GLOBAL=YES", "U"]
+            steps.append(["*STATIC", *other_loads_end, *load.lines, *prints])
+        text = self.model.text(*steps, blocks=[*blocks, self._set_of_all_nodes()])
+        tables = read_tables(self._run("static", text)).get(ALL_NODES, [])
+        if len(tables) != len(loads):
+            raise CalculixError(
+                f"{self.model.path}: CalculiX printed {len(tables)} static solutions instead of "
+                f"{len(loads)}."
+            )
+        return [{int(row[0]): row[1:] for row in table} for table in tables]
+
+    def frequencies(self, count: int, blocks: Sequence[KeywordBlock]) -> FloatArray:
+        """Return the lowest frequencies (count,) [Hz].
+
+        Raises
+        ------
+        CalculixError
+            If CalculiX fails.
+        """
+        text = self.model.text(["*FREQUENCY", str(count)], blocks=blocks)
+        return read_frequencies(self._run("modes", text))[:count]
+
+    def _set_of_all_nodes(self) -> KeywordBlock:
+        """Return the *NSET of the nodes of all elements."""
+        numbers = sorted(
+            {node for element in self.model.mesh.elements.values() for node in element.nodes}
+        )
+        rows = np.array_split(np.array(numbers), max(1, len(numbers) // _MEMBERS_IN_LINE))
+        data = [DataLine("", [str(number) for number in row.tolist()]) for row in rows]
+        return KeywordBlock("", "NSET", {"NSET": ALL_NODES}, data)
+
+    def _run(self, name: str, text: str) -> str:
+        """Run CalculiX on a text and return what it printed into its table of results.
+
+        Raises
+        ------
+        CalculixError
+            If CalculiX fails; the sentence has its message and the line of the deck.
+        """
+        try:
+            return run_calculix(text, self.folder, name, self.time_limit)
+        except CalculixError as error:
+            log = self.folder / f"{name}.log"
+            if not log.is_file():
+                job = str(self.folder / f"{name}.inp")
+                raise CalculixError(str(error).replace(job, str(self.model.path))) from None
+            message = first_error(log.read_text(encoding="utf-8"))
+            where = self._line_of(message)
+            raise CalculixError(f"{where}: CalculiX did not finish: {message}") from None
+
+    def _line_of(self, message: str) -> str:
+        """Return file and line of the deck that a message of CalculiX cites; else the file."""
+        cited = _without_blanks(message)
+        for block in self.model.blocks:
+            head, *lines = block_lines(block)
+            wheres = [block.where, *(where for where, _ in block.data)]
+            for where, line in zip(wheres, [head, *lines], strict=True):
+                if _without_blanks(line) in cited and len(line) > len(block.keyword) + 1:
+                    return where
+        return str(self.model.path)
+
+
+def first_error(log: str) -> str:
+    """Return the first error in the messages of CalculiX, in one line."""
+    lines = log.splitlines()
+    for number, line in enumerate(lines):
+        if "*ERROR" in line:
+            following = [line]
+            for next_line in lines[number + 1 : number + 5]:
+                if not next_line.strip():
+                    break
+                following.append(next_line)
+            return " ".join(" ".join(following).split())
+    last_lines = [line.strip() for line in lines if line.strip()][-1:]
+    return last_lines[0] if last_lines else "it printed no message."
+
+
+def _without_blanks(text: str) -> str:
+    """Return a text without blanks, in capital letters."""
+    return re.sub(r"\s+", "", text).upper()

@@ -1,0 +1,162 @@
+"""Nodes, elements and sets of a deck, of any type of element."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray
+from fe.structure.abaqus import KeywordBlock
+from fe.structure.deck_text import fail, real, whole
+
+_NODES_OF_TYPE = {
+    "B31": 2,
+    "B31R": 2,
+    "B32": 3,
+    "B32R": 3,
+    "DASHPOTA": 2,
+    "DCOUP3D": 1,
+    "GAPUNI": 2,
+    "MASS": 1,
+    "SPRING1": 1,
+    "SPRING2": 2,
+    "SPRINGA": 2,
+    "T2D2": 2,
+    "T3D2": 2,
+    "T3D3": 3,
+}
+"""Numbers of nodes of types of elements whose names do not end with it."""
+_COUNT_IN_NAME = re.compile(r"(?:C3D|CPS|CPE|CAX|M3D|S)(\d+)[A-Z]*")
+
+
+@dataclass(frozen=True)
+class DeckElement:
+    """An element: its type in capital letters, and the numbers of its nodes."""
+
+    type_name: str
+    nodes: tuple[int, ...]
+
+
+@dataclass
+class DeckMesh:
+    """The mesh of a deck.
+
+    Attributes
+    ----------
+    points : dict of int to (3,) array
+        Position of each node, in the deck's unit of length.
+    elements : dict of int to DeckElement
+        The elements by their numbers.
+    node_sets, element_sets : dict of str to list of int
+        Members of each set, in the order of the deck, by the set's name in capital letters.
+    """
+
+    points: dict[int, FloatArray] = field(default_factory=dict)
+    elements: dict[int, DeckElement] = field(default_factory=dict)
+    node_sets: dict[str, list[int]] = field(default_factory=dict)
+    element_sets: dict[str, list[int]] = field(default_factory=dict)
+
+    def nodes_named(self, text: str, where: str) -> list[int]:
+        """Return the nodes of a set, or the one whose number is given."""
+        return _members(self.node_sets, text, where)
+
+    def elements_named(self, text: str, where: str) -> list[int]:
+        """Return the elements of a set, or the one whose number is given."""
+        return _members(self.element_sets, text, where)
+
+
+def read_deck_mesh(blocks: Sequence[KeywordBlock]) -> DeckMesh:
+    """Read nodes, elements and sets from the blocks of a deck.
+
+    Raises
+    ------
+    MeshError
+        If a number or a set cannot be read; the message names the line.
+    """
+    mesh = DeckMesh()
+    for block in blocks:
+        if block.keyword == "NODE":
+            _add_nodes(mesh, block)
+        elif block.keyword == "ELEMENT":
+            _add_elements(mesh, block)
+        elif block.keyword == "NSET":
+            _add_members(mesh.node_sets, block)
+        elif block.keyword == "ELSET":
+            _add_members(mesh.element_sets, block)
+    return mesh
+
+
+def _members(sets: dict[str, list[int]], text: str, where: str) -> list[int]:
+    """Return the members of a set, or the number that stands in its place."""
+    name = text.upper()
+    if name in sets:
+        return sets[name]
+    if not text.isdigit():
+        fail(where, f"a number or the name of a set is expected, but {text!r} was given.")
+    return [int(text)]
+
+
+def _add_nodes(mesh: DeckMesh, block: KeywordBlock) -> None:
+    """Add the nodes of a *NODE."""
+    numbers = []
+    for where, values in block.data:
+        number = whole(where, values[0])
+        coordinates = (*values[1:], "", "", "")[:3]  # those left out are 0
+        mesh.points[number] = np.array([real(where, text) for text in coordinates])
+        numbers.append(number)
+    if block.parameters.get("NSET"):
+        mesh.node_sets.setdefault(block.parameters["NSET"].upper(), []).extend(numbers)
+
+
+def _add_elements(mesh: DeckMesh, block: KeywordBlock) -> None:
+    """Add the elements of an *ELEMENT; an element may take several lines."""
+    type_name = block.required("TYPE").upper()
+    node_count = _node_count(type_name)
+    numbers = []
+    for record in _element_records(block, node_count):
+        number, *nodes = record
+        mesh.elements[number] = DeckElement(type_name, tuple(nodes))
+        numbers.append(number)
+    if block.parameters.get("ELSET"):
+        mesh.element_sets.setdefault(block.parameters["ELSET"].upper(), []).extend(numbers)
+
+
+def _node_count(type_name: str) -> int | None:
+    """Return the number of nodes of a type of elements; None for an unknown type."""
+    in_name = _COUNT_IN_NAME.fullmatch(type_name)
+    return int(in_name[1]) if in_name else _NODES_OF_TYPE.get(type_name)
+
+
+def _element_records(block: KeywordBlock, node_count: int | None) -> Iterator[list[int]]:
+    """Yield number and nodes of each element; an element of unknown type has a line of its own."""
+    record: list[int] = []
+    for where, values in block.data:
+        record += [whole(where, text) for text in values if text]
+        if node_count is None or len(record) > node_count:
+            yield record
+            record = []
+
+
+def _add_members(sets: dict[str, list[int]], block: KeywordBlock) -> None:
+    """Add the members of an *NSET or *ELSET, written out, as sets, or generated."""
+    members = sets.setdefault(block.required(block.keyword).upper(), [])
+    for where, values in block.data:
+        texts = [value for value in values if value]
+        if "GENERATE" not in block.parameters:
+            for text in texts:
+                members.extend(_members(sets, text, where))
+            continue
+        first, last, step = _generation(where, texts)
+        members.extend(range(first, last + 1, step))
+
+
+def _generation(where: str, texts: list[str]) -> tuple[int, int, int]:
+    """Return first, last and step of a line of generated members; the step is 1 if left out."""
+    numbers = [whole(where, text) for text in texts]
+    if len(numbers) == 2:
+        numbers.append(1)
+    if len(numbers) != 3 or numbers[2] < 1:
+        fail(where, f"first, last and step are expected, but {', '.join(texts)} was given.")
+    first, last, step = numbers
+    return first, last, step
