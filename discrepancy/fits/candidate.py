@@ -254,12 +254,16 @@ class TrialDerivatives:
         state, constants of inputs, time zero, health.
     by_effect : (E, N, C) array
         The derivatives with respect to the scaled effect parameters.
+    jumps : (N, C) array
+        What a jump of the prediction adds, where it jumps within a step of an unknown, such as an
+        acceleration at a reversal of dry friction; zero elsewhere.
     """
 
     response: FloatArray
     by_parameters: FloatArray
     by_local: FloatArray
     by_effect: FloatArray
+    jumps: FloatArray
 
 
 @dataclass(frozen=True)

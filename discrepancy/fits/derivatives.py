@@ -5,7 +5,7 @@ model gives; the *prediction* of the readings is the response with gains and zer
 """
 
 from collections.abc import Callable
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,26 @@ from .candidate import (
     TrialDerivatives,
     with_step,
 )
+from .difference_quotients import largest_jumps, one_sided_quotient, two_sided_quotient
 from .trial_data import SharedUnknowns, TrialData
+
+
+class NuisanceDerivatives(NamedTuple):
+    """The derivatives of a trial's response with respect to its nuisances.
+
+    Attributes
+    ----------
+    by_parameters : (P, N, C) ndarray
+        The derivatives with respect to the P calibrated parameters.
+    by_local : (I, N, C) ndarray
+        The derivatives with respect to the I unknowns of the trial that are not zeros of channels.
+    jumps : (N, C) ndarray
+        What a jump within a step of an unknown adds to the response; zero where there is none.
+    """
+
+    by_parameters: FloatArray
+    by_local: FloatArray
+    jumps: FloatArray
 
 
 def nuisance_derivatives(
@@ -27,11 +46,13 @@ def nuisance_derivatives(
     shared_point: FloatArray,
     local_point: FloatArray,
     respond: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]],
-) -> tuple[FloatArray, FloatArray]:
+) -> NuisanceDerivatives:
     """Return the derivatives of a trial's response with respect to its nuisances.
 
-    They are one-sided difference quotients, except that a shift of time zero uses the time
-    derivative of the response if the model gives it.
+    They are difference quotients, except that a shift of time zero uses the time derivative of the
+    response if the model gives it. Each has two steps: one to either side, or two to the side on
+    which an unknown may move. In trials at rest the response is nearly linear, and one step is
+    enough.
 
     Parameters
     ----------
@@ -45,39 +66,52 @@ def nuisance_derivatives(
     respond : callable
         The function that returns the response at given shared and local unknowns, for N samples of
         C channels, and its time derivative (N, C), or None if the model does not give it.
-
-    Returns
-    -------
-    by_parameters : (P, N, C) array
-        The derivatives with respect to the P calibrated parameters.
-    by_local : (I, N, C) array
-        The derivatives with respect to the I unknowns of the trial that are not zeros of channels.
     """
     unknowns = data.unknowns
     response, rates = respond(shared_point, local_point)
+    jumps_by_unknown = []
+
+    def response_at(shared_step: FloatArray, local_step: FloatArray) -> FloatArray:
+        stepped_response, _ = respond(shared_point + shared_step, local_point + local_step)
+        return stepped_response
 
     def slope(
-        shared_values: FloatArray, local_values: FloatArray, step: float = PARAMETER_STEP
+        shared_step: FloatArray, local_step: FloatArray, step: float, *, both_sides: bool = True
     ) -> FloatArray:
-        stepped_response, _ = respond(shared_values, local_values)
-        return (stepped_response - response) / step
+        """Return the derivative along a direction, given as the change of unknowns by a step."""
+        stepped_response = response_at(shared_step, local_step)
+        if not data.trial.is_dynamic:
+            return (stepped_response - response) / step
+        if both_sides:
+            response_below = response_at(-shared_step, -local_step)
+            quotient = two_sided_quotient(response_below, response, stepped_response, step)
+            jumps_by_unknown.append(quotient.jumps)
+            return quotient.slope
+        stepped_twice = response_at(2.0 * shared_step, 2.0 * local_step)
+        return one_sided_quotient(response, stepped_response, stepped_twice, step)
 
-    # calibrated parameters: a step from the upper end of the range goes downwards
-    _, high = shared_unknowns.bounds
-    is_at_end = shared_point + SHARED_STEP > high
-    steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.parameter_count]
-    by_parameters = [
-        slope(with_step(shared_point, k, step), local_point, step)
-        for k, step in enumerate(steps.tolist())
-    ]
+    no_shared_step = np.zeros_like(shared_point)
+    no_local_step = np.zeros_like(local_point)
+    # calibrated parameters: steps from an end of the range go into the range
+    low, high = shared_unknowns.bounds
+    is_at_high_end = shared_point + SHARED_STEP > high
+    is_at_low_end = shared_point - SHARED_STEP < low
+    by_parameters = []
+    for k in range(shared_unknowns.parameter_count):
+        step = -SHARED_STEP if is_at_high_end[k] else SHARED_STEP
+        both_sides = not (is_at_high_end[k] or is_at_low_end[k])
+        parameter_step = with_step(no_shared_step, k, step)
+        by_parameters.append(slope(parameter_step, no_local_step, step, both_sides=both_sides))
     # initial state and constants of inputs
     zeros_end, _, inputs_end, time_zero_end = unknowns.ends_by_kind
     by_local = [
-        slope(shared_point, with_step(local_point, k)) for k in range(zeros_end, inputs_end)
+        slope(no_shared_step, with_step(no_local_step, k), PARAMETER_STEP)
+        for k in range(zeros_end, inputs_end)
     ]
     if unknowns.has_time_zero:
         if rates is None:
-            by_local.append(slope(shared_point, with_step(local_point, inputs_end)))
+            time_zero_step = with_step(no_local_step, inputs_end)
+            by_local.append(slope(no_shared_step, time_zero_step, PARAMETER_STEP))
         else:
             # a shift of time zero by scale u changes the response by its rate times scale u
             by_local.append(rates * unknowns.scale[inputs_end])
@@ -85,11 +119,19 @@ def nuisance_derivatives(
     if len(unknowns.health_rows):
         by_local.extend(
             _health_derivatives(
-                data, local_point, time_zero_end, response.shape, partial(slope, shared_point)
+                data,
+                local_point,
+                time_zero_end,
+                response.shape,
+                lambda step: slope(no_shared_step, step, PARAMETER_STEP, both_sides=False),
             )
         )
     shape = (-1, *response.shape)
-    return np.array(by_parameters).reshape(shape), np.array(by_local).reshape(shape)
+    return NuisanceDerivatives(
+        by_parameters=np.array(by_parameters).reshape(shape),
+        by_local=np.array(by_local).reshape(shape),
+        jumps=largest_jumps(jumps_by_unknown, response.shape),
+    )
 
 
 def _health_derivatives(
@@ -116,8 +158,8 @@ def _health_derivatives(
     shape : tuple of int
         The shape (N, C) of the response.
     slope : callable
-        Returns the change of the response (N, C) at other unknowns of the trial (L,), divided by
-        the positive step `PARAMETER_STEP`.
+        Returns the derivative of the response (N, C) along a change of the unknowns of the trial
+        (L,), per change that is as long as this one over `PARAMETER_STEP`.
     """
     unknowns = data.unknowns
     derivatives = np.zeros((len(unknowns.health_rows), *shape))
@@ -125,11 +167,11 @@ def _health_derivatives(
         region_entries = np.flatnonzero(unknowns.health_columns == region)
         if not len(region_entries):
             continue
-        stepped_local = local_values.copy()
         # step towards zero, away from the limits of the stiffness loss
-        step_signs = np.where(stepped_local[first_health + region_entries] > 0.0, -1.0, 1.0)
-        stepped_local[first_health + region_entries] += step_signs * PARAMETER_STEP
-        difference_quotient = slope(stepped_local)
+        step_signs = np.where(local_values[first_health + region_entries] > 0.0, -1.0, 1.0)
+        local_step = np.zeros_like(local_values)
+        local_step[first_health + region_entries] = step_signs * PARAMETER_STEP
+        difference_quotient = slope(local_step)
         if data.trial.is_dynamic:
             derivatives[region_entries] = (
                 step_signs[:, np.newaxis, np.newaxis] * difference_quotient

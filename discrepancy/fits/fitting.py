@@ -228,10 +228,27 @@ def try_fit(
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a motion that overflows has no probability
-def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
+def objective(
+    problem: Problem,
+    candidate: Candidate,
+    point: Point,
+    jumps: Sequence[FloatArray] | None = None,
+) -> float:
     """Return the negative log posterior of a candidate at a point [nat].
 
     A constant is left out, which is the same for all candidates.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model, with the layout of their unknowns.
+    candidate : Candidate
+        The effects of the hypothesis, each at its place.
+    point : Point
+        The values of all unknowns.
+    jumps : sequence of (N, C) array, optional
+        What jumps near the point add to the response of each trial, see
+        `Problem.standardised_residual`.
 
     Raises
     ------
@@ -244,7 +261,7 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
         problem.response_of_candidate(trial_index, point, candidate)
         for trial_index in trial_indices
     ]
-    return _misfit_at(problem, point, responses).objective
+    return _misfit_at(problem, point, responses, jumps).objective
 
 
 class _Misfit(NamedTuple):
@@ -265,7 +282,12 @@ class _Misfit(NamedTuple):
     sums: FloatArray
 
 
-def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) -> _Misfit:
+def _misfit_at(
+    problem: Problem,
+    point: Point,
+    responses: Sequence[FloatArray],
+    jumps: Sequence[FloatArray] | None,
+) -> _Misfit:
     """Return the negative log posterior and the residuals at a point.
 
     Parameters
@@ -276,10 +298,15 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
         The values of all unknowns.
     responses : sequence of (N, C) array
         The response of the model in each trial at the point.
+    jumps : sequence of (N, C) array or None
+        What jumps near the point add to these responses.
     """
+    jumps_of_trials = [None] * len(responses) if jumps is None else jumps
     residuals = tuple(
-        problem.standardised_residual(trial_index, point, response)
-        for trial_index, response in enumerate(responses)
+        problem.standardised_residual(trial_index, point, response, jumps_of_trial)
+        for trial_index, (response, jumps_of_trial) in enumerate(
+            zip(responses, jumps_of_trials, strict=True)
+        )
     )
     sums = problem.squares_by_channel(residuals)
     minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
@@ -344,6 +371,7 @@ class _Descent:
             self.problem,
             point,
             [derivatives_of_trial.response for derivatives_of_trial in all_derivatives],
+            [derivatives_of_trial.jumps for derivatives_of_trial in all_derivatives],
         )
         return FitState(
             point=point,
@@ -430,10 +458,11 @@ class _Descent:
 
         None if no fraction in `STEP_FRACTIONS` lowers the objective.
         """
+        jumps = [derivatives.jumps for derivatives in state.trial_derivatives]
         for fraction in STEP_FRACTIONS:
             try:
                 point = _move_point(self.problem, self.candidate, state.point, step, fraction)
-                if objective(self.problem, self.candidate, point) < state.objective:
+                if objective(self.problem, self.candidate, point, jumps) < state.objective:
                     return self.state_at(point, state.trial_derivatives)
             except DiscrepancyError:  # the model cannot be evaluated there: try a shorter step
                 continue

@@ -34,7 +34,8 @@ from .candidate import (
     TrialDerivatives,
     with_step,
 )
-from .derivatives import nuisance_derivatives, prediction_derivatives
+from .derivatives import NuisanceDerivatives, nuisance_derivatives, prediction_derivatives
+from .difference_quotients import largest_jumps, two_sided_quotient
 from .trial_data import TrialData, shared_unknowns, stand_in_deviation
 
 MOST_CACHED_RESPONSES = 2000
@@ -295,11 +296,41 @@ class Problem:
         return np.asarray((1.0 + gains) * response + zero)
 
     def standardised_residual(
-        self, trial_index: int, point: Point, response: FloatArray
+        self,
+        trial_index: int,
+        point: Point,
+        response: FloatArray,
+        jumps: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the standardised residuals (N, C) of a trial, given its response (N, C)."""
+        """Return the standardised residuals (N, C) of a trial.
+
+        Parameters
+        ----------
+        trial_index : int
+            The index of the trial.
+        point : Point
+            The values of all unknowns.
+        response : (N, C) array
+            The response of the model in the trial at the point.
+        jumps : (N, C) array, optional
+            What jumps near the point add to the response, or have just added to it. A reading is
+            then compared with the nearest branch: at which side of a reversal it was taken can
+            depend on microseconds, which neither the clock nor the time steps give.
+        """
         data = self.trials[trial_index]
-        return data.standardise(data.trial.values - self.prediction(trial_index, point, response))
+
+        def residual_of(any_response: FloatArray) -> FloatArray:
+            prediction = self.prediction(trial_index, point, any_response)
+            return data.standardise(data.trial.values - prediction)
+
+        residual = residual_of(response)
+        if jumps is None or not np.any(jumps):
+            return residual
+        for other_branch in (response + jumps, response - jumps):
+            residual_of_branch = residual_of(other_branch)
+            is_nearer = np.abs(residual_of_branch) < np.abs(residual)
+            residual = np.where(is_nearer, residual_of_branch, residual)
+        return residual
 
     # -------------------------------------------------------------------------- derivatives
 
@@ -339,11 +370,12 @@ class Problem:
         """
         kind = self.trials[trial_index].trial.kind
         response = self.response_of_candidate(trial_index, point, candidate)
+        by_nuisances: NuisanceDerivatives | TrialDerivatives
         if nearby_derivatives is None:
-            by_parameters, by_local = self._nuisance_derivatives(trial_index, point, candidate)
+            by_nuisances = self._nuisance_derivatives(trial_index, point, candidate)
         else:
-            by_parameters = nearby_derivatives.by_parameters
-            by_local = nearby_derivatives.by_local
+            by_nuisances = nearby_derivatives
+        jumps_by_unknown = [by_nuisances.jumps]
         by_effect = np.zeros((candidate.parameter_count, *response.shape))
         steps = np.full(candidate.parameter_count, PARAMETER_STEP)
         if effect_steps is not None:
@@ -355,12 +387,20 @@ class Problem:
             point_below = replace(point, effect=with_step(point.effect, k, -step))
             above = self.response_of_candidate(trial_index, point_above, candidate)
             below = self.response_of_candidate(trial_index, point_below, candidate)
-            by_effect[k] = (above - below) / (2.0 * step)
-        return TrialDerivatives(response, by_parameters, by_local, by_effect)
+            quotient = two_sided_quotient(below, response, above, step)
+            by_effect[k] = quotient.slope
+            jumps_by_unknown.append(quotient.jumps)
+        return TrialDerivatives(
+            response=response,
+            by_parameters=by_nuisances.by_parameters,
+            by_local=by_nuisances.by_local,
+            by_effect=by_effect,
+            jumps=largest_jumps(jumps_by_unknown, response.shape),
+        )
 
     def _nuisance_derivatives(
         self, trial_index: int, point: Point, candidate: Candidate
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> NuisanceDerivatives:
         """Return the `nuisance_derivatives` of a trial while the effects of a candidate act."""
         patch = self.patch_in_trial(trial_index, candidate, point.effect)
 

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import FloatArray, Trial
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
+from discrepancy.fits.candidate import PARAMETER_STEP, SHARED_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import shift_clock_to_first_sample
@@ -289,11 +289,13 @@ def _port_motion(
     local_at_point = point.local[trial_index]
     motion_at_point = motion(point.shared, local_at_point)
     by_unknowns = {}
+    # central quotients by parameters, see `two_sided_quotient`
     for k in range(layout.parameter_count):
-        by_unknowns[k] = (
-            motion(with_step(point.shared, k), local_at_point) - motion_at_point
-        ) / PARAMETER_STEP
-    # the first unknowns of a trial are the zeros of its channels, which do not move the ports
+        motion_above = motion(with_step(point.shared, k, SHARED_STEP), local_at_point)
+        motion_below = motion(with_step(point.shared, k, -SHARED_STEP), local_at_point)
+        by_unknowns[k] = (motion_above - motion_below) / (2.0 * SHARED_STEP)
+    # The motion is nearly linear in the unknowns of the trial. The first of them are the zeros of
+    # its channels, which do not move the ports.
     for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
         stepped_motion = motion(point.shared, with_step(local_at_point, k))
         by_unknowns[layout.unknown_count + k] = (stepped_motion - motion_at_point) / PARAMETER_STEP
