@@ -41,8 +41,9 @@ class SearchSettings:
     """Grid of the scaled parameters other than magnitudes, by the number of such parameters."""
     grid_levels_if_many: tuple[float, ...] = (-1.0, 1.0)
     """The same grid for four or more of them: its size grows exponentially with their number."""
+    least_start: float = -5.6
     largest_start: float = 2.5
-    """Largest scaled magnitude at which fits begin; farther out, scales mean little."""
+    """Least and largest scaled magnitude at which fits begin; farther out, scales mean little."""
     small_magnitude: float = 0.05
     """Signed magnitudes are tried at one prior deviation and at this fraction of it.
 

@@ -18,6 +18,9 @@ NINETY_PERCENT_QUANTILE = 1.6448536269514722
 Number = Annotated[float, Strict()]
 ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
 """How a table of a file of effects is checked as one of these records."""
+FARTHEST_VALUE, FARTHEST_NORMAL = 8.0, 30.0
+"""Largest standard normal variables that are fitted: of log-normal and uniform values, and of
+normal ones."""
 LEAST_SHRINKAGE = 0.3
 """Least factor by which one step of an iteration may multiply a positive value."""
 
@@ -40,6 +43,16 @@ class Prior:
     shape: Literal["log_normal", "normal", "uniform"]
     low: Number
     high: Number
+
+    @property
+    def largest_standard_normal(self) -> float:
+        """The largest magnitude of the standard normal variable that is fitted.
+
+        What is proportional to a normal value, such as the stiffening of a spring, may be far
+        larger than usual, and the evidence counts how improbable it is. In the other shapes a value
+        would overflow, or be at an end of its range.
+        """
+        return FARTHEST_NORMAL if self.shape == "normal" else FARTHEST_VALUE
 
     def _mean_and_deviation(self) -> tuple[float, float]:
         """Return mean and standard deviation of the value, or of its logarithm if log-normal."""

@@ -87,10 +87,17 @@ class EffectTerm:
                 scaled_values.append(0.0)  # the median of a standard normal variable
         return np.array(scaled_values)
 
+    @property
+    def largest_scaled_values(self) -> FloatArray:
+        """The largest magnitudes (E,) of the scaled parameters that are fitted."""
+        return np.array([parameter.prior.largest_standard_normal for parameter in self.parameters])
+
     def multiply_magnitudes(
         self, scaled_values: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
     ) -> FloatArray:
         """Return the scaled parameters (E,) after all magnitudes are multiplied by a factor.
+
+        They stay within `largest_scaled_values`.
 
         Parameters
         ----------
@@ -99,17 +106,19 @@ class EffectTerm:
         factor : float
             The factor on the physical value of each magnitude.
         lowest, highest : float
-            The limits of the returned scaled magnitudes.
+            Further limits of the returned scaled magnitudes.
         """
         rescaled = scaled_values.copy()
         for number, parameter in enumerate(self.parameters):
             if not parameter.magnitude:
                 continue
             prior = parameter.prior
+            low_end = max(lowest, -prior.largest_standard_normal)
+            high_end = min(highest, prior.largest_standard_normal)
             physical_value = factor * prior.value(float(scaled_values[number]))
             if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
-                physical_value = max(physical_value, prior.value(lowest))
-            rescaled[number] = np.clip(prior.standard_normal(physical_value), lowest, highest)
+                physical_value = max(physical_value, prior.value(low_end))
+            rescaled[number] = np.clip(prior.standard_normal(physical_value), low_end, high_end)
         return rescaled
 
 
@@ -154,6 +163,13 @@ class Candidate:
     def parameter_count(self) -> int:
         """The number E of fitted parameters."""
         return len(self.parameters)
+
+    def within_range(self, scaled_values: FloatArray) -> FloatArray:
+        """Return the scaled effect parameters (E,), clipped to the range that is fitted."""
+        if not self.terms:
+            return scaled_values
+        largest = np.concatenate([term.largest_scaled_values for term in self.terms])
+        return np.clip(scaled_values, -largest, largest)
 
     @property
     def acts_on(self) -> frozenset[TrialKind]:

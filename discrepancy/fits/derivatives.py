@@ -40,12 +40,78 @@ class NuisanceDerivatives(NamedTuple):
     jumps: FloatArray
 
 
+RespondAt = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]]
+"""Returns the response (N, C) of a trial at given shared and local unknowns, and its time
+derivative (N, C), or None if the model does not give that."""
+
+
+class _ResponseDifferences:
+    """The difference quotients of the response of a trial about one point.
+
+    Attributes
+    ----------
+    response : (N, C) ndarray
+        The response at the point.
+    rates : (N, C) ndarray or None
+        Its time derivative.
+    jumps_by_unknown : list of (N, C) ndarray
+        The jumps that were met within the steps so far.
+    """
+
+    def __init__(
+        self, data: TrialData, shared_point: FloatArray, local_point: FloatArray, respond: RespondAt
+    ) -> None:
+        self._is_dynamic = data.trial.is_dynamic
+        self._shared_point = shared_point
+        self._local_point = local_point
+        self._respond = respond
+        self.response, self.rates = respond(shared_point, local_point)
+        self.jumps_by_unknown: list[FloatArray] = []
+
+    def slope(
+        self,
+        shared_step: FloatArray,
+        local_step: FloatArray,
+        step: float,
+        *,
+        both_sides: bool = True,
+    ) -> FloatArray:
+        """Return the derivative (N, C) of the response along a direction.
+
+        Parameters
+        ----------
+        shared_step, local_step : (Q,), (L,) array
+            The change of the unknowns by one step in the direction.
+        step : float
+            The length of the step, with its sign.
+        both_sides : bool
+            Whether the unknowns may also move against the direction.
+        """
+        stepped_response = self._response_at(shared_step, local_step)
+        if not self._is_dynamic:
+            return np.asarray((stepped_response - self.response) / step)
+        if both_sides:
+            response_below = self._response_at(-shared_step, -local_step)
+            quotient = two_sided_quotient(response_below, self.response, stepped_response, step)
+            self.jumps_by_unknown.append(quotient.jumps)
+            return quotient.slope
+        stepped_twice = self._response_at(2.0 * shared_step, 2.0 * local_step)
+        return one_sided_quotient(self.response, stepped_response, stepped_twice, step)
+
+    def _response_at(self, shared_step: FloatArray, local_step: FloatArray) -> FloatArray:
+        """Return the response (N, C) after a step from the point."""
+        response, _ = self._respond(
+            self._shared_point + shared_step, self._local_point + local_step
+        )
+        return response
+
+
 def nuisance_derivatives(
     data: TrialData,
     shared_unknowns: SharedUnknowns,
     shared_point: FloatArray,
     local_point: FloatArray,
-    respond: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]],
+    respond: RespondAt,
 ) -> NuisanceDerivatives:
     """Return the derivatives of a trial's response with respect to its nuisances.
 
@@ -68,28 +134,7 @@ def nuisance_derivatives(
         C channels, and its time derivative (N, C), or None if the model does not give it.
     """
     unknowns = data.unknowns
-    response, rates = respond(shared_point, local_point)
-    jumps_by_unknown = []
-
-    def response_at(shared_step: FloatArray, local_step: FloatArray) -> FloatArray:
-        stepped_response, _ = respond(shared_point + shared_step, local_point + local_step)
-        return stepped_response
-
-    def slope(
-        shared_step: FloatArray, local_step: FloatArray, step: float, *, both_sides: bool = True
-    ) -> FloatArray:
-        """Return the derivative along a direction, given as the change of unknowns by a step."""
-        stepped_response = response_at(shared_step, local_step)
-        if not data.trial.is_dynamic:
-            return (stepped_response - response) / step
-        if both_sides:
-            response_below = response_at(-shared_step, -local_step)
-            quotient = two_sided_quotient(response_below, response, stepped_response, step)
-            jumps_by_unknown.append(quotient.jumps)
-            return quotient.slope
-        stepped_twice = response_at(2.0 * shared_step, 2.0 * local_step)
-        return one_sided_quotient(response, stepped_response, stepped_twice, step)
-
+    differences = _ResponseDifferences(data, shared_point, local_point, respond)
     no_shared_step = np.zeros_like(shared_point)
     no_local_step = np.zeros_like(local_point)
     # calibrated parameters: steps from an end of the range go into the range
@@ -101,20 +146,22 @@ def nuisance_derivatives(
         step = -SHARED_STEP if is_at_high_end[k] else SHARED_STEP
         both_sides = not (is_at_high_end[k] or is_at_low_end[k])
         parameter_step = with_step(no_shared_step, k, step)
-        by_parameters.append(slope(parameter_step, no_local_step, step, both_sides=both_sides))
+        by_parameters.append(
+            differences.slope(parameter_step, no_local_step, step, both_sides=both_sides)
+        )
     # initial state and constants of inputs
     zeros_end, _, inputs_end, time_zero_end = unknowns.ends_by_kind
     by_local = [
-        slope(no_shared_step, with_step(no_local_step, k), PARAMETER_STEP)
+        differences.slope(no_shared_step, with_step(no_local_step, k), PARAMETER_STEP)
         for k in range(zeros_end, inputs_end)
     ]
     if unknowns.has_time_zero:
-        if rates is None:
+        if differences.rates is None:
             time_zero_step = with_step(no_local_step, inputs_end)
-            by_local.append(slope(no_shared_step, time_zero_step, PARAMETER_STEP))
+            by_local.append(differences.slope(no_shared_step, time_zero_step, PARAMETER_STEP))
         else:
             # a shift of time zero by scale u changes the response by its rate times scale u
-            by_local.append(rates * unknowns.scale[inputs_end])
+            by_local.append(differences.rates * unknowns.scale[inputs_end])
     # health
     if len(unknowns.health_rows):
         by_local.extend(
@@ -122,15 +169,17 @@ def nuisance_derivatives(
                 data,
                 local_point,
                 time_zero_end,
-                response.shape,
-                lambda step: slope(no_shared_step, step, PARAMETER_STEP, both_sides=False),
+                differences.response.shape,
+                lambda step: differences.slope(
+                    no_shared_step, step, PARAMETER_STEP, both_sides=False
+                ),
             )
         )
-    shape = (-1, *response.shape)
+    shape = (-1, *differences.response.shape)
     return NuisanceDerivatives(
         by_parameters=np.array(by_parameters).reshape(shape),
         by_local=np.array(by_local).reshape(shape),
-        jumps=largest_jumps(jumps_by_unknown, response.shape),
+        jumps=largest_jumps(differences.jumps_by_unknown, differences.response.shape),
     )
 
 

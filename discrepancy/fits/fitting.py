@@ -30,8 +30,6 @@ from discrepancy.fits.normal_equations import (
 from discrepancy.fits.problem import Problem
 from reporting.words import comma_list
 
-LARGEST_EFFECT = 8.0
-"""Effect parameters stay within this many prior deviations of their median."""
 CONVERGED_DECREASE = 1e-2
 """Predicted decrease of the objective by a step below which a fit has converged [nat]."""
 NEWTON_DAMPING = 1e-2
@@ -152,7 +150,7 @@ def fit(
     """
     descent = _Descent(problem, candidate, local_only)
     damping = FIRST_DAMPING
-    state = descent.state_at(_within_bounds(problem, start), nearby_derivatives)
+    state = descent.state_at(_within_bounds(problem, candidate, start), nearby_derivatives)
     if not np.isfinite(state.objective):
         names = comma_list(candidate.identifiers) if candidate.terms else "no effect"
         raise FitError(
@@ -255,7 +253,7 @@ def objective(
     ModelError
         If the model cannot be evaluated with the effects.
     """
-    point = _within_bounds(problem, point)
+    point = _within_bounds(problem, candidate, point)
     trial_indices = range(len(problem.trials))
     responses = [
         problem.response_of_candidate(trial_index, point, candidate)
@@ -516,16 +514,16 @@ def _move_point(
         ),
         effect=candidate.add_step(point.effect, fraction * step.effect),
     )
-    return _within_bounds(problem, stepped_point)
+    return _within_bounds(problem, candidate, stepped_point)
 
 
-def _within_bounds(problem: Problem, point: Point) -> Point:
+def _within_bounds(problem: Problem, candidate: Candidate, point: Point) -> Point:
     """Return the point with shared unknowns and effect parameters clipped to their ranges."""
     low, high = problem.shared.bounds
     return replace(
         point,
         shared=np.clip(point.shared, low, high),
-        effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT),
+        effect=candidate.within_range(point.effect),
     )
 
 

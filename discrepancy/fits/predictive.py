@@ -21,7 +21,7 @@ from discrepancy.fits.beginnings import (
     with_initial_states_of_first_readings,
 )
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, objective
+from discrepancy.fits.fitting import CandidateFit, fit, objective
 from discrepancy.fits.normal_equations import TrialJacobian, trial_jacobian
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -347,7 +347,7 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
 
     def energy(effect: FloatArray) -> float:
         """Return -ln posterior of effect parameters (E,) relative to the fit [nat]."""
-        if np.abs(effect).max() > LARGEST_EFFECT:
+        if np.any(fit.candidate.within_range(effect) != effect):
             return np.inf
         try:
             rise = screen.misfit_rise(effect)

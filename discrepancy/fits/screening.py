@@ -28,7 +28,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, EffectTerm
-from .fitting import LARGEST_EFFECT, CandidateFit
+from .fitting import CandidateFit
 from .normal_equations import check_finite, cholesky_factor, normal_equations
 from .problem import Problem
 
@@ -76,9 +76,8 @@ class ScreenedChange:
     @property
     def best_values(self) -> FloatArray:
         """The scaled parameters (E,) with the magnitude at the best scale, to begin a fit with."""
-        lowest = -0.7 * LARGEST_EFFECT
         return self.term.multiply_magnitudes(
-            self.effect_values, self.best_scale, lowest, SEARCH.largest_start
+            self.effect_values, self.best_scale, SEARCH.least_start, SEARCH.largest_start
         )
 
 

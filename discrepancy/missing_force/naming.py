@@ -22,7 +22,6 @@ from discrepancy.fits.candidate import (
     EffectTerm,
     with_step,
 )
-from discrepancy.fits.fitting import LARGEST_EFFECT
 from reporting.arrays import LEAST_DIVISOR
 
 from .at_ports import MissingForces
@@ -263,9 +262,7 @@ class ForceSearch(MissingForces):
         weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
         for index, (log_evidence, factor) in weighed_columns.items():
             tried_effect = tried_effects[index]
-            start = tried_effect.term.multiply_magnitudes(
-                tried_effect.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
-            )
+            start = tried_effect.term.multiply_magnitudes(tried_effect.values, factor)
             weighed_by_term.setdefault(tried_effect.term, []).append(
                 _WeighedStart(log_evidence, start)
             )
@@ -469,8 +466,7 @@ class ForceSearch(MissingForces):
             else:
                 step_fraction = min(1.0, 1.5 * step_fraction)
             shortened_step = step_fraction * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = candidate.add_step(effect, shortened_step)
-            effect = np.clip(effect, -LARGEST_EFFECT, LARGEST_EFFECT)
+            effect = candidate.within_range(candidate.add_step(effect, shortened_step))
             has_converged = step_number > 0 and _has_converged(step, last_step)
             processes = hypothesis.processes
             motions = hypothesis.motions

@@ -10,7 +10,7 @@ from dataclasses import replace
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.fitting import LARGEST_EFFECT, objective
+from discrepancy.fits.fitting import objective
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.search_settings import SEARCH
@@ -64,7 +64,7 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
     (term,) = candidate.terms
     valued_points: list[tuple[float, Point]] = []
     for factor in SEARCH.restart_sizes:
-        effect = term.multiply_magnitudes(start.effect, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
+        effect = term.multiply_magnitudes(start.effect, factor)
         point = replace(start, effect=effect)
         with suppress(DiscrepancyError):  # the effect is larger than the model allows
             valued_points.append((objective(problem, candidate, point), point))

@@ -8,6 +8,7 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.motion import Motion
+from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.scales import PortScale
 
 FORCE_PER_RMS = 5.0
@@ -16,6 +17,13 @@ With this ratio, a friction of 1 to 25 % of the acting force lies in the middle 
 does a drag of that size at the largest speed."""
 LEAST_REVERSE_SPEED = 1e-3
 """A motion reverses if the speed exceeds this fraction of its largest value in both directions."""
+FAR_FROM_MEASURED = 2.0
+"""Ratio of a port's computed displacement to its measured one, either way, beyond which its motion
+is scaled by the measured one. What the model lacks can make its motion far too large: near a
+resonance, or in a fall without drag."""
+EXACT_COMBINATION = 1e-9
+"""Part of a port's row that no combination of outputs and drives gives, below which it counts as
+zero."""
 LEAST_PARTICIPATION = 1e-6
 """Share of the squared amplitudes of all modes at a port above which a mode moves the port."""
 
@@ -34,6 +42,44 @@ class LargestMotion(NamedTuple):
     displacement: float
     speed: float
     load: float
+
+
+class DisplacementReadings(NamedTuple):
+    """The channels of a trial that show displacements.
+
+    Attributes
+    ----------
+    rows : (D, N) ndarray
+        The rows of the D displacements in the N unknowns.
+    values : (T, D) ndarray
+        The readings of T samples; NaN where one does not count [m or rad].
+    """
+
+    rows: FloatArray
+    values: FloatArray
+
+
+def displacement_readings(
+    trial: Trial, equations: Sequence[OutputEquation]
+) -> DisplacementReadings:
+    """Return the readings of the channels of a trial that show displacements alone.
+
+    Parameters
+    ----------
+    trial : Trial
+        A trial in motion.
+    equations : sequence of OutputEquation
+        The equation of the output of each channel; there is at least one.
+    """
+    columns = []
+    for column, equation in enumerate(equations):
+        shows_displacement = np.any(equation.rows[0]) and not np.any(equation.rows[1:])
+        if shows_displacement and not equation.feedthrough:
+            columns.append(column)
+    readings = np.where(trial.used, trial.values, np.nan)
+    rows = np.array([equation.rows[0] for equation in equations])
+    constants = np.array([equation.constant for equation in equations])
+    return DisplacementReadings(rows[columns], readings[:, columns] - constants[columns])
 
 
 def scales_of_moving_structure(
@@ -125,7 +171,14 @@ class PortScaleEstimator:
         speeds_at_rest = np.zeros_like(largest_displacements)
         self._add_largest(largest_displacements, speeds_at_rest, is_fitted=is_fitted)
 
-    def add_motion(self, motion: Motion, measured_force: float, *, is_fitted: bool) -> FloatArray:
+    def add_motion(
+        self,
+        motion: Motion,
+        measured_force: float,
+        readings: DisplacementReadings,
+        *,
+        is_fitted: bool,
+    ) -> FloatArray:
         """Add a motion of the structure, and return the loads in it.
 
         Parameters
@@ -134,6 +187,8 @@ class PortScaleEstimator:
             The motion in a dynamic trial of T samples.
         measured_force : float
             The largest force that a channel measured in the motion [N].
+        readings : DisplacementReadings
+            The displacements that channels measured in the motion.
         is_fitted : bool
             Whether the trial is fitted.
 
@@ -143,8 +198,9 @@ class PortScaleEstimator:
             The loads on all unknowns in the motion [N].
         """
         positions, speeds = motion.displacements_and_speeds_at(self.rows)
-        largest_positions = np.max(np.abs(positions), axis=0, initial=0.0)
-        largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0)
+        measured_ratios = self._measured_over_computed(motion, positions, readings)
+        largest_positions = np.max(np.abs(positions), axis=0, initial=0.0) * measured_ratios
+        largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0) * measured_ratios
         self._add_largest(largest_positions, largest_speeds, is_fitted=is_fitted)
         least_speed = LEAST_REVERSE_SPEED * np.max(np.abs(speeds), axis=0)
         self.turns |= (np.min(speeds, axis=0) < -least_speed) & (
@@ -155,11 +211,8 @@ class PortScaleEstimator:
         shapes = system.shapes
         mode_count = shapes.shape[1]
         loads = motion.excitation.loads_at(motion.time, np.eye(system.unknown_count))
-        forces_by_kind = (
-            motion.acceleration[:, :mode_count] @ (system.mass @ shapes).T,
-            motion.velocity[:, :mode_count] @ (self.system.damping @ shapes).T,
-            loads,
-        )
+        inertia = motion.acceleration[:, :mode_count] @ (system.mass @ shapes).T
+        damping = motion.velocity[:, :mode_count] @ (self.system.damping @ shapes).T
         # The equivalent force at a port p excites the modes as the loads do, in
         # projection on the port: p @ shapes @ (modal forces), over the same for a unit force at
         # the port, which is |p @ shapes|^2 (mobility).
@@ -169,7 +222,9 @@ class PortScaleEstimator:
             shapes @ (shapes.T @ self.rows.T) / np.where(is_free_to_move, mobility, 1.0)
         )
         mean_squares = [
-            np.mean((force @ port_forces_per_load) ** 2, axis=0) for force in forces_by_kind
+            np.mean((inertia @ port_forces_per_load * measured_ratios) ** 2, axis=0),
+            np.mean((damping @ port_forces_per_load * measured_ratios) ** 2, axis=0),
+            np.mean((loads @ port_forces_per_load) ** 2, axis=0),
         ]
         largest_mean_square = np.max(mean_squares, axis=0)
         # a port that no mode moves is moved by drives: the divisor makes its force scale, which is
@@ -181,6 +236,52 @@ class PortScaleEstimator:
         self.sample_count += len(motion.time)
         self.follows_drives &= mobility == 0.0
         return loads
+
+    def _measured_over_computed(
+        self, motion: Motion, positions: FloatArray, readings: DisplacementReadings
+    ) -> FloatArray:
+        """Return the factors (P,) that bring the computed motion of ports to the measured size.
+
+        The displacement of a port is measured if it is a linear combination of displacements that
+        channels show and of prescribed motions, such as the distance of a body from a moved
+        support. It is one for all other ports, and where both motions have about the same size.
+
+        Parameters
+        ----------
+        motion : Motion
+            The computed motion of T samples.
+        positions : (T, P) array
+            The computed displacements of the ports [m or rad].
+        readings : DisplacementReadings
+            The displacements that channels measured.
+        """
+        ratios = np.ones(len(self.rows))
+        reading_count = len(readings.rows)
+        if not reading_count:
+            return ratios
+        computed, _ = motion.displacements_and_speeds_at(readings.rows)
+        known_rows = np.vstack(
+            (readings.rows, motion.system.drives.reshape(-1, self.rows.shape[1]))
+        )
+        for port, row in enumerate(self.rows):
+            if not np.any(row[: motion.system.displacement_count]):
+                continue  # a port of a state, whose value is a speed here
+            coefficients = np.linalg.lstsq(known_rows.T, row, rcond=None)[0]
+            unknown_part = np.abs(known_rows.T @ coefficients - row).max()
+            if unknown_part > EXACT_COMBINATION * np.abs(row).max():
+                continue
+            # prescribed motions are the same in both: only readings differ from the computed motion
+            difference = (readings.values - computed) @ coefficients[:reading_count]
+            measured = positions[:, port] + difference
+            counts = np.isfinite(measured)
+            largest_measured = larger_magnitude(0.0, measured[counts])
+            largest_computed = larger_magnitude(0.0, positions[counts, port])
+            if largest_measured == 0.0 or largest_computed == 0.0:
+                continue
+            ratio = largest_measured / largest_computed
+            if not 1.0 / FAR_FROM_MEASURED < ratio < FAR_FROM_MEASURED:
+                ratios[port] = ratio
+        return ratios
 
     def _add_largest(
         self, displacements: FloatArray, speeds: FloatArray, *, is_fitted: bool

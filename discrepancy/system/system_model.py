@@ -21,6 +21,7 @@ from discrepancy.system.port_scales import (
     GlobalScales,
     LargestMotion,
     PortScaleEstimator,
+    displacement_readings,
     larger_magnitude,
     largest_measured_force,
     scales_of_moving_structure,
@@ -437,7 +438,12 @@ class SystemModel(Model):
             if _is_moved_by_inputs(trial):
                 motion = self._motion_under_inputs(campaign, trial)
                 measured_force = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured_force, is_fitted=is_fitted)
+                case = self.patched_trial(trial, Conditions(parameters))
+                outputs = campaign.outputs(trial)
+                self.check_outputs(outputs)
+                equations = self.output_equations(case, outputs, motion.excitation)
+                readings = displacement_readings(trial, equations)
+                loads = estimator.add_motion(motion, measured_force, readings, is_fitted=is_fitted)
                 # from modal coordinates (N, M + P) to the displacements of the structure
                 shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
                 largest_motion = LargestMotion(
