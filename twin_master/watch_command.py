@@ -31,6 +31,24 @@ if TYPE_CHECKING:
     from twin_master.watch.folder import Watch
 
 
+PaceOption = Annotated[
+    float,
+    typer.Option(
+        "--pace",
+        min=0.0,
+        max=3600.0,
+        help="Seconds to wait after each step, to look at a recording.",
+    ),
+]
+MetricsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        help="Serve belief, decision and counts for Prometheus at this port; "
+        "without HOST to this machine only.",
+    ),
+]
 Decision = Mapping[str, Any]
 """The decision of a twin in a step, as `decision_from_line` returns it."""
 
@@ -53,8 +71,8 @@ def watch(
             "--observations",
             metavar="SOURCE",
             show_default="the recording of the scenario, else -",
-            help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines "
-            "on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
+            help="A file (CSV, NetCDF, JSON lines, line protocol), the folder of a run or watch, "
+            "`-` for lines on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
             "TLS).",
         ),
     ] = None,
@@ -84,18 +102,10 @@ def watch(
         bool,
         typer.Option(
             "--follow",
-            help="Wait at the end of a CSV file for more.",
+            help="Wait at the end of a file for more.",
         ),
     ] = False,
-    pace: Annotated[
-        float,
-        typer.Option(
-            "--pace",
-            min=0.0,
-            max=3600.0,
-            help="Seconds to wait after each step, to look at a recording.",
-        ),
-    ] = 0.0,
+    pace: PaceOption = 0.0,
     steps: Annotated[
         int | None,
         typer.Option(
@@ -134,6 +144,7 @@ def watch(
         ),
     ] = False,
     ca_file: CertificateOption = None,
+    metrics: MetricsOption = None,
     seed: SeedOption = None,
     calibration: CalibrationOption = None,
     library: LibraryOption = None,
@@ -195,6 +206,7 @@ def watch(
             report=not no_report,
             otherwise="-",
             begun=begin_watch,
+            metrics=metrics,
             cause_search=cause_search,
             progress=terminal.progress(),
         )
