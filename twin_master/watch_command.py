@@ -6,7 +6,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -175,12 +175,6 @@ def watch(
     comes_from_broker = broker_address.is_broker(observations or "")
     is_live = follow or observations is None or observations == "-" or comes_from_broker
 
-    def print_decision(decision: Decision) -> None:
-        has_reader = _print_decision(watches[0], decision, flush=is_live)
-        time.sleep(pace)
-        if not has_reader and not comes_from_broker:
-            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
-
     with view_beside(view) as begun:
 
         def begin_watch(watched: "Watch") -> None:
@@ -192,7 +186,9 @@ def watch(
             observations,
             out,
             {"seed": seed, "calibration": calibration, "library": library},
-            decide=print_decision,
+            decide=_decision_printer(
+                watches, flush=is_live, pace=pace, needs_reader=not comes_from_broker
+            ),
             resume=resume,
             follow=follow,
             steps=steps,
@@ -212,6 +208,32 @@ def watch(
         )
         _print_end_of_watch(folder, watches[0], report=not no_report)
     _exit_on_complaint(watches[0])
+
+
+def _decision_printer(
+    watches: "list[Watch]", *, flush: bool, pace: float, needs_reader: bool
+) -> Callable[[Decision], None]:
+    """Return a function that prints a decision, and waits as long as the user wants.
+
+    Parameters
+    ----------
+    watches : list of Watch
+        A list to which the watch is added once it has begun.
+    flush : bool
+        Whether each decision is to be written at once.
+    pace : float
+        The time to wait after each decision [s].
+    needs_reader : bool
+        Whether the watch is to end once nobody reads the decisions any more.
+    """
+
+    def print_decision(decision: Decision) -> None:
+        has_reader = _print_decision(watches[0], decision, flush=flush)
+        time.sleep(pace)
+        if needs_reader and not has_reader:
+            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
+
+    return print_decision
 
 
 def _exit_on_complaint(watched: "Watch") -> None:
