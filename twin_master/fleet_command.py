@@ -1,7 +1,6 @@
 """`uav-twin fleet`, and `uav-twin run --seeds`; the process of `--view` for all commands."""
 
 import json
-import os
 import signal
 import sys
 import time
@@ -18,6 +17,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
+from reporting.operating_system import lower_priority, usable_processors
 from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
@@ -331,7 +331,7 @@ def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
         return Engine(cluster=cluster)
     if workers is None:
-        workers = len(os.sched_getaffinity(0))
+        workers = usable_processors()
     return Engine(workers)
 
 
@@ -519,8 +519,7 @@ def view_beside(
     def begin(folder: Path) -> None:
         nonlocal process
         context = multiprocessing.get_context("spawn")
-        arguments = (folder, os.getpid(), server)
-        process = context.Process(target=_serve_mission, args=arguments, daemon=True)
+        process = context.Process(target=_serve_mission, args=(folder, server), daemon=True)
         process.start()
 
     try:
@@ -536,8 +535,10 @@ def view_beside(
             process.join()
 
 
-def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None) -> None:
+def _serve_mission(folder: Path, server: ViewServer | None) -> None:
     """Show a mission once it is prepared, until the process that flies it ends."""
+    import multiprocessing
+
     if server is None:
         from twin_master.viewer.flight import is_prepared
         from twin_master.viewer.server import serve
@@ -545,10 +546,11 @@ def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None
         server = ViewServer(is_prepared, serve)
     # Ctrl-C is for the mission, which then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICENESS_OF_VIEW)
+    lower_priority(_NICENESS_OF_VIEW)
+    mission_process = multiprocessing.parent_process()
 
     def is_mission_alive() -> bool:
-        return os.getppid() == mission_process
+        return mission_process is None or mission_process.is_alive()
 
     while is_mission_alive() and not server.is_ready(folder):
         time.sleep(_POLLING_INTERVAL)

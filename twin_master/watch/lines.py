@@ -9,9 +9,9 @@ from functools import lru_cache
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
-from select import select
-from typing import IO, BinaryIO, TypedDict
+from typing import IO, BinaryIO, TypedDict, cast
 
+from reporting.operating_system import ReadableStream, is_same_beginning, polled_pieces
 from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 
@@ -185,19 +185,14 @@ class Pipe(Lines):
 
     def pieces(self) -> Iterator[bytes | None]:
         """Yield the pieces until the stream ends."""
+        if self._polls:
+            yield from polled_pieces(cast(ReadableStream, self._stream), _PIECE_BYTES)
+            return
         while True:
-            if self._polls and not self._is_readable():
-                yield None
-                continue
             piece: bytes | None = self._stream.read1(_PIECE_BYTES)  # type: ignore[attr-defined]
             if piece == b"":
                 return
             yield piece
-
-    def _is_readable(self) -> bool:
-        """Return whether something has come, or the stream has ended."""
-        readable, _, _ = select([self._stream], [], [], 0.0)
-        return bool(readable)
 
 
 class GrowingFile(Lines):
@@ -313,8 +308,7 @@ class GrowingFile(Lines):
 
     def _was_cut(self) -> bool:
         """Return whether the file was cut after it was read, even if it has grown again since."""
-        beginning = os.pread(self._file.fileno(), len(self._beginning), 0)
-        if beginning != self._beginning:
+        if not is_same_beginning(self._file, self._beginning):
             return True
         return os.fstat(self._file.fileno()).st_size < self._file.tell()
 

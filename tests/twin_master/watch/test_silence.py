@@ -66,7 +66,7 @@ class SilentSource:
 
     def open_file(self, plain: Path, folder: Path) -> list[str]:
         """Feed the watch from a file that has a header only, and return three rows for it."""
-        header, *rows = plain.read_text().splitlines(keepends=True)[:4]
+        header, *rows = plain.read_text(encoding="utf-8").splitlines(keepends=True)[:4]
         path = folder / "m.csv"
         path.write_text(header)
         self.stream = path.open("rb")

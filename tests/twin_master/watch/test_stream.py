@@ -222,7 +222,7 @@ def test_a_watch_that_was_stopped_anywhere_tells_the_same(base, mission, tmp_pat
 def watched(scenario: LoadedScenario, folder: Path, messages: list[Mapping[str, Any]]) -> Any:
     """Run `uav-twin watch` with messages on its standard input."""
     text = "".join(json.dumps(message) + "\n" for message in messages)
-    with patch("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode()))):
+    with patch("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8")):
         return command("watch", scenario.path, "--observations", "-", "--out", folder, "--no-report")
 
 

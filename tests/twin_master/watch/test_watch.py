@@ -158,7 +158,7 @@ class StoppedWatch:
 def stopped_within_gap(base: Watch, plain: Path, tmp_path_factory: pytest.TempPathFactory) -> StoppedWatch:
     """The recording has a gap of ten steps, within which a watch is stopped twice."""
     folder = tmp_path_factory.mktemp("gap")
-    rows = plain.read_text().splitlines()
+    rows = plain.read_text(encoding="utf-8").splitlines()
     recording = folder / "m.csv"
     recording.write_text("\n".join([*rows[:11], "what", *rows[21:], ""]))
     scenario = base.scenario.model_copy()
@@ -230,7 +230,7 @@ def test_what_came_behind_the_last_step_of_a_live_watch_stays_counted(watch, mis
 @pytest.fixture
 def daily_files(plain: Path, tmp_path: Path) -> list[Path]:
     """Three files of a logger that begins one each day; the last is that before, which has grown."""
-    header, *rows = plain.read_text().splitlines()
+    header, *rows = plain.read_text(encoding="utf-8").splitlines()
     files = []
     for day, rows_of_day in enumerate((rows[:30], rows[30:45], rows[30:])):
         path = tmp_path / f"{day}.csv"

@@ -1,0 +1,85 @@
+"""The command line on a system without what POSIX alone has: a mission, a watch, a fleet, a structure.
+
+On Windows these tests run as they are, `python -m pytest -m portable`; elsewhere what Windows lacks is hidden
+from the processes that they start.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.portable, pytest.mark.slow]
+ROOT = Path(__file__).parents[2]
+HIDDEN, NATIVE = "tests.portable.other_system", "uav_twin"
+
+
+def ran(folder: Path, *words: object, module: str = HIDDEN) -> subprocess.CompletedProcess[str]:
+    """Run `uav-twin` in a process of its own, in a folder; it must end well."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "PYTHONUTF8": "1"}
+    process = subprocess.run(
+        [sys.executable, "-m", module, *map(str, words)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        check=False,
+    )
+    assert process.returncode == 0, process.stderr[-3000:]
+    return process
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("portable")
+
+
+@pytest.fixture(scope="module")
+def mission(folder: Path) -> subprocess.CompletedProcess[str]:
+    """The mission of the paper, flown by an FMU, with its report."""
+    return ran(folder, "run", "level_turns", "--out", "mission")
+
+
+def test_a_mission_is_flown_filtered_and_reported(folder, mission):
+    assert "The twin left 3g for 2g at step" in mission.stdout
+    assert (folder / "mission" / "report.html").stat().st_size > 100_000
+    assert (folder / "mission" / "run.nc").is_file()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="hides nothing on this system")
+@pytest.mark.parametrize("sentence", ["cannot isolate FMUs", "no locks on files", "cannot fork a process"])
+def test_what_is_weaker_is_said_once(mission, sentence):
+    said = " ".join(mission.stderr.split())
+    assert len(re.findall(sentence, said)) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="hides nothing on this system")
+def test_a_mission_is_the_same_to_the_bit(folder, mission):
+    ran(folder, "run", "level_turns", "--out", "native", "--no-report", module=NATIVE)
+    journals = [(folder / name / "journal.jsonl").read_bytes() for name in ("mission", "native")]
+    assert journals[0] == journals[1]
+
+
+def test_a_file_is_watched_and_the_watch_is_resumed(folder):
+    ran(folder, "watch", "watched_wing", "--out", "watch", "--steps", "5", "--no-report")
+    ran(folder, "watch", "--resume", "--out", "watch", "--steps", "9", "--observations",
+        ROOT / "scenarios/recordings/watched_wing.csv", "--no-report")  # fmt: skip
+    lines = (folder / "watch" / "journal.jsonl").read_text(encoding="utf-8").splitlines()
+    assert sum('"filtered"' in line for line in lines) == 9
+
+
+def test_a_fleet_is_flown(folder):
+    pytest.importorskip("distributed")
+    ran(folder, "run", "level_turns", "--seeds", "1:2", "--out", "fleet", "--no-report")
+    assert (folder / "fleet" / "result.json").is_file()
+
+
+def test_a_structure_is_built_and_verified(folder):
+    text = ran(folder, "structure", "info", "bracket").stdout
+    assert "bracket" in text
+    ran(folder, "structure", "reduce", "bracket", "--out", "bracket.npz")
+    assert (folder / "bracket.npz").stat().st_size > 1000
