@@ -116,13 +116,14 @@ def plug_in_versions() -> dict[str, str]:
         such as ``uav_twin.laws: my_law``, in sorted order.
     """
     versions = {}
-    for point in metadata.entry_points():
-        if point.group.startswith(_PLUG_IN_GROUPS):
+    groups = [name for name in metadata.entry_points().groups if name.startswith(_PLUG_IN_GROUPS)]
+    for group in groups:
+        for point in metadata.entry_points(group=group):
             distribution = point.dist
             version = "unknown"
             if distribution is not None:
                 version = f"{distribution.name} {distribution.version}"
-            versions[f"{point.group}: {point.name}"] = version
+            versions[f"{group}: {point.name}"] = version
     return dict(sorted(versions.items()))
 
 

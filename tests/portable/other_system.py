@@ -10,6 +10,7 @@ import os
 import select
 import signal
 import sys
+from contextlib import suppress
 from typing import Any, NoReturn
 
 MODULES = ("fcntl", "grp", "pwd", "resource", "termios")
@@ -36,6 +37,9 @@ def hide_posix() -> None:
     import tempfile
 
     tempfile.gettempdir()
+    # So does this library, which has a module of its own for each system
+    with suppress(ImportError):
+        import distributed  # noqa: F401
     for name in MODULES:
         sys.modules[name] = None  # type: ignore[assignment]
     for module, names in ((os, OF_OS), (signal, OF_SIGNAL)):
