@@ -76,7 +76,7 @@ def test_a_file_is_watched_and_the_watch_is_resumed(folder):
 def test_a_fleet_is_flown(folder):
     pytest.importorskip("distributed")
     ran(folder, "run", "level_turns", "--seeds", "1:3", "--workers", "0", "--out", "fleet")
-    assert (folder / "fleet" / "result.json").is_file()
+    assert any((folder / "fleet").glob("*.zarr"))
 
 
 def test_a_structure_is_built_and_reduced(folder):
