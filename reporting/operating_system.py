@@ -114,7 +114,7 @@ def _lock_byte(descriptor: int, *, wait: bool) -> None:
             except OSError as error:
                 # A lock that is waited for is tried for ten seconds only
                 if not wait:
-                    raise BlockingIOError(*error.args) from None
+                    raise BlockingIOError(error.errno, error.strerror) from None
     finally:
         os.lseek(descriptor, former_position, os.SEEK_SET)
 
@@ -282,8 +282,10 @@ def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes |
 
     def read() -> None:
         try:
-            while piece := stream.read1(size):
+            piece = stream.read1(size)
+            while piece:
                 pieces.put(piece)
+                piece = stream.read1(size)
             pieces.put(b"")
         except BaseException as error:  # noqa: BLE001 - raised again where the stream is read
             pieces.put(error)
