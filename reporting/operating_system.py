@@ -7,6 +7,7 @@ worker of FMUs, which needs Linux. A substitute that is weaker says so once, in 
 
 import os
 import queue
+import select
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -260,13 +261,11 @@ def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
     size : int
         The greatest length of a piece.
     """
-    if os.name != "posix":
+    if not _can_poll(stream):
         yield from pieces_read_by_thread(stream, size)
         return
-    from select import select
-
     while True:
-        readable, _, _ = select([stream], [], [], 0.0)
+        readable, _, _ = select.select([stream], [], [], 0.0)
         if not readable:
             yield None
             continue
@@ -274,6 +273,15 @@ def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
         if piece == b"":
             return
         yield piece
+
+
+def _can_poll(stream: ReadableStream) -> bool:
+    """Return whether the system can be asked whether something has come on a stream."""
+    try:
+        select.select([stream], [], [], 0.0)
+    except OSError:
+        return False
+    return True
 
 
 def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes | None]:

@@ -25,6 +25,7 @@ from twin_master.command_options import (
     EstimatorOption,
     FleetFolderOption,
     FleetSeedOption,
+    MetricsOption,
     PolicyOption,
     SensorModelOption,
     ViewOption,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Estimated
     from twin_master.fleet.watched_asset import WatchedAsset
+    from twin_master.watch.metrics_server import MetricsServer
 
 
 Standing = Mapping[str, Any]
@@ -78,6 +80,7 @@ def watch(
         ),
     ] = None,
     ca_file: CertificateOption = None,
+    metrics: MetricsOption = None,
     view: ViewOption = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each step of each asset out.
@@ -93,6 +96,7 @@ def watch(
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
+    from twin_master.watch.metrics_server import serve_metrics
     from twin_master.watch.signals import call_on_end_signal
 
     fleet = load_fleet(file, seed)
@@ -110,11 +114,13 @@ def watch(
     server = ViewServer(is_fleet, serve_fleet)
     try:
         with (
+            serve_metrics(metrics) as console.metrics_server,
             call_on_end_signal(watched.ask),
             view_beside(view, server) as begun,
             console.live_display,
         ):
             begun(folder)
+            console.say_address_of_metrics()
             watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
@@ -136,7 +142,11 @@ class _Console:
     ----------
     live_display : context manager
         While it is open, people see the table.
+    metrics_server : MetricsServer or None
+        Serves the figures of the assets whose decisions are told, if that is wanted.
     """
+
+    metrics_server: "MetricsServer | None" = None
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -151,6 +161,8 @@ class _Console:
 
     def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Print the new notices of a decision and, for a program, the decision."""
+        if self.metrics_server is not None:
+            self.metrics_server.attach(asset.name, asset.watch).note_decision(decision)
         for notice in decision["notices"]:
             was_told = notice["sentence"] in asset.alarms
             if not was_told:
@@ -162,6 +174,11 @@ class _Console:
             sys.stdout.write(json.dumps({"asset": asset.name, **decision}) + "\n")
         except BrokenPipeError:  # the reader has ended
             signal.raise_signal(signal.SIGINT)  # which ends the watch in order
+
+    def say_address_of_metrics(self) -> None:
+        """Print the address where the figures are served, if they are."""
+        if self.metrics_server is not None:
+            self.say(f"Metrics: {self.metrics_server.address}")
 
     def say(self, text: str) -> None:
         """Print a sentence: above the table for people, on the error stream for a program."""

@@ -20,6 +20,7 @@ from twin_master.command_options import (
     CalibrationOption,
     CertificateOption,
     LibraryOption,
+    MetricsOption,
     SeedOption,
     ViewOption,
     complete_scenario,
@@ -38,15 +39,6 @@ PaceOption = Annotated[
         min=0.0,
         max=3600.0,
         help="Seconds to wait after each step, to look at a recording.",
-    ),
-]
-MetricsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--metrics",
-        metavar="[HOST:]PORT",
-        help="Serve belief, decision and counts for Prometheus at this port; "
-        "without HOST to this machine only.",
     ),
 ]
 Decision = Mapping[str, Any]

@@ -4,9 +4,11 @@ On Windows these tests run as they are, `python -m pytest -m portable`; elsewher
 from the processes that they start.
 """
 
+import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,16 +17,20 @@ import pytest
 
 pytestmark = [pytest.mark.portable, pytest.mark.slow]
 ROOT = Path(__file__).parents[2]
+RECORDING = ROOT / "scenarios" / "recordings" / "watched_wing.csv"
 HIDDEN, NATIVE = "tests.portable.other_system", "uav_twin"
 
 
-def ran(folder: Path, *words: object, module: str = HIDDEN) -> subprocess.CompletedProcess[str]:
-    """Run `uav-twin` in a process of its own, in a folder; it must end well."""
+def ran(
+    folder: Path, *words: object, module: str = HIDDEN, given: str = ""
+) -> subprocess.CompletedProcess[str]:
+    """Run `uav-twin` in a process of its own, in a folder, with a text as its input; it must end well."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", "PYTHONUTF8": "1"}
     process = subprocess.run(
         [sys.executable, "-m", module, *map(str, words)],
         cwd=folder,
         env=environment,
+        input=given,
         capture_output=True,
         text=True,
         encoding="utf-8",
@@ -68,9 +74,32 @@ def test_a_mission_is_the_same_to_the_bit(folder, mission):
 def test_a_file_is_watched_and_the_watch_is_resumed(folder):
     ran(folder, "watch", "watched_wing", "--out", "watch", "--steps", "5", "--no-report")
     ran(folder, "watch", "--resume", "--out", "watch", "--steps", "9", "--observations",
-        ROOT / "scenarios/recordings/watched_wing.csv", "--no-report")  # fmt: skip
+        RECORDING, "--no-report")  # fmt: skip
     lines = (folder / "watch" / "journal.jsonl").read_text(encoding="utf-8").splitlines()
     assert sum('"filtered"' in line for line in lines) == 9
+
+
+def readings(count: int) -> list[dict[str, str]]:
+    """Return the first rows of the shipped recording."""
+    with RECORDING.open(encoding="utf-8", newline="") as file:
+        return [row for row, _ in zip(csv.DictReader(file), range(count), strict=False)]
+
+
+def test_a_file_is_followed(folder):
+    shutil.copyfile(RECORDING, folder / "followed.csv")
+    words = ["--observations", "followed.csv", "--follow", "--steps", "4", "--no-report"]
+    decisions = ran(folder, "watch", "watched_wing", "--out", "followed", *words).stdout.splitlines()
+    assert [json.loads(decision)["step"] for decision in decisions] == [0, 1, 2, 3]
+
+
+def test_a_pipe_is_watched_that_must_not_fall_silent(folder):
+    """It is polled, which Windows cannot do; so a thread reads it."""
+    text = (ROOT / "scenarios" / "watched_wing.toml").read_text(encoding="utf-8")
+    (folder / "piped.toml").write_text(f"{text}quiet_after_seconds = 600\n", encoding="utf-8")
+    lines = "".join(f"{json.dumps({**row, 'step': step})}\n" for step, row in enumerate(readings(4)))
+    words = ["--observations", "-", "--out", "piped", "--no-report"]
+    decisions = ran(folder, "watch", "piped.toml", *words, given=lines).stdout.splitlines()
+    assert [json.loads(decision)["step"] for decision in decisions] == [0, 1, 2, 3]
 
 
 def test_a_fleet_is_flown(folder):

@@ -2,8 +2,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Literal
 
 from twin_master.mission.residuals import residual_summary
@@ -61,10 +62,15 @@ class WatchMetrics:
     ----------
     watch : Watch
         The watch, which runs in another thread; it is only read.
+
+    Attributes
+    ----------
+    watch : Watch
+        The watch.
     """
 
     def __init__(self, watch: Watch) -> None:
-        self._watch = watch
+        self.watch = watch
         self._decision: Decision = {}
         self._notice_counts = Counter({ALARM: 0})
 
@@ -76,15 +82,11 @@ class WatchMetrics:
         self._notice_counts = self._notice_counts + new_kinds
         self._notice_counts.setdefault(ALARM, 0)
 
-    def exposition(self) -> str:
-        """Return all figures in the text format of Prometheus, version 0.0.4.
-
-        The text is empty before the watch has begun to read messages.
-        """
-        if not self._watch.has_begun:
-            return ""
-        metrics = [*self._decision_metrics(self._decision), *self._message_metrics()]
-        return exposition(metrics, {"asset": self._watch.scenario.mission.name})
+    def metrics(self) -> list[Metric]:
+        """Return all figures; none before the watch has begun to read messages."""
+        if not self.watch.has_begun:
+            return []
+        return [*self._decision_metrics(self._decision), *self._message_metrics()]
 
     def _decision_metrics(self, decision: Decision) -> Iterator[Metric]:
         """Yield the figures of the last decision; none before the first one."""
@@ -146,23 +148,23 @@ class WatchMetrics:
     def _control_metric(self, key: str, meaning: str) -> Metric:
         """Return which control stands under a key of the decision, as 1, and 0 for the others."""
         samples = []
-        for name in self._watch.scenario.control_names:
+        for name in self.watch.scenario.control_names:
             samples.append(Sample(float(name == self._decision[key]), {"control": name}))
         return Metric(key, "gauge", meaning, samples)
 
     def _residual_samples(self) -> list[Sample]:
         """Return the residual of the last step; nothing if it has no reading."""
-        step = self._watch.last_step
+        step = self.watch.last_step
         if step is None:
             return []
-        history = History(self._watch.twin, self._watch.scenario.observation.count, [step])
-        summary = residual_summary(history, step.twin_step.step, self._watch.models)
+        history = History(self.watch.twin, self.watch.scenario.observation.count, [step])
+        summary = residual_summary(history, step.twin_step.step, self.watch.models)
         residual = summary["rms_residual"]
         return [] if residual is None else [Sample(residual)]
 
     def _message_metrics(self) -> Iterator[Metric]:
         """Yield the counts of messages and notices, and the times of the watch."""
-        counts = self._watch.intake.counts
+        counts = self.watch.intake.counts
         meanings = {
             "messages_received": (counts.received, "Messages that were read."),
             "messages_refused": (counts.rejected, "Messages that were refused."),
@@ -183,39 +185,48 @@ class WatchMetrics:
             "seconds_since_step",
             "gauge",
             "Time since the last step [s].",
-            [Sample(self._watch.seconds_since_step)],
+            [Sample(self.watch.seconds_since_step)],
         )
         yield Metric(
             "messages_waiting",
             "gauge",
             "Messages that a broker has sent and that wait to be processed.",
-            [Sample(self._watch.intake.waiting_messages)],
+            [Sample(self.watch.intake.waiting_messages)],
         )
 
 
-def exposition(metrics: list[Metric], labels: Mapping[str, str]) -> str:
-    """Return metrics in the text format of Prometheus.
+def exposition(metrics_of_asset: Mapping[str, Sequence[Metric]]) -> str:
+    """Return metrics of assets in the text format of Prometheus, version 0.0.4.
+
+    The values of a metric stand together, whatever asset they are of.
 
     Parameters
     ----------
-    metrics : list of Metric
-        The metrics.
-    labels : dict of str to str
-        The labels that all values have.
+    metrics_of_asset : dict of str to sequence of Metric
+        The metrics of each asset, by its name, which becomes the label `asset`.
     """
-    lines = []
-    for metric in metrics:
-        if not metric.samples:
-            continue
-        name = _PREFIX + metric.name
-        meaning = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
-        lines.append(f"# HELP {name} {meaning}")
-        lines.append(f"# TYPE {name} {metric.kind}")
-        for sample in metric.samples:
-            pairs = {**labels, **sample.labels}.items()
-            texts = [f'{label}="{_escape_label(value)}"' for label, value in pairs]
-            lines.append(f"{name}{{{','.join(texts)}}} {_number_text(sample.value)}")
-    return "\n".join([*lines, ""])
+    lines_of_metric: dict[str, list[str]] = {}
+    for asset, metrics in metrics_of_asset.items():
+        for metric in metrics:
+            if metric.samples:
+                lines = lines_of_metric.setdefault(metric.name, _heading_lines(metric))
+                lines += [_sample_line(metric, sample, asset) for sample in metric.samples]
+    all_lines = chain.from_iterable(lines_of_metric.values())
+    return "".join(f"{line}\n" for line in all_lines)
+
+
+def _heading_lines(metric: Metric) -> list[str]:
+    """Return the lines that say what a metric is."""
+    name = _PREFIX + metric.name
+    meaning = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
+    return [f"# HELP {name} {meaning}", f"# TYPE {name} {metric.kind}"]
+
+
+def _sample_line(metric: Metric, sample: Sample, asset: str) -> str:
+    """Return the line of a value."""
+    labels = {"asset": asset, **sample.labels}
+    texts = [f'{label}="{_escape_label(value)}"' for label, value in labels.items()]
+    return f"{_PREFIX}{metric.name}{{{','.join(texts)}}} {_number_text(sample.value)}"
 
 
 def _escape_label(value: str) -> str:

@@ -1,4 +1,4 @@
-"""The page of the figures of a watch, which a monitoring system reads over HTTP."""
+"""The page of the figures of watches, which a monitoring system reads over HTTP."""
 
 import re
 import threading
@@ -10,8 +10,7 @@ from socketserver import BaseServer
 
 from twin_master.errors import MissionInputError
 from twin_master.watch.folder import Watch
-from twin_master.watch.metrics import WatchMetrics
-from twin_master.watch.records import Decision
+from twin_master.watch.metrics import WatchMetrics, exposition
 
 LOOPBACK = "127.0.0.1"
 """The address that is served where the user names none: that of this machine alone."""
@@ -24,7 +23,7 @@ _IDLE_SECONDS = 10
 
 
 class MetricsServer:
-    """Serves the figures of a watch, from the moment when it is attached.
+    """Serves the figures of watches, of each from the moment when it is attached.
 
     Parameters
     ----------
@@ -45,7 +44,7 @@ class MetricsServer:
     """
 
     def __init__(self, host: str, port: int) -> None:
-        self._metrics: WatchMetrics | None = None
+        self._metrics_of_asset: dict[str, WatchMetrics] = {}
         with MissionInputError.instead_of(
             OSError, before=f"the metrics cannot be served at {host}:{port}: ", after="."
         ):
@@ -54,18 +53,27 @@ class MetricsServer:
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
-    def attach(self, watch: Watch) -> None:
-        """Serve the figures of a watch from now on."""
-        self._metrics = WatchMetrics(watch)
+    def attach(self, asset: str, watch: Watch) -> WatchMetrics:
+        """Serve the figures of a watch from now on, and return them.
 
-    def note_decision(self, decision: Decision) -> None:
-        """Take a new decision of the watch."""
-        if self._metrics is not None:
-            self._metrics.note_decision(decision)
+        Parameters
+        ----------
+        asset : str
+            The name of the asset, which is in all of its figures.
+        watch : Watch
+            The watch; one that takes the place of another of the asset begins to count anew.
+        """
+        metrics = self._metrics_of_asset.get(asset)
+        if metrics is None or metrics.watch is not watch:
+            metrics = WatchMetrics(watch)
+            self._metrics_of_asset[asset] = metrics
+        return metrics
 
     def text(self) -> str:
         """Return the figures in the text format of Prometheus; empty before a watch is attached."""
-        return "" if self._metrics is None else self._metrics.exposition()
+        # A copy, because the thread of the watches may attach another one meanwhile
+        attached = self._metrics_of_asset.copy()
+        return exposition({asset: metrics.metrics() for asset, metrics in attached.items()})
 
     def close(self) -> None:
         """End the page."""
@@ -110,7 +118,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve_metrics(address: str | int | None) -> Iterator[MetricsServer | None]:
-    """Serve the figures of a watch within a context; None if no address is given.
+    """Serve the figures of watches within a context; None if no address is given.
 
     Parameters
     ----------

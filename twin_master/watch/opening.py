@@ -384,11 +384,11 @@ def _also_as_metrics(
     """Return a function that also hands each decision to the server of metrics, if there is one."""
     if server is None:
         return decide
-    server.attach(watched)
+    metrics = server.attach(watched.scenario.mission.name, watched)
     watched.progress.note(f"Metrics: {server.address}")
 
     def decide_and_count(decision: Decision) -> None:
-        server.note_decision(decision)
+        metrics.note_decision(decision)
         decide(decision)
 
     return decide_and_count

@@ -19,7 +19,7 @@ from twin_master.errors import MissionInputError
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.metrics import Metric, Sample, WatchMetrics, exposition
-from twin_master.watch.metrics_server import MEDIA_TYPE, MetricsServer, serve_metrics
+from twin_master.watch.metrics_server import MEDIA_TYPE, serve_metrics
 from uav_twin import watch as watch_asset
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -56,17 +56,17 @@ class ServedMission:
         self.decisions: list[dict[str, Any]] = []
         with serve_metrics("127.0.0.1:0") as server:
             assert server is not None
-            server.attach(watch)
+            metrics = server.attach("wing", watch)
             self.before = server.text()
-            watch.run(CsvFeed(recorded, watch.scenario), self._decide(server), step_limit=steps)
+            watch.run(CsvFeed(recorded, watch.scenario), self._decide(metrics), step_limit=steps)
             port = int(server.address.split(":")[2].partition("/")[0])
             self.status, self.text = served(port, "/metrics")
             self.other_status, _ = served(port, "/")
         self.values = parsed(self.text)
 
-    def _decide(self, server: MetricsServer) -> Any:
+    def _decide(self, metrics: WatchMetrics) -> Any:
         def decide(decision: dict[str, Any]) -> None:
-            server.note_decision(decision)
+            metrics.note_decision(decision)
             self.decisions.append(decision)
 
         return decide
@@ -127,14 +127,14 @@ def test_a_figure_that_has_no_value_yet_is_left_out(watch, plain):
 )
 def test_labels_and_numbers_are_written_as_prometheus_reads_them(number, text):
     metric = Metric("m", "gauge", "A \\ and\na line.", [Sample(number, {"name": 'a "b"\\\n'})])
-    lines = exposition([metric], {"asset": "w"}).splitlines()
+    lines = exposition({"w": [metric]}).splitlines()
     assert lines[0] == r"# HELP uav_twin_m A \\ and\na line."
     assert lines[2] == rf'uav_twin_m{{asset="w",name="a \"b\"\\\n"}} {text}'
 
 
 def test_the_media_type_is_that_of_the_text_format(watch, plain):
     with serve_metrics(0) as server:
-        server.attach(watch)
+        server.attach("wing", watch)
         connection = HTTPConnection(
             "127.0.0.1", int(server.address.split(":")[2].partition("/")[0]), timeout=20
         )
@@ -231,7 +231,7 @@ def test_the_panels_of_the_board_do_not_overlap(board):
 def test_the_figures_can_be_read_while_the_watch_goes_on(watch, plain):
     """A monitoring system reads from another thread, again and again."""
     with serve_metrics(0) as server:
-        server.attach(watch)
+        metrics = server.attach("wing", watch)
         port = int(server.address.split(":")[2].partition("/")[0])
         texts: list[str] = []
         is_over = threading.Event()
@@ -242,7 +242,7 @@ def test_the_figures_can_be_read_while_the_watch_goes_on(watch, plain):
 
         thread = threading.Thread(target=read)
         thread.start()
-        watch.run(CsvFeed(plain, watch.scenario), server.note_decision)
+        watch.run(CsvFeed(plain, watch.scenario), metrics.note_decision)
         wait_until(lambda: f"{watch.twin.steps - 1}.0" in texts[-1])
         is_over.set()
         thread.join(60)
@@ -258,6 +258,19 @@ def test_a_state_that_is_not_believed_has_no_number(watch, plain):
     for health in decision["health"].values():
         health["mean"] = None
     metrics.note_decision(decision | {"state_believed": False})
-    values = parsed(metrics.exposition())
+    values = parsed(exposition({"wing": metrics.metrics()}))
     assert np.isnan(list(values["uav_twin_state_mean"].values())).all()
     assert value(values, "state_believed") == 0.0
+
+
+def test_the_values_of_a_metric_stand_together_whatever_asset_they_are_of():
+    """Prometheus reads one group of lines for each metric."""
+    step = Metric("step", "gauge", "Number.", [Sample(1.0)])
+    lost = Metric("lost_sensors", "gauge", "Sensors.", [Sample(0.0)])
+    lines = exposition({"a": [step, lost], "b": [step]}).splitlines()
+    assert [line for line in lines if line[0] != "#"] == [
+        'uav_twin_step{asset="a"} 1.0',
+        'uav_twin_step{asset="b"} 1.0',
+        'uav_twin_lost_sensors{asset="a"} 0.0',
+    ]
+    assert len(lines) == 7
