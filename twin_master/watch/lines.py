@@ -33,6 +33,7 @@ class Position(TypedDict):
 _PIECE_BYTES = 65_536
 """Number of bytes that are read at once, and of those at the beginning that identify a file."""
 _NUMBER_SUFFIX = re.compile(r"\.\d{1,6}")
+_DATE_AND_SECONDS = re.compile(r"\.\d{4}-\d\d-\d\d-\d{9,12}")
 _DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
@@ -41,7 +42,8 @@ def rotated_files(path: Path) -> list[Path]:
 
     They had the name of the log before, or are copies of it. Their names are that of the log and a
     number or a date, as logrotate and `logging.handlers` make them: `log.csv.1`,
-    `log.csv-20260501`, `log.csv.2026-05-01_12`.
+    `log.csv-20260501`, `log.csv.2026-05-01_12`. Telegraf writes date and seconds since 1970 before
+    the ending: `log.2026-05-01-1777629600.csv`.
     """
     dates = []
     numbers = []
@@ -53,7 +55,13 @@ def rotated_files(path: Path) -> list[Path]:
             numbers.append(suffix)
     dates.sort()
     numbers.sort(key=_number_of_suffix, reverse=True)  # the largest number is the oldest
-    return [path.with_name(path.name + suffix) for suffix in dates + numbers]
+    stamped = []
+    for file in path.parent.glob(f"{escape(path.stem)}.*{escape(path.suffix)}"):
+        stamp = file.name.removeprefix(path.stem).removesuffix(path.suffix)
+        if path.suffix and _DATE_AND_SECONDS.fullmatch(stamp):
+            stamped.append(file)
+    stamped.sort()
+    return stamped + [path.with_name(path.name + suffix) for suffix in dates + numbers]
 
 
 def _number_of_suffix(suffix: str) -> int:
