@@ -33,7 +33,7 @@ def record(watch: Watch, path: Path, steps: int) -> None:
     values = watch.models[0].knowledge.sensor_model.value_per_draw[:, 0, 1].mean(axis=0)
     rng = np.random.default_rng(1)
     count = scenario.observation.count
-    with path.open("w") as file:
+    with path.open("w", encoding="utf-8") as file:
         file.write(
             "step,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n"
         )

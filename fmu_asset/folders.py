@@ -5,6 +5,7 @@ Nobody else can write into such a folder: it has a parent of its own that only i
 
 import os
 import re
+import shutil
 import signal
 import tempfile
 import time
@@ -16,9 +17,12 @@ from .errors import FmuFileError
 
 _CANDIDATES = ("/tmp", "/var/tmp", "/dev/shm")
 """Folders for temporary files if the usual one cannot be used."""
-_PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+")
+_PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+|[A-Za-z]:[A-Za-z0-9/_.\-~]+")
+"""A path without characters that have to be quoted; on Windows with a drive, and short names."""
 _SEARCH_ROUNDS = 100
 """Largest number of searches for processes that keep starting others."""
+_HAS_OPENED_PATHS = hasattr(os, "O_PATH")
+"""Whether a folder can be opened without the right to read it, as on Linux."""
 _cleaned_parents: set[Path] = set()
 
 
@@ -37,7 +41,7 @@ def plain_folder() -> Path:
     candidates = [tempfile.gettempdir(), *_CANDIDATES]
     for name in candidates:
         path = Path(name)
-        is_plain = _PLAIN_PATH.fullmatch(str(path.absolute()))
+        is_plain = _PLAIN_PATH.fullmatch(path.absolute().as_posix())
         if is_plain and path.is_dir() and os.access(path, os.W_OK):
             _remove_leftovers(path)
             parent = tempfile.mkdtemp(prefix=f"{_prefix()}{os.getpid()}-", dir=path)
@@ -65,7 +69,8 @@ def _remove_leftovers(parent: Path) -> None:
 
     Nothing is done on a system without /proc, which cannot tell whether a process runs.
     """
-    if parent in _cleaned_parents or not Path("/proc/self").exists():
+    can_tell = Path("/proc/self").exists() and hasattr(os, "getuid")
+    if parent in _cleaned_parents or not can_tell:
         return
     _cleaned_parents.add(parent)
     for folder in parent.glob(f"{_prefix()}*"):
@@ -133,14 +138,20 @@ def remove_folder(folder: str | os.PathLike[str]) -> None:
     """Remove a folder and its content, however deeply nested, as far as it can be removed.
 
     Inner folders are first moved to the top. `shutil.rmtree` would call itself for each level, and
-    a deep path is longer than the system allows. Links are not followed, not even those by which a
-    process of the FMU replaces a folder meanwhile.
+    a deep path is longer than the system allows; on systems other than Linux it is used anyway.
+    Links are not followed, not even those by which a process of the FMU replaces a folder
+    meanwhile.
 
     Parameters
     ----------
     folder : path-like
         The path of the folder.
     """
+    if not _HAS_OPENED_PATHS:
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            Path(folder).parent.rmdir()
+        return
     # strings instead of `Path` objects take half the time
     top = os.fspath(folder)
     waiting = [top]

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from reporting.errors import DiskFullError, FileNotWrittenError
+from reporting.operating_system import can_flush, flag_for_flushing, open_descriptor
 
 TEMPORARY_SUFFIX = ".partial"
 """Ending of temporary names, which marks the leftovers of a killed process."""
@@ -81,8 +82,13 @@ def _destination(path: Path) -> Path:
 
 
 def synchronise(path: Path) -> None:
-    """Flush a file or a folder to the disk, so that it survives a power failure."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Flush a file or a folder to the disk, so that it survives a power failure.
+
+    A folder is left alone on a system that cannot flush it.
+    """
+    if not can_flush(path):
+        return
+    descriptor = os.open(path, flag_for_flushing())
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -170,7 +176,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         # The user's umask gives the permissions; `tempfile` would make a private file.
-        os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666))
+        os.close(open_descriptor(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC))
         yield temporary
         synchronise(temporary)
         temporary.replace(target)

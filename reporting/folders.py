@@ -15,33 +15,11 @@ from pathlib import Path
 
 from reporting.errors import FileNotWrittenError
 from reporting.files import explained_write_errors
+from reporting.operating_system import lock_folder
 
 _NEW = "new"
 _OLD = "old"
 _REPLACED = "replaced"
-
-
-def lock_folder(folder: Path) -> int | None:
-    """Lock a folder for this process.
-
-    The lock belongs to the folder itself, so it stays when the folder is renamed. The system
-    releases it when the process ends.
-
-    Returns
-    -------
-    int or None
-        The file descriptor that holds the lock until it is closed; None if another process has
-        locked the folder.
-    """
-    import fcntl
-
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
 
 
 @contextmanager

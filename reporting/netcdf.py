@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 from reporting.arrays import AnyArray
 from reporting.errors import DamagedFileError
+from reporting.operating_system import can_fork
 
 if TYPE_CHECKING:
     import h5py
@@ -197,7 +198,7 @@ def read_groups(path: Path) -> xr.DataTree:
     import h5netcdf  # noqa: F401
     import xarray as xr
 
-    groups = _groups_read_by_fork(path)
+    groups = _groups_read_by_fork(path) if can_fork() else _read_groups(path)
     if isinstance(groups, str):
         raise DamagedFileError(f"{path} is damaged or is not a NetCDF file ({groups})")
     return xr.DataTree.from_dict(groups)

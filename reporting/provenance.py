@@ -41,6 +41,8 @@ SOURCE_PACKAGES = (
 )
 """Packages of this project."""
 
+_PLUG_IN_GROUPS = "uav_twin."
+"""The beginning of all groups of entry points by which packages add something to this project."""
 _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
 
 
@@ -58,12 +60,16 @@ class Provenance:
         The SHA-256 of the sources of each package of this project.
     input_hashes : mapping of str to str
         The SHA-256 of each input, such as design, scenario or FMU.
+    plug_ins : mapping of str to str
+        The distribution and the version of each plug-in of another package, such as
+        ``my-laws 1.2``, by the group and the name of its entry point, ``uav_twin.laws: my_law``.
     """
 
     seed: int | None
     versions: Mapping[str, str]
     source_hashes: Mapping[str, str]
     input_hashes: Mapping[str, str] = field(default_factory=dict)
+    plug_ins: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """Return plain dictionaries, ready for JSON."""
@@ -96,7 +102,29 @@ def collect_provenance(
         versions={"python": platform.python_version(), **versions},
         source_hashes={package: source_hash(package) for package in packages},
         input_hashes=dict(sorted((input_hashes or {}).items())),
+        plug_ins=plug_in_versions(),
     )
+
+
+def plug_in_versions() -> dict[str, str]:
+    """Return the distribution and the version of each installed plug-in, without loading any.
+
+    Returns
+    -------
+    dict of str to str
+        The distributions, such as ``my-laws 1.2``, by the group and the name of the entry point,
+        such as ``uav_twin.laws: my_law``, in sorted order.
+    """
+    versions = {}
+    groups = [name for name in metadata.entry_points().groups if name.startswith(_PLUG_IN_GROUPS)]
+    for group in groups:
+        for point in metadata.entry_points(group=group):
+            distribution = point.dist
+            version = "unknown"
+            if distribution is not None:
+                version = f"{distribution.name} {distribution.version}"
+            versions[f"{group}: {point.name}"] = version
+    return dict(sorted(versions.items()))
 
 
 @cache

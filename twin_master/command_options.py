@@ -34,6 +34,15 @@ CertificateOption = Annotated[
     Path | None,
     typer.Option("--ca-file", help="Certificate of the authority of an mqtts:// broker."),
 ]
+MetricsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        help="Serve belief, decision and counts for Prometheus at this port; "
+        "without HOST to this machine only.",
+    ),
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(

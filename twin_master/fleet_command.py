@@ -1,7 +1,6 @@
 """`uav-twin fleet`, and `uav-twin run --seeds`; the process of `--view` for all commands."""
 
 import json
-import os
 import signal
 import sys
 import time
@@ -18,6 +17,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
+from reporting.operating_system import lower_priority, usable_processors
 from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
@@ -25,6 +25,7 @@ from twin_master.command_options import (
     EstimatorOption,
     FleetFolderOption,
     FleetSeedOption,
+    MetricsOption,
     PolicyOption,
     SensorModelOption,
     ViewOption,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Estimated
     from twin_master.fleet.watched_asset import WatchedAsset
+    from twin_master.watch.metrics_server import MetricsServer
 
 
 Standing = Mapping[str, Any]
@@ -78,6 +80,7 @@ def watch(
         ),
     ] = None,
     ca_file: CertificateOption = None,
+    metrics: MetricsOption = None,
     view: ViewOption = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each step of each asset out.
@@ -93,6 +96,7 @@ def watch(
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
+    from twin_master.watch.metrics_server import serve_metrics
     from twin_master.watch.signals import call_on_end_signal
 
     fleet = load_fleet(file, seed)
@@ -110,11 +114,13 @@ def watch(
     server = ViewServer(is_fleet, serve_fleet)
     try:
         with (
+            serve_metrics(metrics) as console.metrics_server,
             call_on_end_signal(watched.ask),
             view_beside(view, server) as begun,
             console.live_display,
         ):
             begun(folder)
+            console.say_address_of_metrics()
             watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
@@ -136,7 +142,11 @@ class _Console:
     ----------
     live_display : context manager
         While it is open, people see the table.
+    metrics_server : MetricsServer or None
+        Serves the figures of the assets whose decisions are told, if that is wanted.
     """
+
+    metrics_server: "MetricsServer | None" = None
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -151,6 +161,8 @@ class _Console:
 
     def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
         """Print the new notices of a decision and, for a program, the decision."""
+        if self.metrics_server is not None:
+            self.metrics_server.attach(asset.name, asset.watch).note_decision(decision)
         for notice in decision["notices"]:
             was_told = notice["sentence"] in asset.alarms
             if not was_told:
@@ -162,6 +174,11 @@ class _Console:
             sys.stdout.write(json.dumps({"asset": asset.name, **decision}) + "\n")
         except BrokenPipeError:  # the reader has ended
             signal.raise_signal(signal.SIGINT)  # which ends the watch in order
+
+    def say_address_of_metrics(self) -> None:
+        """Print the address where the figures are served, if they are."""
+        if self.metrics_server is not None:
+            self.say(f"Metrics: {self.metrics_server.address}")
 
     def say(self, text: str) -> None:
         """Print a sentence: above the table for people, on the error stream for a program."""
@@ -331,7 +348,7 @@ def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
             raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
         return Engine(cluster=cluster)
     if workers is None:
-        workers = len(os.sched_getaffinity(0))
+        workers = usable_processors()
     return Engine(workers)
 
 
@@ -519,8 +536,7 @@ def view_beside(
     def begin(folder: Path) -> None:
         nonlocal process
         context = multiprocessing.get_context("spawn")
-        arguments = (folder, os.getpid(), server)
-        process = context.Process(target=_serve_mission, args=arguments, daemon=True)
+        process = context.Process(target=_serve_mission, args=(folder, server), daemon=True)
         process.start()
 
     try:
@@ -536,8 +552,10 @@ def view_beside(
             process.join()
 
 
-def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None) -> None:
+def _serve_mission(folder: Path, server: ViewServer | None) -> None:
     """Show a mission once it is prepared, until the process that flies it ends."""
+    import multiprocessing
+
     if server is None:
         from twin_master.viewer.flight import is_prepared
         from twin_master.viewer.server import serve
@@ -545,10 +563,11 @@ def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None
         server = ViewServer(is_prepared, serve)
     # Ctrl-C is for the mission, which then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICENESS_OF_VIEW)
+    lower_priority(_NICENESS_OF_VIEW)
+    mission_process = multiprocessing.parent_process()
 
     def is_mission_alive() -> bool:
-        return os.getppid() == mission_process
+        return mission_process is None or mission_process.is_alive()
 
     while is_mission_alive() and not server.is_ready(folder):
         time.sleep(_POLLING_INTERVAL)

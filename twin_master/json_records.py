@@ -310,6 +310,9 @@ class ProvenanceRecord(TypedDict):
     """SHA-256 of the source code of each package of this program, by its name."""
     input_hashes: dict[str, str]
     """SHA-256 of each input, by its name."""
+    plug_ins: NotRequired[dict[str, str]]
+    """Distribution and version of each installed plug-in, by the group and the name of its entry
+    point, such as `uav_twin.laws: my_law`; runs of earlier versions have none."""
 
 
 class ConfigRecord(TypedDict):

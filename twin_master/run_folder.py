@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reporting.files import atomic_write_text, remove_leftovers, write_members
-from reporting.folders import closing_lock, lock_folder, restore_folder, whole_folder
+from reporting.folders import closing_lock, restore_folder, whole_folder
 from reporting.json_file import JsonObject, read_json
+from reporting.operating_system import is_lock_of, lock_folder
 from reporting.progress import Progress
-from reporting.provenance import collect_provenance
+from reporting.provenance import collect_provenance, plug_in_versions
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
@@ -147,7 +148,7 @@ def lock_run_folder(folder: Path) -> int:
     if descriptor is None:
         raise RunFolderError(f"another process is flying in {folder}: wait for it to end.")
     # Another process may have replaced the folder after it was opened for the lock.
-    if not folder.is_dir() or not os.path.samestat(os.fstat(descriptor), folder.stat()):
+    if not is_lock_of(descriptor, folder):
         os.close(descriptor)
         raise RunFolderError(
             f"another process has just put another run into {folder}: look at that one."
@@ -185,6 +186,7 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
         If packages have changed; the sentence names them.
     """
     recorded_provenance = config["provenance"]
+    _check_plug_ins(folder, recorded_provenance.get("plug_ins", {}))
     current = collect_provenance(seed)
     current_tables = {"versions": current.versions, "source_hashes": current.source_hashes}
     for table, current_values in current_tables.items():
@@ -201,6 +203,23 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
                 f"{folder} was begun with another version of {', '.join(names)}, so its results "
                 "could not be the same: fly the mission again with --replace."
             )
+
+
+def _check_plug_ins(folder: Path, recorded: JsonObject) -> None:
+    """Refuse to continue a run if a plug-in that was installed at its beginning is now another.
+
+    Plug-ins that were installed since do not matter, and runs of earlier versions record none.
+    """
+    current = plug_in_versions()
+    changes = []
+    for name, version in recorded.items():
+        if current.get(name) != version:
+            changes.append(f"{name} ({version}, now {current.get(name, 'not installed')})")
+    if changes:
+        raise NotResumableError(
+            f"{folder} was begun with other plug-ins: {', '.join(changes)}. Install what it was "
+            "begun with, or fly the mission again with --replace."
+        )
 
 
 def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:

@@ -6,7 +6,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +20,7 @@ from twin_master.command_options import (
     CalibrationOption,
     CertificateOption,
     LibraryOption,
+    MetricsOption,
     SeedOption,
     ViewOption,
     complete_scenario,
@@ -31,6 +32,15 @@ if TYPE_CHECKING:
     from twin_master.watch.folder import Watch
 
 
+PaceOption = Annotated[
+    float,
+    typer.Option(
+        "--pace",
+        min=0.0,
+        max=3600.0,
+        help="Seconds to wait after each step, to look at a recording.",
+    ),
+]
 Decision = Mapping[str, Any]
 """The decision of a twin in a step, as `decision_from_line` returns it."""
 
@@ -53,8 +63,8 @@ def watch(
             "--observations",
             metavar="SOURCE",
             show_default="the recording of the scenario, else -",
-            help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines "
-            "on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
+            help="A file (CSV, NetCDF, JSON lines, line protocol), the folder of a run or watch, "
+            "`-` for lines on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
             "TLS).",
         ),
     ] = None,
@@ -84,18 +94,10 @@ def watch(
         bool,
         typer.Option(
             "--follow",
-            help="Wait at the end of a CSV file for more.",
+            help="Wait at the end of a file for more.",
         ),
     ] = False,
-    pace: Annotated[
-        float,
-        typer.Option(
-            "--pace",
-            min=0.0,
-            max=3600.0,
-            help="Seconds to wait after each step, to look at a recording.",
-        ),
-    ] = 0.0,
+    pace: PaceOption = 0.0,
     steps: Annotated[
         int | None,
         typer.Option(
@@ -134,6 +136,7 @@ def watch(
         ),
     ] = False,
     ca_file: CertificateOption = None,
+    metrics: MetricsOption = None,
     seed: SeedOption = None,
     calibration: CalibrationOption = None,
     library: LibraryOption = None,
@@ -164,12 +167,6 @@ def watch(
     comes_from_broker = broker_address.is_broker(observations or "")
     is_live = follow or observations is None or observations == "-" or comes_from_broker
 
-    def print_decision(decision: Decision) -> None:
-        has_reader = _print_decision(watches[0], decision, flush=is_live)
-        time.sleep(pace)
-        if not has_reader and not comes_from_broker:
-            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
-
     with view_beside(view) as begun:
 
         def begin_watch(watched: "Watch") -> None:
@@ -181,7 +178,9 @@ def watch(
             observations,
             out,
             {"seed": seed, "calibration": calibration, "library": library},
-            decide=print_decision,
+            decide=_decision_printer(
+                watches, flush=is_live, pace=pace, needs_reader=not comes_from_broker
+            ),
             resume=resume,
             follow=follow,
             steps=steps,
@@ -195,11 +194,38 @@ def watch(
             report=not no_report,
             otherwise="-",
             begun=begin_watch,
+            metrics=metrics,
             cause_search=cause_search,
             progress=terminal.progress(),
         )
         _print_end_of_watch(folder, watches[0], report=not no_report)
     _exit_on_complaint(watches[0])
+
+
+def _decision_printer(
+    watches: "list[Watch]", *, flush: bool, pace: float, needs_reader: bool
+) -> Callable[[Decision], None]:
+    """Return a function that prints a decision, and waits as long as the user wants.
+
+    Parameters
+    ----------
+    watches : list of Watch
+        A list to which the watch is added once it has begun.
+    flush : bool
+        Whether each decision is to be written at once.
+    pace : float
+        The time to wait after each decision [s].
+    needs_reader : bool
+        Whether the watch is to end once nobody reads the decisions any more.
+    """
+
+    def print_decision(decision: Decision) -> None:
+        has_reader = _print_decision(watches[0], decision, flush=flush)
+        time.sleep(pace)
+        if needs_reader and not has_reader:
+            signal.raise_signal(signal.SIGINT)  # which ends a watch in order
+
+    return print_decision
 
 
 def _exit_on_complaint(watched: "Watch") -> None:

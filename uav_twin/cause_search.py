@@ -5,13 +5,12 @@ This package hands the search in where a watch is begun, because `twin_master` d
 """
 
 import functools
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import ParamSpec, TypeVar
 
+from reporting.operating_system import lower_priority
 from twin_master.watch.cause_search import RunningSearch, SearchRequest
 
 COMMAND = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
@@ -76,8 +75,7 @@ class DiscrepancySearch:
                 start_new_session=True,
             )
         if request.low_priority:
-            with suppress(ProcessLookupError):  # the process has ended already
-                os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+            lower_priority(NICENESS, process.pid)
         return _SearchProcess(process)
 
 

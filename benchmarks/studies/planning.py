@@ -177,7 +177,8 @@ def write_drn(problem: DecisionProblem, path: Path) -> float:
         text.append("\n".join(lines))
     head = f"@type: POMDP\n@parameters\n\n@reward_models\nr\n@nr_states\n{len(text)}\n"
     path.write_text(
-        f"{head}@nr_choices\n{2 + controls * len(waiting)}\n@model\n" + "\n".join(text) + "\n"
+        f"{head}@nr_choices\n{2 + controls * len(waiting)}\n@model\n" + "\n".join(text) + "\n",
+        encoding="utf-8",
     )
     return lift / (1.0 - discount)
 

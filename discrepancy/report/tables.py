@@ -308,12 +308,14 @@ def origin_table(origin: Origin) -> TitledTable:
     sources = ", ".join(
         f"{name} {digest[:12]}" for name, digest in provenance.source_hashes.items()
     )
+    plug_ins = ", ".join(f"{name} {version}" for name, version in provenance.plug_ins.items())
     items = {
         "campaign": f"{origin.campaign}, SHA-256 {origin.data_hash}",
         "model": f"{origin.model}, SHA-256 {origin.model_hash}",
         "command": origin.short_command,
         "seed": str(provenance.seed),
         "software": versions,
+        "plug-ins": plug_ins,
         "sources": sources,
     }
     for name, digest in provenance.input_hashes.items():

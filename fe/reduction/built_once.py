@@ -9,6 +9,7 @@ from typing import TypeVar
 from fe.runtime.errors import ReducedModelFileError
 from reporting.errors import FileNotWrittenError
 from reporting.log import module_logger
+from reporting.operating_system import lock_descriptor, open_descriptor, read_at
 
 _logger = module_logger(__name__)
 
@@ -75,13 +76,12 @@ def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
     """Hold a lock while a result is built; without a writable folder nothing is locked."""
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
+        descriptor = open_descriptor(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError:
         yield
         return
     try:
-        with suppress(ImportError):  # on Windows, where several processes then build the same
-            _acquire_lock(descriptor, result_file)
+        _acquire_lock(descriptor, result_file)
         yield
     finally:
         os.close(descriptor)
@@ -89,15 +89,14 @@ def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
 
 def _acquire_lock(descriptor: int, result_file: Path) -> None:
     """Acquire a lock that ends with this process; log a warning while another process holds it."""
-    import fcntl
-
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_descriptor(descriptor, wait=False)
     except BlockingIOError:
-        process_id = os.pread(descriptor, 20, 0).decode()
+        process_id = read_at(descriptor, 20, 0).decode()
         holder = f"another process (number {process_id})" if process_id else "another process"
         _logger.warning("Waiting for %s that makes %s.", holder, result_file)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        lock_descriptor(descriptor, wait=True)
     with suppress(OSError):  # a full disk, say: the number only informs those who wait
         os.truncate(descriptor, 0)
-        os.pwrite(descriptor, str(os.getpid()).encode(), 0)
+        os.lseek(descriptor, 0, os.SEEK_SET)
+        os.write(descriptor, str(os.getpid()).encode())

@@ -20,6 +20,7 @@ from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 from reporting.arrays import Float
 from reporting.log import module_logger
+from reporting.operating_system import can_supervise
 from reporting.toml_file import validate
 
 from .binding import Binding
@@ -68,7 +69,8 @@ class InstanceHost:
     limits : WorkerLimits
         Limits of the worker.
     isolated : bool
-        Whether the instance runs in a worker process.
+        Whether the instance runs in a worker process. It does so on Linux only; elsewhere it runs
+        in this process.
 
     Attributes
     ----------
@@ -84,12 +86,12 @@ class InstanceHost:
         self._description = description
         self._plan = plan
         self._limits = limits
-        self._isolated = isolated
+        self._isolated = isolated and can_supervise()
         self._extracted: ExtractedFmu | None = None
         self._release: Callable[[], object] = lambda: None
         self.instance: Instance | None = None
         # If only one instance can be made, there is no new one to compare a reset one with.
-        can_make_another = isolated or not description.once_per_process
+        can_make_another = self._isolated or not description.once_per_process
         self.reset_trial = ResetTrial(comparable=can_make_another)
         self._method = RestartMethod.LOADING
         self._start: InstanceStart | None = None

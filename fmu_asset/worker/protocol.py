@@ -136,7 +136,7 @@ def has_ended(process: int, limit: float) -> bool:
     return bool(poll.poll(1000.0 * limit))
 
 
-def poll_for_message(poll: select.poll) -> None:
+def poll_for_message(poll: "select.poll") -> None:
     """Return as soon as there is something to read, or after a moment; see `_POLLING_TIME`."""
     if _PROCESSOR_COUNT > 1:
         end = time.monotonic() + _POLLING_TIME

@@ -34,7 +34,7 @@ def escape(mass):
 
 
 def read(_):
-    with open(os.environ["HOSTILE_TARGET"]) as file:  # noqa: PTH123
+    with open(os.environ["HOSTILE_TARGET"], encoding="utf-8") as file:  # noqa: PTH123
         file.read()
 
 

@@ -297,7 +297,7 @@ def folder(
         "bad.ssp": "nothing", "bar.inp": INPUTS.text("bar.inp"), "bar.toml": INPUTS.text("bar.toml"),
         "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
         "filled/pull.csv": TWO["pull.csv"].decode(),
-        "run.nc": "", "misspelt.csv": "step,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
+        "run.nc": "", "misspelt.csv": "step,strian_24\n0,1e-4\n", "lines.csv": "\n",
         "torn.toml": "mass = [", "half.toml": "name = 'half a wing'",
         "hole.csv": "F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n",
         "back.csv": "t [ms];Weg [mm]\n" + "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14)),

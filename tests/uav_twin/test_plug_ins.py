@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,12 @@ from discrepancy.catalogue.library import effects_of_entry_points
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import PlugInError
 from fe.runtime.plug_ins import find_plug_in, load_plug_ins
+from reporting.provenance import collect_provenance
 from tests.kept import ROOT
-from twin_master.errors import MissionInputError
+from tests.refusals import refused
+from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.parts import object_by_name
+from twin_master.run_folder import check_versions
 
 EXAMPLE = ROOT / "docs" / "how_to" / "add" / "example_plug_in"
 
@@ -59,6 +63,41 @@ def example_folder(tmp_path: Path) -> Path:
     return target
 
 
+def provenance_with(**plug_ins: str) -> dict[str, Any]:
+    """Return the configuration of a run that was begun with some plug-ins and this program."""
+    return {"provenance": {**collect_provenance(0).as_dict(), "plug_ins": plug_ins}}
+
+
+def test_a_run_is_not_resumed_without_a_plug_in_of_its_beginning(tmp_path):
+    config = provenance_with(**{"uav_twin.laws: gone": "lost-laws 1.2"})
+    with refused(
+        NotResumableError, r"other plug-ins: uav_twin.laws: gone \(lost-laws 1.2, now not installed\)"
+    ):
+        check_versions(tmp_path, config, 0)
+
+
+def test_a_run_is_not_resumed_with_another_version_of_a_plug_in(tmp_path, monkeypatch):
+    """The version is that of the metadata beside the package."""
+    metadata = tmp_path / "my_laws-2.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: my-laws\nVersion: 2.0\n", encoding="utf-8"
+    )
+    (metadata / "entry_points.txt").write_text("[uav_twin.laws]\nmine = my_laws:Mine\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    check_versions(tmp_path, provenance_with(**{"uav_twin.laws: mine": "my-laws 2.0"}), 0)
+    with refused(NotResumableError, "my-laws 1.0, now my-laws 2.0"):
+        check_versions(tmp_path, provenance_with(**{"uav_twin.laws: mine": "my-laws 1.0"}), 0)
+
+
+def test_a_run_is_resumed_beside_plug_ins_that_were_installed_since(tmp_path):
+    """So it is if an earlier version has begun it, which recorded no plug-ins."""
+    config = provenance_with()
+    check_versions(tmp_path, config, 0)
+    del config["provenance"]["plug_ins"]
+    check_versions(tmp_path, config, 0)
+
+
 @pytest.mark.slow
 def test_the_example_of_the_page_adds_one_of_each(example_folder, tmp_path):
     run = subprocess.run(
@@ -70,6 +109,10 @@ def test_the_example_of_the_page_adds_one_of_each(example_folder, tmp_path):
     )
     assert run.returncode == 0, run.stderr
     uses = json.loads(run.stdout.partition("USES")[2])
+    config = json.loads((tmp_path / "run" / "config.json").read_text(encoding="utf-8"))
+    recorded = config["provenance"]["plug_ins"]
+    assert set(recorded.values()) == {"bar-plug-in 1.0"}
+    assert {"uav_twin.laws: saturating_spring", "uav_twin.estimators: wary"} < set(recorded)
 
     slope_at_rest = 2.0 / 0.1
     ratio = np.tanh(0.5)

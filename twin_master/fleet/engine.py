@@ -155,7 +155,8 @@ def program_version() -> str:
     """Return a hash of this program, Python and all packages that can change results."""
     provenance = collect_provenance().as_dict()
     python = list(sys.version_info[:2])
-    return hash_record([provenance["versions"], provenance["source_hashes"], python])
+    parts = [provenance[name] for name in ("versions", "source_hashes", "plug_ins")]
+    return hash_record([*parts, python])
 
 
 def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> ShardResult:

@@ -12,6 +12,7 @@ from pathlib import Path
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import JsonObject, JsonRecord
+from reporting.operating_system import allow_many_files
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
@@ -141,7 +142,7 @@ class FleetWatch:
         self.folder_locks.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
         self.standing = read_standing(folder)
         self._records_of_lost = dict(self.standing["assets"])
-        _allow_many_files()
+        allow_many_files()  # each asset needs three
 
     def note(self, sentence: str) -> None:
         """Tell the operator a sentence."""
@@ -388,14 +389,6 @@ def _record(fleet: Fleet) -> JsonObject:
         scenario = group.scenarios[0].portable().to_dict()
         groups.append({"name": group.name, "scenarios": [scenario]})
     return fleet.head.model_dump(exclude={"shard"}) | {"groups": groups}
-
-
-def _allow_many_files() -> None:
-    """Raise this process's limit of open files to the largest allowed: each asset needs three."""
-    import resource
-
-    _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
 
 
 def _pause_after(look_seconds: float) -> None:

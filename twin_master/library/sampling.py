@@ -6,7 +6,6 @@ Several processes share the grid, and an interrupted sampling can be continued.
 import io
 import itertools
 import json
-import os
 import shutil
 import time
 from collections.abc import Mapping
@@ -24,8 +23,9 @@ from fmu_asset.client.instance_host import warn_without_sandbox
 from fmu_asset.client.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
-from reporting.folders import closing_lock, lock_folder
+from reporting.folders import closing_lock
 from reporting.json_file import JsonObject, JsonRecord, parse_json
+from reporting.operating_system import lock_folder, usable_processors
 from reporting.progress import Stage, stage
 from twin_master.assets.library_source import (
     FORMAT,
@@ -115,7 +115,7 @@ def sample_library(
     FileNotWrittenError
         If the disk is full or the folder cannot be written.
     """
-    worker_count = _processor_count() if workers is None else workers
+    worker_count = usable_processors() if workers is None else workers
     if worker_count < 1:
         raise MissionInputError(
             f"the number of workers must be at least 1, but {worker_count} was given."
@@ -144,13 +144,6 @@ def sample_library(
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
     return SamplingOutcome(out, library, kept_blocks, block_count, worker_count, seconds)
-
-
-def _processor_count() -> int:
-    """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _sample_blocks(

@@ -25,6 +25,7 @@ from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_error
 from reporting.former_names import with_present_names
 from reporting.json_file import JsonObject, plain
+from reporting.operating_system import open_descriptor
 from twin_master.errors import NotResumableError
 from twin_master.mission.steps import GroundTruth, MissionStep, Reading
 
@@ -177,7 +178,7 @@ class JournalFile:
             check_header(self.path, config_hash)
             last_line = next(records_backwards(self.path), None)
             self.size = 0 if last_line is None else last_line.end
-            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            self._descriptor = open_descriptor(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.truncate(self._descriptor, self.size)
             if self.size == 0:
                 self.append({"config_hash": config_hash})

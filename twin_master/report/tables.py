@@ -275,6 +275,7 @@ def add_provenance_table(page: Page, run: Run) -> None:
     provenance = run.config.get("provenance", {})
     rows = [
         ("software", _sorted_pairs(provenance.get("versions", {}))),
+        ("plug-ins", _sorted_pairs(provenance.get("plug_ins", {}))),
         ("sources", _sorted_hashes(provenance.get("source_hashes", {}))),
         ("inputs", _sorted_hashes(provenance.get("input_hashes", {}))),
         ("inputs", _sorted_hashes(run.config.get("inputs", {}))),

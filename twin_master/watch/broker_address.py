@@ -10,6 +10,12 @@ from twin_master.errors import MissionInputError
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
 """The environment variable with the password of the twin."""
+_SPARKPLUG = "spBv1.0"
+"""The first level of topics of Sparkplug B, whose payloads are protocol buffers.
+
+A metric has its name in the message of birth alone, on a topic of its own; later messages have its
+alias.
+"""
 _PORT = 1883
 _PORT_WITH_TLS = 8883
 
@@ -86,6 +92,12 @@ def parse_broker(
         raise MissionInputError(
             "every user of this machine sees a password in an address: put it into "
             f"{PASSWORD_VARIABLE}."
+        )
+    if topic.split("/")[0] == _SPARKPLUG:
+        raise MissionInputError(
+            f"{address}: {_SPARKPLUG} is a topic of Sparkplug B, whose messages are not text and "
+            "name their metrics on other topics: let a program that knows Sparkplug, such as "
+            "Node-RED, publish the values as JSON on a topic of their own."
         )
     has_wildcard = "#" in address or "+" in topic
     ends_with_wildcard = topic.endswith("/+") and "+" not in topic[:-1] and "#" not in address

@@ -116,11 +116,6 @@ class CsvFeed(RecordedFeed):
             raise MissionInputError(
                 f"{self.path} is empty: a CSV file begins with a line of its columns."
             )
-        if names[0].startswith("{"):
-            raise MissionInputError(
-                f"{self.path} holds JSON lines, and a file of observations is CSV or NetCDF: hand "
-                f"them over by standard input, `--observations - < {self.path}`."
-            )
         former_names = {name: PRESENT_NAMES[name] for name in names if name in PRESENT_NAMES}
         if former_names:
             warn_of_former_names(str(self.path), former_names)

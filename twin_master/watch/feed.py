@@ -26,6 +26,11 @@ class Feed:
     def __init__(self, items: Iterable[FeedItem] = ()) -> None:
         self._items = items
 
+    @property
+    def waiting_messages(self) -> int:
+        """The number of messages that have come and are not read yet; 0 if it is not known."""
+        return 0
+
     def contains_position(self, position: Position) -> bool:
         """Return whether a position belongs to this feed; false for a feed without positions."""
         return False

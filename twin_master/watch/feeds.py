@@ -13,32 +13,36 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker_address import Broker, is_broker, parse_broker
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feed import Feed
-from twin_master.watch.lines import Pipe
-from twin_master.watch.message import FeedItem, MessageReader, Refused
-from twin_master.watch.recorded_feeds import FolderFeed, RunFeed, beginning_of
+from twin_master.watch.line_protocol import looks_like_line_protocol
+from twin_master.watch.lines import Pipe, first_line
+from twin_master.watch.message import FeedItem, Refused
+from twin_master.watch.payload import PayloadReader
+from twin_master.watch.recorded_feeds import FolderFeed, LinesFeed, RunFeed, beginning_of
 
 Observations = Iterable[Mapping[str, object]] | str | Path
 """Messages of a program, or a file, an address, or "-" for standard input."""
 STANDARD_INPUT = "-"
+_SUFFIXES_OF_PAYLOADS = (".json", ".jsonl", ".ndjson", ".lp", ".influx")
 
 
 def _read_messages(
     scenario: Scenario, contents: Iterable[bytes | Refused | None]
 ) -> Iterator[FeedItem]:
-    """Yield the message in each JSON text, with the beginning of the text.
+    """Yield the messages in each payload, with the beginning of its text.
 
     None in the place of a text means that nothing has come yet; so it does in the result.
     """
-    reader = MessageReader(scenario)
+    payloads = PayloadReader(scenario)
     for content in contents:
         if content is None:
             yield None, ""
-        else:
-            yield reader.read(content), beginning_of(content)
+            continue
+        for message in payloads.read(content):
+            yield message, beginning_of(content)
 
 
-def feed_of_json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
-    """Return the feed of a stream of JSON objects, one a line.
+def feed_of_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
+    """Return the feed of a stream whose lines are JSON objects, or line protocol.
 
     Parameters
     ----------
@@ -65,8 +69,11 @@ def _as_list(value: object) -> object:
 
 def file_feed(
     path: Path, scenario: Scenario, *, follow: bool = False
-) -> CsvFeed | RunFeed | FolderFeed:
-    """Return the feed of a run folder, or of a file: NetCDF if it ends with `.nc`, else CSV.
+) -> CsvFeed | LinesFeed | RunFeed | FolderFeed:
+    """Return the feed of a run folder, or of a file, whose form shows in its name or first line.
+
+    A file is NetCDF if its name ends with `.nc`. One that begins with a JSON object or with line
+    protocol has a payload on each line. Every other file is CSV.
 
     Parameters
     ----------
@@ -75,7 +82,7 @@ def file_feed(
     scenario : Scenario
         The scenario of the asset.
     follow : bool
-        Whether to wait at the end of a CSV file for more.
+        Whether to wait at the end of a file of text for more.
 
     Raises
     ------
@@ -86,12 +93,29 @@ def file_feed(
         raise MissionInputError(f"there is no file {path} to read observations from.")
     is_netcdf = path.suffix.lower() == ".nc"
     if follow and (path.is_dir() or is_netcdf):
-        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
+        raise MissionInputError(
+            f"{path} is recorded: only a file of text can be followed (CSV, JSON lines, line "
+            "protocol)."
+        )
     if path.is_dir():
         return FolderFeed(path, scenario)
     if is_netcdf:
         return RunFeed(path, scenario)
+    if _has_payloads(path):
+        return LinesFeed(path, scenario, follow=follow)
     return CsvFeed(path, scenario, follow=follow)
+
+
+def _has_payloads(path: Path) -> bool:
+    """Return whether each line of a file is a payload; CSV has a line of its columns first.
+
+    The name of the file decides if nothing was written yet.
+    """
+    with MissionInputError.instead_of(OSError, before=f"{path} cannot be read: ", after="."):
+        beginning = first_line(path).decode("utf-8", "replace").lstrip()
+    if not beginning:
+        return path.suffix.lower() in _SUFFIXES_OF_PAYLOADS
+    return beginning.startswith("{") or looks_like_line_protocol(beginning)
 
 
 def choose_feed(
@@ -143,6 +167,6 @@ def _feed_of(
         return file_feed(Path(observations), scenario, follow=follow)
     if follow:
         raise MissionInputError(
-            "--follow belongs to a CSV file; standard input is read to its end anyway."
+            "--follow belongs to a file; standard input is read to its end anyway."
         )
-    return feed_of_json_lines(scenario, sys.stdin.buffer)
+    return feed_of_lines(scenario, sys.stdin.buffer)

@@ -114,6 +114,10 @@ class Watch:
     filtered : (states,) array or None
         The filtered probability of each state after the last step; None before the first step of
         this process.
+    has_begun : bool
+        Whether journal, intake and twin are there.
+    last_step : MissionStep or None
+        The last step of this process; None before the first one.
     is_quiet : bool
         Whether the operator was told that no step comes any more.
     """
@@ -122,6 +126,8 @@ class Watch:
     intake: Intake
     twin: Twin
     filtered: Float | None
+    has_begun: bool = False
+    last_step: MissionStep | None = None
     is_quiet: bool
 
     def __init__(
@@ -270,6 +276,7 @@ class Watch:
             self.is_quiet = "quiet" in last_line
             self._time_of_last_step = time.monotonic()
             self._written_intake = intake.state()
+            self.has_begun = True
             if patch is not None:
                 self._adopt_given(patch)
             yield
@@ -323,6 +330,7 @@ class Watch:
             line["notices"] = line.get("notices", []) + notices
         self._append_line(line)
         self.filtered = step.twin_step.filtered
+        self.last_step = step
         self.is_quiet = False
         self._time_of_last_step = time.monotonic()
         return line

@@ -165,6 +165,11 @@ class Intake:
         """Whether the queue still contains readings of the last message or of a gap before it."""
         return bool(self._queue)
 
+    @property
+    def waiting_messages(self) -> int:
+        """The number of messages that wait to be read, if the feed knows it."""
+        return self._feed.waiting_messages
+
     def state(self) -> JsonObject:
         """Return the state from which a resumed watch goes on, for the journal."""
         # After a gap the queue holds missing steps, then the message itself. A watch that is

@@ -9,9 +9,9 @@ from functools import lru_cache
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
-from select import select
-from typing import IO, BinaryIO, TypedDict
+from typing import IO, BinaryIO, TypedDict, cast
 
+from reporting.operating_system import ReadableStream, is_same_beginning, polled_pieces
 from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 
@@ -33,6 +33,7 @@ class Position(TypedDict):
 _PIECE_BYTES = 65_536
 """Number of bytes that are read at once, and of those at the beginning that identify a file."""
 _NUMBER_SUFFIX = re.compile(r"\.\d{1,6}")
+_DATE_AND_SECONDS = re.compile(r"\.\d{4}-\d\d-\d\d-\d{9,12}")
 _DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
@@ -41,7 +42,8 @@ def rotated_files(path: Path) -> list[Path]:
 
     They had the name of the log before, or are copies of it. Their names are that of the log and a
     number or a date, as logrotate and `logging.handlers` make them: `log.csv.1`,
-    `log.csv-20260501`, `log.csv.2026-05-01_12`.
+    `log.csv-20260501`, `log.csv.2026-05-01_12`. Telegraf writes date and seconds since 1970 before
+    the ending: `log.2026-05-01-1777629600.csv`.
     """
     dates = []
     numbers = []
@@ -53,7 +55,13 @@ def rotated_files(path: Path) -> list[Path]:
             numbers.append(suffix)
     dates.sort()
     numbers.sort(key=_number_of_suffix, reverse=True)  # the largest number is the oldest
-    return [path.with_name(path.name + suffix) for suffix in dates + numbers]
+    stamped = []
+    for file in path.parent.glob(f"{escape(path.stem)}.*{escape(path.suffix)}"):
+        stamp = file.name.removeprefix(path.stem).removesuffix(path.suffix)
+        if path.suffix and _DATE_AND_SECONDS.fullmatch(stamp):
+            stamped.append(file)
+    stamped.sort()
+    return stamped + [path.with_name(path.name + suffix) for suffix in dates + numbers]
 
 
 def _number_of_suffix(suffix: str) -> int:
@@ -185,19 +193,14 @@ class Pipe(Lines):
 
     def pieces(self) -> Iterator[bytes | None]:
         """Yield the pieces until the stream ends."""
+        if self._polls:
+            yield from polled_pieces(cast(ReadableStream, self._stream), _PIECE_BYTES)
+            return
         while True:
-            if self._polls and not self._is_readable():
-                yield None
-                continue
             piece: bytes | None = self._stream.read1(_PIECE_BYTES)  # type: ignore[attr-defined]
             if piece == b"":
                 return
             yield piece
-
-    def _is_readable(self) -> bool:
-        """Return whether something has come, or the stream has ended."""
-        readable, _, _ = select([self._stream], [], [], 0.0)
-        return bool(readable)
 
 
 class GrowingFile(Lines):
@@ -313,8 +316,7 @@ class GrowingFile(Lines):
 
     def _was_cut(self) -> bool:
         """Return whether the file was cut after it was read, even if it has grown again since."""
-        beginning = os.pread(self._file.fileno(), len(self._beginning), 0)
-        if beginning != self._beginning:
+        if not is_same_beginning(self._file, self._beginning):
             return True
         return os.fstat(self._file.fileno()).st_size < self._file.tell()
 

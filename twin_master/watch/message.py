@@ -254,15 +254,21 @@ class MessageReader:
         """Return the observation of a message, or the reason why there is none."""
         try:
             if isinstance(content, bytes):
-                content = self._parse(content)
+                content = self.parse(content)
             if isinstance(content, Message | Refused):
                 return content
             return self._read_record(content)
         except Refused as refusal:
             return refusal
 
-    def _parse(self, content: bytes) -> Mapping[str, object]:
-        """Return the JSON object in the text of a message."""
+    def parse(self, content: bytes) -> Mapping[str, object]:
+        """Return the JSON object in the text of a message.
+
+        Raises
+        ------
+        Refused
+            If the text is too long, or not a JSON object.
+        """
         if len(content) > LARGEST_MESSAGE:
             raise Refused(
                 f"a message has at most {LARGEST_MESSAGE} bytes, but {len(content)} were given"

@@ -14,8 +14,9 @@ from twin_master.watch.broker_address import Broker
 from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.lines import Position
-from twin_master.watch.message import FeedItem, Message, MessageReader, Refused
+from twin_master.watch.message import FeedItem, Message, Refused
 from twin_master.watch.mqtt_session import LONGEST_RETRY_SECONDS, Session
+from twin_master.watch.payload import PayloadReader
 from twin_master.watch.recorded_feeds import beginning_of
 from twin_master.watch.records import Decision
 
@@ -62,7 +63,8 @@ class Topic(Feed):
         self._session = session
         self._topic = topic
         self._on_error = on_error
-        self._reader = MessageReader(scenario)
+        self._payload_reader = PayloadReader(scenario)
+        self._unread_items: deque[FeedItem] = deque()  # of the last payload
         self.payloads: deque[bytes] = deque(maxlen=MOST_WAITING)
         self.watch: Watch | None = None
         # Sizes of the journal [bytes]
@@ -79,20 +81,25 @@ class Topic(Feed):
         None is yielded while there is none. The position is not used: a broker cannot go back.
         """
         while True:
-            yield self._read_payload(self.payloads.popleft() if self.payloads else None)
+            yield from self._items_of(self.payloads.popleft() if self.payloads else None)
 
-    def _read_payload(self, payload: bytes | None) -> FeedItem:
-        """Return the observation in a message, with the beginning of its text.
+    def _items_of(self, payload: bytes | None) -> Iterator[FeedItem]:
+        """Yield the messages of a payload, with the beginning of its text; None if none came.
 
         A message that names neither its step nor its time is refused: a broker may deliver it
         twice, and the second one would count as another step.
         """
         if payload is None:
-            return None, ""
-        message = self._reader.read(payload)
-        if isinstance(message, Message) and message.step is None and message.time is None:
-            message = Refused("a broker may deliver it twice: `step` or `time` is needed over MQTT")
-        return message, beginning_of(payload)
+            yield None, ""
+            return
+        for message in self._payload_reader.read(payload):
+            if isinstance(message, Message) and message.step is None and message.time is None:
+                message = Refused(
+                    "a broker may deliver it twice: `step` or `time` is needed over MQTT"
+                )
+            self._unread_items.append((message, beginning_of(payload)))
+        while self._unread_items:
+            yield self._unread_items.popleft()
 
     def attach(self, watch: Watch) -> None:
         """Attach a watch, whose decisions are published from now on.
@@ -127,9 +134,10 @@ class Topic(Feed):
     def send_decision(self, decision: Decision) -> None:
         """Publish all decisions in the journal that were not sent yet; the last is the given one.
 
-        The message of the step is acknowledged, unless the queue still has readings of it.
+        The payload of the step is acknowledged, unless readings or messages of it still wait.
         """
-        if self.watch is not None and not self.watch.intake.has_queued_readings:
+        has_unread = bool(self._unread_items)
+        if self.watch is not None and not self.watch.intake.has_queued_readings and not has_unread:
             self._session.acknowledge()
         self._session.publishers[self] = None
         self.publish()
@@ -256,13 +264,18 @@ class MqttFeed(Topic):
             "refused": counts.rejected,
         }
 
+    @property
+    def waiting_messages(self) -> int:
+        """The number of messages that the broker has sent and that are not read yet."""
+        return len(self._session.unread)
+
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield the messages as they come, without end; None while nothing comes.
 
         A message is acknowledged once its step is in the journal.
         """
         for message in self._session.receive(0.1):
-            yield self._read_payload(None if message is None else bytes(message.payload))
+            yield from self._items_of(None if message is None else bytes(message.payload))
 
     def close(self) -> None:
         """Publish the last decisions and disconnect; see `Session.close`."""

@@ -33,6 +33,7 @@ from twin_master.watch.feed import Feed
 from twin_master.watch.feeds import Observations, choose_feed
 from twin_master.watch.folder import GivenPatch, Watch
 from twin_master.watch.intake import Counts
+from twin_master.watch.metrics_server import MetricsServer, serve_metrics
 from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
 from twin_master.watch.recorded_feeds import RecordedFeed
@@ -267,6 +268,7 @@ def watch(
     report: bool = True,
     otherwise: str | None = None,
     begun: Callable[[Watch], object] = _ignore_watch,
+    metrics: str | int | None = None,
     cause_search: CauseSearch | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -318,6 +320,9 @@ def watch(
         The observations if neither `observations` nor the scenario names any.
     begun : callable
         Called with the watch once its folder is held, before anything is read.
+    metrics : str or int, optional
+        The port at which the figures of the watch are served for Prometheus while it goes on, or
+        ``HOST:PORT``; without a host, only this machine can read them.
     cause_search : CauseSearch, optional
         What looks for the cause of an alarm. `uav_twin.watch` gives `uav-twin discrepancy run` in a
         process of its own; only a watch with `teach` needs it.
@@ -358,9 +363,10 @@ def watch(
     opened = _open_watch(
         loaded_scenario, folder, overrides, progress, resume=resume, replace=replace
     )
-    with opened as watched:
+    with serve_metrics(metrics) as metrics_server, opened as watched:
         try:
             begun(watched)
+            decide = _also_as_metrics(decide, metrics_server, watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, reading_scenario)
             teacher = cause_search if teach else None
@@ -370,6 +376,22 @@ def watch(
             error.add_note(_advice_after_error(watched))
             raise
     return watched.folder
+
+
+def _also_as_metrics(
+    decide: DecisionSink, server: MetricsServer | None, watched: Watch
+) -> DecisionSink:
+    """Return a function that also hands each decision to the server of metrics, if there is one."""
+    if server is None:
+        return decide
+    metrics = server.attach(watched.scenario.mission.name, watched)
+    watched.progress.note(f"Metrics: {server.address}")
+
+    def decide_and_count(decision: Decision) -> None:
+        metrics.note_decision(decision)
+        decide(decision)
+
+    return decide_and_count
 
 
 def _given_patch(

@@ -27,6 +27,7 @@ from twin_master.watch.message import (
     MessageReader,
     Refused,
 )
+from twin_master.watch.payload import PayloadReader
 from twin_master.watch.records import JournalLine
 from twin_master.watch.step_status import StepStatus
 
@@ -81,7 +82,8 @@ class RecordedFeed(Feed):
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield each message after a position, with the beginning of its text.
 
-        The message is None if no further one has come yet. `position` is moved on before each item.
+        The message is None if no further one has come yet. `position` is moved on before
+        the last item of each line.
         """
         followed_path = self.path if self.follow else None
         lines = GrowingFile(self.open_file(position), position, followed_path)
@@ -90,11 +92,22 @@ class RecordedFeed(Feed):
             content: MessageContent | None = line
             if isinstance(line, bytes):
                 content = self.content_of(line, lines.begin)
+            if line is None or content is None:
+                self.position = lines.position
+                if line is None:
+                    yield None, ""
+                continue
+            messages = self.read_content(content)
+            # A watch that ends between the messages of a line reads the whole line again
+            for message in messages[:-1]:
+                yield message, beginning_of(line)
             self.position = lines.position
-            if line is None:
-                yield None, ""
-            elif content is not None:
-                yield self.reader.read(content), beginning_of(line)
+            for message in messages[-1:]:
+                yield message, beginning_of(line)
+
+    def read_content(self, content: MessageContent) -> Sequence[Message | Refused]:
+        """Return the messages in a line, or the reasons why there are none."""
+        return [self.reader.read(content)]
 
     def content_of(self, line: bytes, begin: int) -> MessageContent | None:
         """Return the message in a line; None if the line is not a message.
@@ -107,6 +120,24 @@ class RecordedFeed(Feed):
             The position in the file at which the line begins [bytes].
         """
         return line
+
+
+class LinesFeed(RecordedFeed):
+    """A file with a payload on each line: JSON, JSON of Telegraf, or line protocol.
+
+    Parameters
+    ----------
+    path, scenario, follow
+        As of `RecordedFeed`.
+    """
+
+    def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
+        super().__init__(path, scenario, follow=follow)
+        self._payloads = PayloadReader(scenario)
+
+    def read_content(self, content: MessageContent) -> Sequence[Message | Refused]:
+        """Return the messages in a payload, or the reasons why there are none."""
+        return self._payloads.read(content)
 
 
 class RunFeed(RecordedFeed):

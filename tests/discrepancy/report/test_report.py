@@ -52,7 +52,7 @@ from fe.runtime.patch import PowerDamping, SensorDrift
 from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
-from reporting.folders import lock_folder
+from reporting.operating_system import lock_folder
 from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import FEW, INPUTS, ORIGIN, drag_found, model_of

@@ -210,7 +210,7 @@ def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[
 
 
 def state_and_supervisor(worker: int | None) -> tuple[str, int]:
-    _, _, state, parent, *_ = Path(f"/proc/{worker}/stat").read_text().split()
+    _, _, state, parent, *_ = Path(f"/proc/{worker}/stat").read_text(encoding="utf-8").split()
     return state, int(parent)
 
 

@@ -47,7 +47,7 @@ TEXT = text_of("model_mismatch")
 @pytest.fixture
 def content(library_file: Path) -> dict[str, Any]:
     """A library in the published format, of which the regions have other levels."""
-    found: dict[str, Any] = json.loads(library_file.read_text())
+    found: dict[str, Any] = json.loads(library_file.read_text(encoding="utf-8"))
     return found | {"states": [[0, 20, 40], [0, 80]]}
 
 

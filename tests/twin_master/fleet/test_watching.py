@@ -36,6 +36,7 @@ from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
+from twin_master.watch.metrics_server import MetricsServer
 from uav_twin import fly_fleet, open_fleet
 
 
@@ -541,3 +542,20 @@ def test_a_damaged_record_of_a_fleet_is_refused(lost_folder):
     file.write_text(json.dumps(record))
     with pytest.raises(FleetError, match="out is damaged or of another version"):
         fleet_page(lost_folder, ATTENTION_ROWS)
+
+
+def test_the_figures_of_all_assets_are_served_for_prometheus(fleet_file, tmp_path, monkeypatch):
+    """They are read a last time when the watch of the fleet has come to its end."""
+    texts: list[str] = []
+    close = MetricsServer.close
+
+    def read_and_close(server: MetricsServer) -> None:
+        texts.append(served(int(re.search(r":(\d+)/", server.address)[1]), "/metrics")[1])
+        close(server)
+
+    monkeypatch.setattr(MetricsServer, "close", read_and_close)
+    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--metrics", 0)
+    assert done.returncode == 0, done.stderr
+    steps = re.findall(r'^uav_twin_step\{asset="(.*)"\} (\S+)$', texts[0], re.MULTILINE)
+    assert steps == [(name, f"{STEPS - 1}.0") for name in WINGS]
+    assert "Metrics: http://127.0.0.1:" in done.stderr

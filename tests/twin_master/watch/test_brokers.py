@@ -408,3 +408,46 @@ def test_addresses_of_brokers(tmp_path, wrong, sentence):
     (tmp_path / "authority.pem").write_text("no certificate")
     with refused(MissionInputError, sentence):
         parse_broker(wrong, tmp_path / "authority.pem" if sentence.startswith("authority") else None)
+
+
+def metric(step: int, **fields: float) -> dict[str, Any]:
+    """A metric as Telegraf publishes it, a second after that of the step before."""
+    tags = {"host": "logger", "control": "2g"}
+    return {
+        "fields": fields or {"strain_1": 1e-3},
+        "name": "wing",
+        "tags": tags,
+        "timestamp": 1_714_557_600 + step,
+    }
+
+
+def timed(watch: Watch) -> Watch:
+    watch.scenario = watch.scenario.with_changes("watch", seconds_per_step=1.0)
+    return watch
+
+
+def test_batches_and_lines_of_telegraf_over_a_broker(watch, broker):
+    """Alone, as a batch, and as line protocol, which has no step and no field `time`."""
+    with watching(where_of(broker), timed(watch), 6):
+        client, heard = heard_at(broker, "listener")
+        batch = {"metrics": [metric(1), metric(2), metric(3)]}
+        lines = "\n".join(f"wing,control=2g strain_1=1e-3 {1_714_557_600 + step}000000000" for step in (4, 5))
+        for payload in (json.dumps(metric(0)), json.dumps(batch), lines):
+            client.publish(TOPIC, payload, qos=1).wait_for_publish(60)
+    wait_until(lambda: len(heard) >= 6)
+    client.disconnect()
+    assert [decision["step"] for decision in heard] == [0, 1, 2, 3, 4, 5]
+    assert watch.intake.counts == Counts(received=6)
+
+
+def test_a_batch_is_acknowledged_once_all_of_it_is_in_the_journal(watch, broker):
+    """A watch that ends in the middle of a batch gets it again, and loses none of its steps."""
+    with watching(where_of(broker), timed(watch), 2):
+        client = broker.client("publisher")
+        batch = {"metrics": [metric(step) for step in range(4)]}
+        client.publish(TOPIC, json.dumps(batch), qos=1).wait_for_publish(60)
+    with watching(where_of(broker), watch, 4):
+        pass
+    client.disconnect()
+    assert [line["step"] for line in journal(watch.folder) if "filtered" in line] == [0, 1, 2, 3]
+    assert watch.intake.counts.missing == 0

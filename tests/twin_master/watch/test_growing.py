@@ -33,7 +33,7 @@ def row(step: int) -> str:
 
 
 def append(path: Path, text: str) -> None:
-    with path.open("a") as file:
+    with path.open("a", encoding="utf-8") as file:
         file.write(text)
 
 
@@ -79,7 +79,14 @@ def copied(path: Path) -> None:
     os.truncate(path, 0)
 
 
+def stamped(path: Path) -> None:
+    """Rename a log by date and seconds, as Telegraf does; the next one comes later."""
+    seconds = 1777629600 + len(list(path.parent.glob("log.2*.csv")))
+    path.rename(path.with_name(f"log.2026-05-01-{seconds}.csv"))
+
+
 ROTATIONS: dict[str, Rotation] = {
+    "telegraf": stamped,
     "create": logrotate("create"),
     "absent": logrotate("nocreate"),
     "copytruncate": logrotate("copytruncate"),
@@ -232,7 +239,7 @@ def test_a_cut_without_a_copy_is_told(begun_log, steps, left):
 
 
 @pytest.mark.parametrize("has_header", [True, False], ids=["header", "no header"])
-@pytest.mark.parametrize("rotation", rotations("create", *CUT))
+@pytest.mark.parametrize("rotation", rotations("create", "telegraf", *CUT))
 def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp_path, rotation, has_header):
     """Where a log is cut, its writer has it open, and writes no header again."""
     header, *rows = plain.read_text().splitlines(keepends=True)

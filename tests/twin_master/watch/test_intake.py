@@ -61,7 +61,7 @@ def message(row: np.ndarray, **others: object) -> bytes:
 def intake_of(
     knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None, feed: Feed | None = None
 ) -> Intake:
-    feed = feed or feeds.feed_of_json_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
+    feed = feed or feeds.feed_of_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
     return Intake(knowledge.scenario, feed, rejected)
 
 

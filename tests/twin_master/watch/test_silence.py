@@ -12,7 +12,7 @@ import pytest
 from tests.twin_master.watch.conftest import begun, journalled, ran, viewed, wait_until
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feed import Feed
-from twin_master.watch.feeds import feed_of_json_lines
+from twin_master.watch.feeds import feed_of_lines
 from twin_master.watch.folder import Watch
 from twin_master.watch.result import notices_since
 
@@ -61,12 +61,12 @@ class SilentSource:
         """Feed the watch from a pipe, and return three messages for it."""
         read, self.write = os.pipe()
         self.stream = os.fdopen(read, "rb")
-        self.feed: Feed = feed_of_json_lines(self.watch.scenario, self.stream)
+        self.feed: Feed = feed_of_lines(self.watch.scenario, self.stream)
         return [json.dumps({"step": step, "strain_1": 1e-3}) + "\n" for step in range(3)]
 
     def open_file(self, plain: Path, folder: Path) -> list[str]:
         """Feed the watch from a file that has a header only, and return three rows for it."""
-        header, *rows = plain.read_text().splitlines(keepends=True)[:4]
+        header, *rows = plain.read_text(encoding="utf-8").splitlines(keepends=True)[:4]
         path = folder / "m.csv"
         path.write_text(header)
         self.stream = path.open("rb")

@@ -16,7 +16,7 @@ from tests.twin_master.watch.conftest import begun
 from twin_master.errors import ImpossibleObservation
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feeds import feed_of_json_lines
+from twin_master.watch.feeds import feed_of_lines
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Intake
 
@@ -41,7 +41,7 @@ def decisions_of(watch: Watch, messages: list[Mapping[str, Any]], steps: int | N
     """Return what the operator is told of messages."""
     stream = io.BytesIO("".join(json.dumps(message) + "\n" for message in messages).encode())
     decisions = list[Any]()
-    watch.run(feed_of_json_lines(watch.scenario, stream), decisions.append, step_limit=steps)
+    watch.run(feed_of_lines(watch.scenario, stream), decisions.append, step_limit=steps)
     return decisions
 
 
@@ -144,7 +144,7 @@ def test_a_counter_that_begins_again_is_told_as_that(watch, mission):
 def test_observations_that_no_state_shows_are_refusals(base, mission):
     """They are refused once their step is assimilated, so that steps go on."""
     text = "".join(json.dumps(line(mission, step, step=step)) + "\n" for step in range(3))
-    intake = Intake(base.scenario, feed_of_json_lines(base.scenario, io.BytesIO(text.encode())))
+    intake = Intake(base.scenario, feed_of_lines(base.scenario, io.BytesIO(text.encode())))
     twin = base.models[0].knowledge.twin(lag=12)
     for step in range(3):
         reading = intake.read(twin)
@@ -222,7 +222,7 @@ def test_a_watch_that_was_stopped_anywhere_tells_the_same(base, mission, tmp_pat
 def watched(scenario: LoadedScenario, folder: Path, messages: list[Mapping[str, Any]]) -> Any:
     """Run `uav-twin watch` with messages on its standard input."""
     text = "".join(json.dumps(message) + "\n" for message in messages)
-    with patch("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode()))):
+    with patch("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode()), encoding="utf-8")):
         return command("watch", scenario.path, "--observations", "-", "--out", folder, "--no-report")
 
 

@@ -32,7 +32,7 @@ from twin_master.mission.replay import BelievedModel
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feeds import feed_of_json_lines, file_feed
+from twin_master.watch.feeds import feed_of_lines, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import copy_of_run_until, resume_watch
 from twin_master.watch.recorded_feeds import FolderFeed
@@ -158,7 +158,7 @@ class StoppedWatch:
 def stopped_within_gap(base: Watch, plain: Path, tmp_path_factory: pytest.TempPathFactory) -> StoppedWatch:
     """The recording has a gap of ten steps, within which a watch is stopped twice."""
     folder = tmp_path_factory.mktemp("gap")
-    rows = plain.read_text().splitlines()
+    rows = plain.read_text(encoding="utf-8").splitlines()
     recording = folder / "m.csv"
     recording.write_text("\n".join([*rows[:11], "what", *rows[21:], ""]))
     scenario = base.scenario.model_copy()
@@ -222,7 +222,7 @@ def test_what_came_behind_the_last_step_of_a_live_watch_stays_counted(watch, mis
     told = {"step": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
     line = json.dumps(told | {"strain": mission.observed[0].tolist()}).encode() + b"\n"
     for lines, received in ((3 * line, 3), (b"", 3), (line, 4)):
-        counts = ran(watch, feed_of_json_lines(watch.scenario, io.BytesIO(lines)))
+        counts = ran(watch, feed_of_lines(watch.scenario, io.BytesIO(lines)))
         assert (counts.received, counts.duplicates) == (received, received - 1)
     assert [decision["step"] for decision in journalled(watch) if decision] == [0]
 
@@ -230,7 +230,7 @@ def test_what_came_behind_the_last_step_of_a_live_watch_stays_counted(watch, mis
 @pytest.fixture
 def daily_files(plain: Path, tmp_path: Path) -> list[Path]:
     """Three files of a logger that begins one each day; the last is that before, which has grown."""
-    header, *rows = plain.read_text().splitlines()
+    header, *rows = plain.read_text(encoding="utf-8").splitlines()
     files = []
     for day, rows_of_day in enumerate((rows[:30], rows[30:45], rows[30:])):
         path = tmp_path / f"{day}.csv"

@@ -67,7 +67,7 @@ def test_the_last_decision_is_told_again_only_after_a_kill_before_the_summary(
     shutil.copytree(abandoned_watch[0], folder)
 
     def decisions_of_resumed_watch() -> list[tuple[bool, bool]]:
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
         lines = said("watch", "--resume", "--out", folder, "--no-report").splitlines()
         decisions = [json.loads(line) for line in lines]
         return [(decision["told_again"], decision["step"] > 0) for decision in decisions]
@@ -228,7 +228,7 @@ def watch_of_misspelt_column(
     """Folder of a watch of two steps whose recording has a misspelt column."""
     folder = tmp_path_factory.mktemp("misspelt")
     recording = folder / "slip.csv"
-    recording.write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
+    recording.write_text(edited(recorded.read_text(encoding="utf-8"), ("strain_24", "strian_24")))
     return uav_twin.watch(scenario, recording, folder / "watch", allow_unknown=True, steps=2, report=False)
 
 

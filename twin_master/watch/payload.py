@@ -1,0 +1,96 @@
+"""What a publisher sends at once, in any form: our JSON, JSON of Telegraf, or line protocol."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.line_protocol import looks_like_line_protocol, parse_line
+from twin_master.watch.message import (
+    LARGEST_MESSAGE,
+    Message,
+    MessageContent,
+    MessageReader,
+    Refused,
+)
+from twin_master.watch.points import Point, TimedRecord, records_of_points, seconds_since_1970
+from twin_master.watch.telegraf import is_of_telegraf, points_of_telegraf
+
+
+class PayloadReader:
+    """Reads what a publisher sends at once; its form is found by its look.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of the asset.
+
+    Attributes
+    ----------
+    reader : MessageReader
+        The reader of a single message.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.reader = MessageReader(scenario)
+
+    def read(self, content: MessageContent) -> list[Message | Refused]:
+        """Return the messages in a payload, in their order, or the reasons why there are none.
+
+        A JSON object is one message. Metrics of Telegraf, and lines of line protocol, are a message
+        for each time that they have. The list is empty if there are only comments.
+        """
+        try:
+            if isinstance(content, bytes):
+                text = self._line_protocol_in(content)
+                if text is not None:
+                    return self._read_lines(text)
+                content = self.reader.parse(content)
+            if not isinstance(content, Message | Refused) and is_of_telegraf(content):
+                return self._read_points(points_of_telegraf(content))
+        except Refused as refusal:
+            return [refusal]
+        return [self.reader.read(content)]
+
+    def _line_protocol_in(self, content: bytes) -> str | None:
+        """Return the text of a payload if it looks like line protocol; else None."""
+        if len(content) > LARGEST_MESSAGE:
+            return None  # the reader of messages refuses it
+        try:
+            text = content.decode()
+        except UnicodeDecodeError:
+            return None
+        return text if looks_like_line_protocol(text) else None
+
+    def _read_lines(self, text: str) -> list[Message | Refused]:
+        """Return the messages in lines of line protocol; a wrong line is refused alone."""
+        refusals: list[Message | Refused] = []
+        points = []
+        for line in text.split("\n"):
+            try:
+                point = parse_line(line)
+            except ValueError as error:
+                refusals.append(Refused(f"it is not line protocol: {error}"))
+                continue
+            if point is not None:
+                points.append(point)
+        return refusals + self._read_points(points)
+
+    def _read_points(self, points: Sequence[Point]) -> list[Message | Refused]:
+        """Return the message of each time that some points have."""
+        try:
+            records = records_of_points(points)
+        except Refused as refusal:
+            return [refusal]
+        return [self._read_record(record) for record in records]
+
+    def _read_record(self, record: TimedRecord) -> Message | Refused:
+        """Return the message in the values of a time, which is used where they name no step."""
+        message = self.reader.read(record.values)
+        if isinstance(message, Refused) or record.timestamp is None:
+            return message
+        if message.step is not None or message.time is not None:
+            return message
+        try:
+            return replace(message, time=seconds_since_1970(record.timestamp))
+        except Refused as refusal:
+            return refusal

@@ -1,0 +1,110 @@
+"""Points of a time series: what a line of line protocol and a metric of Telegraf have in common."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from twin_master.watch.message import Refused
+
+FieldValue = object
+"""The value of a field: a number, a truth value, a text, or a list of these."""
+_VALUE_FIELD = "value"
+"""The name of a field that says nothing: such a field is called by the measurement."""
+_RANGES_SINCE_1970 = ((1e8, 1.0), (1e11, 1e3), (1e14, 1e6), (1e17, 1e9))
+"""The least timestamp in s, ms, us and ns that counts from 1970, and the length of a second in it.
+
+Each range ends where the next one begins. In seconds they are the years from 1973 to 5138.
+"""
+_LARGEST_TIMESTAMP = 1e20
+
+
+@dataclass(frozen=True)
+class Point:
+    """The values of some fields at a time.
+
+    Attributes
+    ----------
+    measurement : str
+        The name of what is measured.
+    fields : dict of str to FieldValue
+        The values, by the names of the fields.
+    tags : dict of str to str
+        Where the values come from.
+    timestamp : int, float or None
+        The time since 1970 in s, ms, us or ns; None if the point has no time.
+    """
+
+    measurement: str
+    fields: Mapping[str, FieldValue]
+    tags: Mapping[str, str] = field(default_factory=dict)
+    timestamp: float | None = None
+
+
+def seconds_since_1970(timestamp: float) -> float:
+    """Return a timestamp in seconds; its size shows in which unit it counts from 1970.
+
+    Raises
+    ------
+    Refused
+        If it lies before the year 1973 in each unit, or after the year 5138.
+    """
+    seconds = math.nan
+    if timestamp < _LARGEST_TIMESTAMP:
+        for least, units_per_second in _RANGES_SINCE_1970:
+            if timestamp >= least:
+                seconds = timestamp / units_per_second
+    if math.isnan(seconds):
+        raise Refused(
+            f"its timestamp is {timestamp!r:.40}, and one that counts from 1970 in s, ms, us or ns "
+            "is expected; for another clock send a field `step` or `time`"
+        )
+    return seconds
+
+
+@dataclass
+class TimedRecord:
+    """The values of all points of a time, under the keys of a JSON message.
+
+    Attributes
+    ----------
+    values : dict of str to object
+        The values.
+    timestamp : int, float or None
+        The timestamp of the points.
+    """
+
+    values: dict[str, object]
+    timestamp: float | None
+
+
+def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
+    """Return a record for each time of some points, in the order of the points.
+
+    A field is called by its own name; one that is called `value`, by its measurement. Of the tags,
+    `control` alone is read.
+
+    Raises
+    ------
+    Refused
+        If two points of a time have different values of the same name.
+    """
+    record_of_time: dict[float | None, TimedRecord] = {}
+    for point in points:
+        record = record_of_time.setdefault(point.timestamp, TimedRecord({}, point.timestamp))
+        if "control" in point.tags:
+            _add_value(record, "control", point.tags["control"])
+        for name, value in point.fields.items():
+            _add_value(record, point.measurement if name == _VALUE_FIELD else name, value)
+    return list(record_of_time.values())
+
+
+def _add_value(record: TimedRecord, name: str, value: FieldValue) -> None:
+    """Add a value to a record, and refuse it if the record has another one under its name."""
+    if name == "step" and isinstance(value, float) and value.is_integer():
+        value = int(value)  # a number of line protocol without a type is floating-point
+    former_value = record.values.setdefault(name, value)
+    if former_value is not value and former_value != value:
+        raise Refused(
+            f"`{name[:60]}` has two values at one time: each sensor needs a field of its own, such "
+            "as `strain_7`, which the processor `pivot` of Telegraf makes of a tag"
+        )
