@@ -21,7 +21,7 @@ test: $(VENV)/.dev ## Set up and run all tests (with UAV_TWIN_LONG_TESTS=1 those
 	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: test-quick
-test-quick: $(VENV)/.dev ## Set up and run the three quarters of the tests that take a fraction of a second each
+test-quick: $(VENV)/.dev ## Set up and run the three fifths of the tests that take a fraction of a second each
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --quick
 
 .PHONY: setup

@@ -27,11 +27,13 @@ def call(
     return code
 
 
-def command(*words: object, columns: str = "200") -> subprocess.CompletedProcess[str]:
-    """Run `uav-twin` in this process; return its exit code and what it said."""
+def command(
+    *words: object, main: Callable[[], None] = cli.main, columns: str = "200"
+) -> subprocess.CompletedProcess[str]:
+    """Run `uav-twin`, or another command line, in this process; return its exit code and what it said."""
     said, complained = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(complained):
-        code = call(patch, *words, columns=columns)
+        code = call(patch, *words, main=main, columns=columns)
     return subprocess.CompletedProcess(words, code, said.getvalue(), complained.getvalue())
 
 

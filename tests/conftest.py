@@ -12,8 +12,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import gc
 import json
 import shutil
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+from tests import costs
 from tests.kept import FE, ROOT, exported, kept, remove_old
 from tests.refusals import Inputs
 
@@ -54,8 +55,8 @@ COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
-NOT_QUICK, QUICK_SECONDS = Path(__file__).with_name("not_quick.txt"), 0.2
-"""Functions whose tests took longer than this in all, the last time that they were listed."""
+NOT_QUICK = Path(__file__).with_name("not_quick.txt")
+"""Functions whose tests were not quick, the last time that they were listed (`tests.costs`)."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -127,19 +128,58 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.set_threshold(50_000, 20, 50)
 
 
-_taken: Counter[str] = Counter()
+_costs: defaultdict[str, list[costs.TestCost]] = defaultdict(list)
+_name_of_fixture: dict[str, str] = {}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_logstart() -> None:
+    """Begin to count what a test costs."""
+    costs.begin_test()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(
+    fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest
+) -> Iterator[None]:
+    """Count a fixture that several tests share for all of them."""
+    if fixturedef.scope == "function":
+        return (yield)
+    name = f"{request.node.nodeid} {fixturedef.argname} {getattr(request, 'param_index', '')}"
+    _name_of_fixture[fixturedef.argname] = name
+    with costs.shared_by_tests(name):
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Report what a test cost once it has ended; pytest-xdist hands the attributes of a report over."""
+    report = yield
+    if call.when == "teardown":
+        fixtures = {_name_of_fixture.get(name) for name in getattr(item, "fixturenames", ())}
+        used = (fixtures | costs.running.shared_used) & costs.seconds_of_shared.keys()
+        report.own_seconds = costs.running.own_seconds
+        report.shared_seconds = {name: costs.seconds_of_shared[name] for name in used if name}
+    return report
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Add up the seconds of each function's tests, without those of fixtures."""
-    if report.when == "call":
-        _taken[report.nodeid.partition("[")[0].partition("@")[0]] += report.duration
+    """Collect the costs of each function's tests."""
+    if report.when == "teardown":
+        function = report.nodeid.partition("[")[0].partition("@")[0]
+        _costs[function].append(costs.TestCost(report.own_seconds, report.shared_seconds))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Renew the list of what is not quick, where that is asked for; on an idle machine with warm caches."""
+    """Renew the list of what is not quick, where that is asked for; with warm caches.
+
+    Beside `--quick`, what is no longer quick is added to it.
+    """
     if session.config.getoption("list_not_quick") and not hasattr(session.config, "workerinput"):
-        names = sorted(name for name, seconds in _taken.items() if seconds > QUICK_SECONDS)
+        listed = set(NOT_QUICK.read_text("utf-8").split()) if session.config.getoption("quick") else set()
+        names = sorted(listed | costs.slow_functions(_costs))
         NOT_QUICK.write_text("".join(f"{name}\n" for name in names), "utf-8")
 
 

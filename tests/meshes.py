@@ -20,10 +20,13 @@ _PARTS = {  # of a cube, into cells by their number of corners
 def box(kind: str, divisions: tuple[int, int, int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return a mesh of the unit cube: points (nn, 3) and cells (nc, k) of a kind of meshio's."""
     element = KINDS[kind]
-    cubes = [np.array(place) + _CORNERS for place in itertools.product(*map(range, divisions))]
-    corners = np.array([cube[part] for cube in cubes for part in _PARTS[len(element.corners)]])
-    middles = [0.5 * (corners[:, a] + corners[:, b]) for a, b in element.edges]
+    parts_of_cube = _PARTS[len(element.corners)]
+    places = itertools.product(*(range(count) for count in divisions))
+    cubes = [np.array(place) + _CORNERS for place in places]
+    corners = np.array([cube[part] for cube in cubes for part in parts_of_cube])
+    middles = [0.5 * (corners[:, first] + corners[:, second]) for first, second in element.edges]
     nodes = np.concatenate([corners, *(middle[:, None] for middle in middles)], axis=1)
-    doubled = np.rint(2.0 * nodes).astype(np.int64).reshape(-1, 3)
-    points, cells = np.unique(doubled, axis=0, return_inverse=True)
+    # at half steps, so that coordinates are whole numbers: nodes that coincide are one point
+    half_steps = np.rint(2.0 * nodes).astype(np.int64).reshape(-1, 3)
+    points, cells = np.unique(half_steps, axis=0, return_inverse=True)
     return points / (2.0 * np.array(divisions)), cells.reshape(nodes.shape[:2])

@@ -81,10 +81,11 @@ def bracket(folder: Path) -> None:
     text, *_ = blocks(ROOT / "docs" / "how_to" / "structures.md", "toml")  # the others are of scenarios
     (folder / "bracket.toml").write_text(text, encoding="utf-8")
     points, cells = box("hexahedron", (12, 2, 2))
-    ends = {"ROOT": points[:, 0] == 0.0, "TOP": points[:, 2] == 1.0}
-    sets = {"BODY": [np.arange(48)], "LUG": [np.arange(8)]}
-    mesh = meshio.Mesh(points * [120, 20, 20] - [0, 10, 0], [("hexahedron", cells)], cell_sets=sets)
-    mesh.point_sets = {name: np.flatnonzero(there) for name, there in ends.items()}
+    length, _, height = points.T
+    millimetres = points * [120, 20, 20] - [0, 10, 0]
+    cell_sets = {"BODY": [np.arange(48)], "LUG": [np.arange(8)]}
+    mesh = meshio.Mesh(millimetres, [("hexahedron", cells)], cell_sets=cell_sets)
+    mesh.point_sets = {"ROOT": np.flatnonzero(length == 0.0), "TOP": np.flatnonzero(height == 1.0)}
     mesh.write(folder / "bracket.inp")
 
 

@@ -3,7 +3,6 @@
 import shutil
 import tomllib
 from dataclasses import fields, is_dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from discrepancy.system.response import Conditions
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.provenance import collect_provenance
+from tests.costs import once
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
@@ -126,7 +126,7 @@ FEW = chosen(
 """Part of the catalogue, where the whole one would only take time."""
 
 
-@cache
+@once
 def drag_found() -> Investigation:
     """Quadratic damping, hidden in ring-downs and static trials of the rig, and found; group `verdict`."""
     return investigate(*measured(0.01), FEW, seed=3)
@@ -166,18 +166,27 @@ def integrated(rate: Any, time: FloatArray, first: Any, parts: bool = False, **o
     return np.array(states)
 
 
-def same(one: Any, other: Any, rtol: float = 0.0) -> bool:
+def same(first: Any, second: Any, rtol: float = 0.0) -> bool:
     """Compare records to the last bit in all they hold, or to rounding but for what files do not keep."""
-    if is_dataclass(one):
-        kept = [item.name for item in fields(one) if not rtol or (item.compare and item.name != "data_hash")]
-        return all(same(getattr(one, name), getattr(other, name), rtol) for name in kept)
-    if isinstance(one, dict):
-        return list(one) == list(other) and same(tuple(one.values()), tuple(other.values()), rtol)
-    if isinstance(one, tuple):
-        return len(one) == len(other) and all(same(*pair, rtol) for pair in zip(one, other, strict=True))
-    if isinstance(one, np.ndarray | float):
-        first, second = np.asarray(one), np.asarray(other)
-        largest = np.abs(first).max(initial=0.0, where=np.isfinite(first)) if rtol else 0.0
-        alike = (first.dtype, first.shape) == (second.dtype, second.shape)
-        return alike and np.allclose(first, second, rtol=rtol, atol=rtol * largest, equal_nan=True)
-    return bool(one == other)
+    if is_dataclass(first):
+        compared = fields(first)
+        if rtol:
+            compared = tuple(item for item in compared if item.compare and item.name != "data_hash")
+        return all(same(getattr(first, item.name), getattr(second, item.name), rtol) for item in compared)
+    if isinstance(first, dict):
+        has_same_keys = list(first) == list(second)
+        return has_same_keys and same(tuple(first.values()), tuple(second.values()), rtol)
+    if isinstance(first, tuple):
+        has_same_length = len(first) == len(second)
+        return has_same_length and all(same(*pair, rtol) for pair in zip(first, second, strict=True))
+    if isinstance(first, np.ndarray | float):
+        return _same_numbers(np.asarray(first), np.asarray(second), rtol)
+    return bool(first == second)
+
+
+def _same_numbers(first: FloatArray, second: FloatArray, rtol: float) -> bool:
+    """Compare type, shape and numbers; the tolerance is relative to the largest finite one."""
+    largest = np.abs(first).max(initial=0.0, where=np.isfinite(first)) if rtol else 0.0
+    if (first.dtype, first.shape) != (second.dtype, second.shape):
+        return False
+    return np.allclose(first, second, rtol=rtol, atol=rtol * largest, equal_nan=True)

@@ -481,14 +481,15 @@ def test_a_built_in_sensor_is_that_of_its_channel():
     """Of two channels that measure one output, the one that the effect was found on."""
     model = uav_twin.load_model("single_mass_rig")
     noise = NoiseRecord(1e-5, 50.0)
-    channels = tuple(
-        Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
-    )
-    campaign = example_campaign(model, "static", 0, replace(usual_plan(model), channels=channels))
-    patched, given = model.with_patch(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
-    seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), given).values
-    np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
-    assert np.abs(seen[:, 1]).max() > 0.0
+    laser = Channel("laser", Quantity.DISPLACEMENT, "displacement", noise)
+    transducer = Channel("transducer", Quantity.DISPLACEMENT, "displacement", noise)
+    plan = replace(usual_plan(model), channels=(laser, transducer))
+    campaign = example_campaign(model, "static", 0, plan)
+    patched = model.with_patch(ModelPatch((SensorGain("laser", 0.1),)))
+    readings = observe(patched, campaign, campaign.trials[0], ModelPatch(), Conditions(np.ones(2))).values
+    of_laser, of_transducer = readings.T
+    np.testing.assert_allclose(of_laser, 1.1 * of_transducer, rtol=1e-12)
+    assert np.abs(of_transducer).max() > 0.0
 
 
 def test_friction_in_the_model_is_fitted_from_the_beginnings():

@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
+from tests.costs import once
 from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, exported, kept
 
@@ -39,7 +39,7 @@ STRUCTURES = tables(__file__, "ours")
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
 
 
-@cache
+@once
 def wing_model(name: str = "wing") -> ReducedModel:
     """Return the reduced model of a design."""
     design = DESIGNS[name]
@@ -49,7 +49,7 @@ def wing_model(name: str = "wing") -> ReducedModel:
         ).model
 
 
-@cache
+@once
 def wing_arrays() -> PatchArrays:
     """Return that wing for patches."""
     return kept(

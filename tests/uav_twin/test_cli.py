@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from reporting import terminal
 from scenarios import recording_files, scenario_files, structure_files
 from tests.command_line import command, refused, said
 from tests.conftest import synthetic_calibration
+from tests.costs import once
 from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
@@ -190,7 +190,7 @@ def test_a_scenario_without_a_strain_library_says_what_it_needs():
         check_scenario(load_scenario(NEEDS_LIBRARY))
 
 
-@cache
+@once
 def checked_scenario(name: str, library: Path) -> dict[str, Any]:
     """Return what the check of a shipped scenario finds."""
     options = {"strain_library": library} if name == NEEDS_LIBRARY else {}

@@ -486,23 +486,25 @@ def test_zeros_and_gains_are_as_stated(zero, gain, known):
 
 def test_holds_begins_and_files_for_proof_are_written():
     swings("a.csv", "b.csv")
-    given = ("--kind", "driven", "--column", "x=x", "--column", "U=input:U", "--quantity", "U=voltage")
-    said(*IMPORT, "a.csv", "b.csv", *given, "--hold", "U=zero_order", "--begins", "a.csv=still",
-         "--begins", "b.csv=unknown", "--held-out", "b.csv")  # fmt: skip
-    read = read_campaign("a")
-    assert [(trial.begins.value, trial.held_out) for trial in read.trials] == [
-        ("still", False),
-        ("unknown", True),
-    ]
-    assert [item.hold.value for item in read.trials[0].inputs] == ["zero_order"]
+    columns = ("--kind", "driven", "--column", "x=x", "--column", "U=input:U", "--quantity", "U=voltage")
+    begins = ("--begins", "a.csv=still", "--begins", "b.csv=unknown")
+    said(*IMPORT, "a.csv", "b.csv", *columns, *begins, "--hold", "U=zero_order", "--held-out", "b.csv")
+    first, second = read_campaign("a").trials
+    assert (first.begins.value, first.held_out) == ("still", False)
+    assert (second.begins.value, second.held_out) == ("unknown", True)
+    assert [item.hold.value for item in first.inputs] == ["zero_order"]
 
 
 def test_a_table_without_a_time_has_the_interval_that_is_stated():
     swings("a.csv", first_column=False)
-    given = (*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
-    assert "--interval NAME=... for 'a.csv' (seconds between its rows" in refused(*given)
-    said(*given, "--interval", "0.02")
+    command = (*IMPORT, "a.csv", "--kind", "driven", *PLAIN)
+    sentence = refused(*command)
+    said(*command, "--interval", "0.02")
+    assert "--interval NAME=... for 'a.csv' (seconds between its rows" in sentence
     assert read_campaign("a").trials[0].time.tolist() == [0.02 * k for k in range(16)]
+
+
+def test_an_interval_for_a_table_with_a_time_is_refused():
     swings("b.csv")
     sentence = refused(*IMPORT, "b.csv", "--kind", "driven", *PLAIN, "--interval", "b.csv=0.02")
     assert "b.csv has a column of times, but --interval was given for it" in sentence
@@ -588,15 +590,31 @@ def test_channels_keep_the_units_and_digits_of_the_files():
     assert Path("a/01_a.csv").read_text("utf-8").splitlines()[:3] == ["time,x", "0.0,-20.0", "0.01,-10.0"]
 
 
-def test_the_outputs_of_the_model_are_listed_with_their_units_where_a_column_may_be_one_of_them():
+OUTPUTS_OF_RIG = "displacement (displacement in m) and leaf_strain (strain without a unit)"
+ONE_SWING = ("swing.csv", "--kind", "ringdown", "--release", "8mm", "--decimal", ",", "--model", MODEL)
+
+
+@pytest.fixture
+def one_swing():
     Path("swing.csv").write_bytes(TWO["swing.csv"])
-    outputs = "displacement (displacement in m) and leaf_strain (strain without a unit)"
-    options = ("swing.csv", "--kind", "ringdown", "--release", "8mm", "--decimal", ",", "--model", MODEL)
-    assert f"The model has the outputs {outputs}." in refused(*IMPORT, *options)
+
+
+@pytest.mark.usefixtures("one_swing")
+def test_the_outputs_of_the_model_are_listed_where_a_column_may_be_one_of_them():
+    assert f"The model has the outputs {OUTPUTS_OF_RIG}." in refused(*IMPORT, *ONE_SWING)
+
+
+@pytest.mark.usefixtures("one_swing")
+def test_the_outputs_of_the_model_are_listed_where_a_column_is_said_to_be_another():
     wrong = ("--column", "Weg=deflection", "--unit", "Weg=mm")
-    assert f"the model has no output 'deflection'; it has {outputs}; say another." in refused(
-        *IMPORT, *options, *wrong
-    )
-    _, screen = in_a_terminal(["deflection", "displacement", "mm", "", "", "y"], *options, "--out", "lab")
-    assert screen.index(f"The model has the outputs {outputs}.") < screen.index("Weg: column")
-    assert [channel.output for channel in read_campaign("lab").channels.values()] == ["displacement"]
+    sentence = refused(*IMPORT, *ONE_SWING, *wrong)
+    assert f"the model has no output 'deflection'; it has {OUTPUTS_OF_RIG}; say another." in sentence
+
+
+@pytest.mark.usefixtures("one_swing")
+def test_a_dialogue_lists_the_outputs_of_the_model_before_it_asks_for_one():
+    answers = ["deflection", "displacement", "mm", "", "", "y"]
+    _, screen = in_a_terminal(answers, *ONE_SWING, "--out", "lab")
+    channels = read_campaign("lab").channels.values()
+    assert screen.index(f"The model has the outputs {OUTPUTS_OF_RIG}.") < screen.index("Weg: column")
+    assert [channel.output for channel in channels] == ["displacement"]

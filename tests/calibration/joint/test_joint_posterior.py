@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from calibration.result.record import STATE
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import PUBLISHED_LINE, stiffness_line
 from tests.calibration.decays import free_decay
+from tests.costs import once
 
 LIMITS = np.array([[0.85, 1.15], [0.05, 0.3], [0.0, 0.3]])
 """Where the model is valid: factor of the modulus, servo mass and pitot mass [kg]."""
@@ -43,9 +43,11 @@ def make_line_table():
     low, high = LIMITS.T
     half_width = 0.5 * (high - low)
     middle = LIMITS.mean(axis=1)
-    coefficient = np.zeros((2, 2, 2, 2))
+    slope_over_half_width = half_width[:, None] * SLOPES
+    coefficient = np.zeros((2, 2, 2, 2))  # by powers of the three parameters, and by mode
     coefficient[0, 0, 0] = LOG_FREQUENCIES_AT_CENTRE + (middle - CENTRE) @ SLOPES
-    coefficient[1, 0, 0], coefficient[0, 1, 0], coefficient[0, 0, 1] = half_width[:, None] * SLOPES
+    for parameter, powers in enumerate([(1, 0, 0), (0, 1, 0), (0, 0, 1)]):
+        coefficient[powers] = slope_over_half_width[parameter]
     curve = stiffness_line(575.2, 101.8, lower=0.85, upper=1.15)
     return WingTable(LIMITS, coefficient, curve)
 
@@ -347,7 +349,7 @@ def values_of(trials, reading):
     return values, errors
 
 
-@cache
+@once
 def fit_scattered(count, scatter):
     """Return the fits of some trials with scattered frequencies, which take seconds."""
     records = record_trials(1, scatter=scatter)[:count]

@@ -1,7 +1,7 @@
 """What campaigns cannot decide, before any data; the workflow tried on simulated ones of a rig."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf, log
 
 import numpy as np
@@ -13,6 +13,8 @@ from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, TrialKind
 from discrepancy.fits.candidate import EffectTerm
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
 from discrepancy.judgement.next_experiment import (
     Proposal,
     feasible_proposals,
@@ -22,8 +24,15 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
 from discrepancy.report.decidability_text import group_lines
-from discrepancy.self_calibration import outcome_of, self_calibrate, wilson_interval, write_self_calibration
+from discrepancy.self_calibration import (
+    SelfCalibration,
+    outcome_of,
+    self_calibrate,
+    wilson_interval,
+    write_self_calibration,
+)
 from discrepancy.simulation import Simulator
+from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of
@@ -75,6 +84,30 @@ def test_a_release_of_unknown_state_shows_effects_as_one_from_rest_does():
     assert "none of the effects" in group_lines(nothing)[0]
 
 
+def one_gauge_at_one_load_factor(kind: TrialKind) -> Campaign:
+    """Return the trials of a kind on the cantilever: one gauge, at rest or at 2 g, with a known modulus."""
+    measured_campaign = campaign()
+    gauge = next(
+        name for name, item in measured_campaign.channels.items() if item.quantity is Quantity.STRAIN
+    )
+    trials = []
+    for trial in measured_campaign.trials:
+        if trial.kind is kind:
+            column = [trial.channels.index(gauge)]
+            load_factor = np.full_like(trial.load_factor, 2.0 if kind is TrialKind.FLIGHT else 0.0)
+            of_gauge = replace(
+                trial,
+                channels=(gauge,),
+                values=trial.values[:, column],
+                used=trial.used[:, column],
+                load_factor=load_factor,
+            )
+            trials.append(of_gauge)
+    channels = {gauge: replace(measured_campaign.channels[gauge], gain_deviation=0.0)}
+    known = {item.name: (item.mean, 1e-4 * item.mean) for item in Cantilever().parameters}
+    return replace(measured_campaign, channels=channels, trials=tuple(trials), parameters=known)
+
+
 @pytest.mark.parametrize(
     ("kind", "group"),
     [
@@ -83,48 +116,57 @@ def test_a_release_of_unknown_state_shows_effects_as_one_from_rest_does():
     ],
 )
 def test_one_gauge_at_one_load_factor_cannot_tell(kind, group):
-    """One gauge of the cantilever, whose modulus is known: damage beside it, or relief beside lift."""
-    given, model = campaign(), Cantilever()
-    name = next(key for key, item in given.channels.items() if item.quantity is Quantity.STRAIN)
-    trials = []
-    for trial in (item for item in given.trials if item.kind is kind):
-        column = [trial.channels.index(name)]
-        level = np.full_like(trial.load_factor, 2.0 if kind is TrialKind.FLIGHT else 0.0)
-        part = {"channels": (name,), "values": trial.values[:, column], "used": trial.used[:, column]}
-        trials.append(replace(trial, **part, load_factor=level))
-    channels = {name: replace(given.channels[name], gain_deviation=0.0)}
-    known = {item.name: (item.mean, 1e-4 * item.mean) for item in model.parameters}
-    one = replace(given, channels=channels, trials=tuple(trials), parameters=known)
-    assert set(group_of(decided(model, one, *group), min(group))) == group
+    """Damage beside it, or relief beside lift."""
+    separability = decided(Cantilever(), one_gauge_at_one_load_factor(kind), *group)
+    assert set(group_of(separability, min(group))) == group
 
 
-def test_a_whole_laboratory_test_separates():
-    """And measured values do not count; what cannot be tested says why.
+SEPARATED = (
+    "point_mass",
+    "root_compliance",
+    "quadratic_damping",
+    "coulomb_friction",
+    "load_cell",
+    "gauge_gain",
+)
+"""Effects that a whole laboratory test tells apart."""
 
-    A gain of a millionth is within the noise of anything, and is not confused with all others.
-    """
-    identifiers = (
-        "point_mass", "root_compliance", "quadratic_damping", "coulomb_friction", "load_cell", "gauge_gain",
-    )  # fmt: skip
-    found, other, again = (
-        decided(kit.BENCH.model, given, *identifiers, "washout")
-        for given in (kit.BENCH.campaign, kit.BENCH.measured(1), kit.BENCH.measured(2))
+
+@pytest.fixture(scope="module")
+def laboratory():
+    """What a whole laboratory test can tell apart, before any data."""
+    return decided(kit.BENCH.model, kit.BENCH.campaign, *SEPARATED, "washout")
+
+
+def test_a_whole_laboratory_test_separates(laboratory):
+    assert laboratory.groups == ()
+    assert set(laboratory.identifiers) == set(SEPARATED)
+    np.testing.assert_array_equal(np.diag(laboratory.distance), 0.0)
+
+
+def test_measured_values_do_not_count_for_what_is_separated():
+    once, again = (
+        decided(kit.BENCH.model, kit.BENCH.measured(seed), *SEPARATED, "washout") for seed in (1, 2)
     )
-    np.testing.assert_allclose(other.distance, again.distance, rtol=1e-6)
-    assert found.groups == ()
-    assert set(found.identifiers) == set(identifiers)
-    np.testing.assert_array_equal(np.diag(found.distance), 0.0)
-    for item in found.detectability:
+    np.testing.assert_allclose(once.distance, again.distance, rtol=1e-6)
+
+
+def test_effects_of_usual_size_are_detectable_and_what_cannot_be_tested_says_why(laboratory):
+    for item in laboratory.detectability:
         assert bool(item.reason) is (item.effect.identifier == "washout")
         assert item.reason or item.detectable < item.typical
+
+
+def test_an_effect_within_the_noise_of_anything_is_not_confused_with_all_others():
+    """A gain of a millionth."""
     *others, gauge = kit.chosen("root_compliance", "quadratic_damping", "gauge_gain")
     (gain,) = gauge.parameters
-    small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
-    effects = [*others, replace(gauge, parameters=(replace(gain, prior=small),))]
-    unseen = compute_separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
-    assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSION_DISTANCE
-    assert "gauge_gain" in unseen.identifiers
-    assert unseen.groups == ()
+    tiny = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
+    tiny_gain = replace(gauge, parameters=(replace(gain, prior=tiny),))
+    found = compute_separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, [*others, tiny_gain])
+    assert 1e-6 < found.detectability[-1].distance < 0.1 * CONFUSION_DISTANCE
+    assert "gauge_gain" in found.identifiers
+    assert found.groups == ()
 
 
 def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
@@ -147,84 +189,133 @@ def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
 HALF = np.array([0.5, 0.5])
 
 
+def known_closed_form(trial, offset_deviation=0.0):
+    """Return the problem of one trial of y1 on the closed form, whose parameters are known."""
+    channel = Channel("y1", Quantity.DISPLACEMENT, "y1", kit.NOISE, offset_deviation=offset_deviation)
+    parameters = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
+    return kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, parameters, ""), kit.ClosedForm())
+
+
+def information_in_closed_form(shift, weights):
+    """Return the information of a reading of unit noise on whether it is shifted, by quadrature."""
+
+    def density(y):
+        joint = weights * norm.pdf(y, [0.0, shift])
+        posterior = joint / joint.sum()
+        return float(np.sum(joint * (np.log(posterior) - np.log(weights))))
+
+    information, _ = quad(density, -8.0, 8.0 + shift)
+    return information
+
+
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("weight", [0.5, 0.2])
 def test_information_of_one_reading_against_quadrature(shift, weight):
     """Of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
-    channel = Channel("y1", Quantity.DISPLACEMENT, "y1", kit.NOISE)
     trial = kit.blank_trial("one", TrialKind.STATIC, ("y1",), np.array([1.0]))
     trial = replace(trial, values=np.full((1, 1), 1.5))
-    tight = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
-    problem = kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, tight, ""), kit.ClosedForm())
-    none, other = (
-        kit.fitted(problem),
-        kit.fitted(problem, EffectTerm(kit.offset_effect(deviation=0.02), "y1")),
-    )
-    point = replace(none.point, effect=np.array([shift]))
-    fits = [none, replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))]
-    proposal, weights = Proposal(trial, "", "", 1.0), np.array([weight, 1.0 - weight])
-    got = mutual_information(problem, proposal, fits, weights)
-
-    def density(y):
-        parts = weights * norm.pdf(y, [0.0, shift])
-        share = parts / parts.sum()
-        return float(np.sum(parts * (np.log(share) - np.log(weights))))
-
-    exact, _ = quad(density, -8.0, 8.0 + shift)
+    problem = known_closed_form(trial)
+    nothing = kit.fitted(problem)
+    offset = kit.fitted(problem, EffectTerm(kit.offset_effect(deviation=0.02), "y1"))
+    shifted = replace(nothing.point, effect=np.array([shift]))
+    fits = [nothing, replace(offset, point=shifted, covariance=np.diag([1.0, 1.0, 1e-12]))]
+    weights = np.array([weight, 1.0 - weight])
+    proposal = Proposal(trial, "", "", 1.0)
+    information = mutual_information(problem, proposal, fits, weights)
+    under_a_free_zero = mutual_information(known_closed_form(trial, inf), proposal, fits, weights)
     entropy = -float(weights @ np.log(weights))
-    assert 0.0 <= got <= entropy
+    assert 0.0 <= information <= entropy
     # 300 outcomes each: standard error about 0.02
-    assert got == pytest.approx(exact, abs=0.06)
-    # under a free zero it tells nothing
-    channels = {"y1": replace(problem.campaign.channels["y1"], offset_deviation=inf)}
-    free = kit.problem_of(replace(problem.campaign, channels=channels), problem.model)
-    assert mutual_information(free, proposal, fits, weights) < 0.02
+    assert information == pytest.approx(information_in_closed_form(shift, weights), abs=0.06)
+    assert under_a_free_zero < 0.02
 
 
-def test_another_amplitude_decides_between_amplitude_and_time():
-    """Stiffening with amplitude and drift with time look alike in releases from one amplitude."""
-    test = kit.chain_bench(static=False, amplitudes=(0.01, 0.01), samples=160)
-    problem = test.problem(3, test.patch("cubic_stiffness", {"stiffening": 0.01}, "end"))
+@dataclass(frozen=True)
+class TwoHypotheses:
+    """Stiffening with amplitude and drift with time, which look alike in releases from one amplitude."""
+
+    problem: Problem
+    fits: list[CandidateFit]
+
+    def information(self, proposal):
+        return mutual_information(self.problem, proposal, self.fits, HALF)
+
+    def best_experiments(self):
+        return next_experiments(self.problem, [(item, 0.5) for item in self.fits])
+
+
+@pytest.fixture(scope="module")
+def amplitude_or_time():
+    bench = kit.chain_bench(static=False, amplitudes=(0.01, 0.01), samples=160)
+    problem = bench.problem(3, bench.patch("cubic_stiffness", {"stiffening": 0.01}, "end"))
     stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
     fits = [kit.fitted(problem, term) for term in (EffectTerm(stiffening, "end"), EffectTerm(drift))]
-    information = {
-        item.trial.name: mutual_information(problem, item, fits, HALF) for item in feasible_proposals(problem)
-    }
-    assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
-    same = Proposal(problem.campaign.trials[0], "", "", 1.0)
+    return TwoHypotheses(problem, fits)
+
+
+def test_another_amplitude_decides_between_amplitude_and_time(amplitude_or_time):
+    proposals = list(feasible_proposals(amplitude_or_time.problem))
+    information = {item.trial.name: amplitude_or_time.information(item) for item in proposals}
+    repetition = Proposal(amplitude_or_time.problem.campaign.trials[0], "", "", 1.0)
     twice = information["release at twice the largest amplitude so far"]
-    assert twice > mutual_information(problem, same, fits, HALF)
+    assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
+    assert twice > amplitude_or_time.information(repetition)
     assert twice > 0.95 * log(2.0)
-    best, again = (next_experiments(problem, [(item, 0.5) for item in fits]) for _ in range(2))
+
+
+def test_the_experiments_that_tell_most_for_their_cost_come_first(amplitude_or_time):
+    best = list(amplitude_or_time.best_experiments())
     assert best
+    assert best == sorted(best, key=lambda item: -item.information / item.cost)
     # a longer record may do as well, for less; of all repetitions another amplitude comes first
     assert "amplitude" in next(item.description for item in best if item.cost >= 1.0)
-    assert list(best) == sorted(best, key=lambda item: -item.information / item.cost)
-    assert again == best  # seeded
 
 
-def test_proposals_are_trials_of_the_kinds_that_were_done():
-    """A longer record is one of what swings."""
-    problem = kit.BENCH.problem(1)
-    found = list(feasible_proposals(problem))
-    assert {item.trial.kind for item in found} == {TrialKind.STATIC, TrialKind.RINGDOWN}
-    assert len({item.description for item in found}) == len(found)
-    for item in found:
-        assert item.cost > 0.0
-        assert len(item.trial.time) == len(item.trial.values)
-    longer = next(item for item in found if item.trial.name == "longer record")
-    before = max((t for t in problem.campaign.trials if t.release), key=lambda t: t.release.displacement)
-    assert longer.trial.interval == pytest.approx(before.interval)
-    assert len(longer.trial.time) == 3 * len(before.time)
-    assert f"({3.0 * len(before.time) * before.interval:.3g} s)" in longer.description
-    none = kit.fitted(problem)
-    assert oscillates(problem, none)
-    decay = tuple(
-        replace(part, response=np.exp(-data.trial.time)[:, np.newaxis] * np.ones(part.response.shape[1]))
-        for data, part in zip(problem.trials, none.trial_derivatives, strict=True)
-    )
-    assert not oscillates(problem, replace(none, trial_derivatives=decay))
-    names = [item.trial.name for item in feasible_proposals(problem, is_oscillating=False)]
+def test_the_next_experiments_are_seeded(amplitude_or_time):
+    assert amplitude_or_time.best_experiments() == amplitude_or_time.best_experiments()
+
+
+@pytest.fixture(scope="module")
+def laboratory_problem():
+    return kit.BENCH.problem(1)
+
+
+def test_proposals_are_trials_of_the_kinds_that_were_done(laboratory_problem):
+    proposals = list(feasible_proposals(laboratory_problem))
+    assert {item.trial.kind for item in proposals} == {TrialKind.STATIC, TrialKind.RINGDOWN}
+    assert len({item.description for item in proposals}) == len(proposals)
+
+
+def test_proposals_have_a_cost_and_a_reading_at_each_time(laboratory_problem):
+    for proposal in feasible_proposals(laboratory_problem):
+        assert proposal.cost > 0.0
+        assert len(proposal.trial.time) == len(proposal.trial.values)
+
+
+def test_a_longer_record_is_three_times_the_largest_release(laboratory_problem):
+    proposals = feasible_proposals(laboratory_problem)
+    longer = next(item for item in proposals if item.trial.name == "longer record")
+    releases = [trial for trial in laboratory_problem.campaign.trials if trial.release]
+    largest = max(releases, key=lambda trial: trial.release.displacement)
+    count = 3 * len(largest.time)
+    assert longer.trial.interval == pytest.approx(largest.interval)
+    assert len(longer.trial.time) == count
+    assert f"({count * largest.interval:.3g} s)" in longer.description
+
+
+def test_what_only_decays_does_not_oscillate(laboratory_problem):
+    fitted = kit.fitted(laboratory_problem)
+    decaying = []
+    for data, derivatives in zip(laboratory_problem.trials, fitted.trial_derivatives, strict=True):
+        decay = np.exp(-data.trial.time)[:, np.newaxis] * np.ones(derivatives.response.shape[1])
+        decaying.append(replace(derivatives, response=decay))
+    assert oscillates(laboratory_problem, fitted)
+    assert not oscillates(laboratory_problem, replace(fitted, trial_derivatives=tuple(decaying)))
+
+
+def test_a_longer_record_is_proposed_of_what_oscillates_only(laboratory_problem):
+    proposals = feasible_proposals(laboratory_problem, is_oscillating=False)
+    names = [item.trial.name for item in proposals]
     assert names
     assert "longer record" not in names
 
@@ -253,22 +344,51 @@ def test_how_verdicts_count(hidden, kind, named, group, outcome):
     assert outcome_of(hidden, kind, named, group) == outcome
 
 
-def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
-    campaign, model = measured()
-    simulator = Simulator(campaign, model)
-    squares = []
-    for seed in range(12):
-        drawn = simulator.simulate(None, np.random.default_rng(seed))
-        assert [trial.name for trial in drawn.trials] == [trial.name for trial in campaign.trials]
-        found = investigate(drawn, model, (), thorough=False) if seed < 2 else None
-        assert found is None or found.verdict.kind is VerdictKind.NOTHING_MISSING
-        again = simulator.simulate(None, np.random.default_rng(seed)).trials[-1].values
-        assert np.array_equal(again, drawn.trials[-1].values)
-        # sixth differences of a slow motion hold noise alone: variance times the sum of squared binomials
-        sixth = np.diff(drawn.trials[-1].values[:, 0], 6)
-        noise = simulator.problem.noise_models[drawn.trials[-1].channels[0]].standard_deviation
-        squares.append(float(np.mean(sixth**2)) / 924.0 / noise**2)
-    assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
+SEEDS = range(12)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    """What simulates campaigns like one of the single-mass rig."""
+    return Simulator(*measured())
+
+
+@pytest.fixture(scope="module")
+def simulated_campaigns(simulator):
+    """A campaign without any effect for each seed."""
+    return [simulator.simulate(None, np.random.default_rng(seed)) for seed in SEEDS]
+
+
+def test_simulated_campaigns_have_the_trials_of_the_real_one(simulated_campaigns):
+    names = [trial.name for trial in measured()[0].trials]
+    for simulated in simulated_campaigns:
+        assert [trial.name for trial in simulated.trials] == names
+
+
+def test_simulated_campaigns_repeat_with_their_seed(simulator, simulated_campaigns):
+    for seed, simulated in zip(SEEDS, simulated_campaigns, strict=True):
+        again = simulator.simulate(None, np.random.default_rng(seed))
+        assert np.array_equal(again.trials[-1].values, simulated.trials[-1].values)
+
+
+def test_nothing_is_missing_in_simulated_campaigns_without_an_effect(simulated_campaigns):
+    _, model = measured()
+    for simulated in simulated_campaigns[:2]:
+        found = investigate(simulated, model, (), thorough=False)
+        assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+
+
+def test_simulated_campaigns_have_the_noise_of_the_real_one(simulator, simulated_campaigns):
+    """Sixth differences of a slow motion hold noise alone, times the sum of squared binomials."""
+    sum_of_squared_binomials = 924.0
+    variance_ratios = []
+    for simulated in simulated_campaigns:
+        trial = simulated.trials[-1]
+        sixth_differences = np.diff(trial.values[:, 0], 6)
+        stated = simulator.problem.noise_models[trial.channels[0]].standard_deviation
+        variance = float(np.mean(sixth_differences**2)) / sum_of_squared_binomials
+        variance_ratios.append(variance / stated**2)
+    assert np.mean(variance_ratios) == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_motion_that_began_before_its_record_goes_on_in_simulated_campaigns():
@@ -283,21 +403,55 @@ def test_a_motion_that_began_before_its_record_goes_on_in_simulated_campaigns():
             np.testing.assert_allclose(own.values[0], trial.values[0], atol=0.1 * np.ptp(trial.values))
 
 
-def test_the_workflow_tried_on_its_own_geometry(tmp_path):
+@dataclass(frozen=True)
+class TriedWorkflow:
+    """The workflow tried on six simulated campaigns of static trials, and how often it reported progress."""
+
+    campaign: Campaign
+    model: LumpedModel
+    result: SelfCalibration
+    step_count: int
+
+
+@pytest.fixture(scope="module")
+def tried():
     campaign, model = measured(kind="static")
     steps = []
-    found = self_calibrate(campaign, model, FEW, 6, seed=2, workers=1, advance=lambda: steps.append(1))
-    assert len(steps) == len(found.cases) == 6
-    assert [case.hidden == "nothing" for case in found.cases] == [True, False, False] * 2
-    assert all(case.distance >= 25.0 for case in found.cases if case.hidden != "nothing")
-    assert sum(found.confusion()[2].ravel()) == 6
-    assert found.share("right", null=True).total == 2
-    none, square = wilson_interval(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
+    result = self_calibrate(campaign, model, FEW, 6, seed=2, workers=1, advance=lambda: steps.append(1))
+    return TriedWorkflow(campaign, model, result, len(steps))
+
+
+def test_the_workflow_tried_on_its_own_geometry_has_a_case_for_each_campaign(tried):
+    cases = tried.result.cases
+    assert tried.step_count == len(cases) == 6
+    assert [case.hidden == "nothing" for case in cases] == [True, False, False] * 2
+
+
+def test_effects_are_hidden_with_a_size_that_can_be_seen(tried):
+    assert all(case.distance >= 25.0 for case in tried.result.cases if case.hidden != "nothing")
+
+
+def test_shares_and_confusions_count_each_case(tried):
+    _, _, counts = tried.result.confusion()
+    assert sum(counts.ravel()) == 6
+    assert tried.result.share("right", null=True).total == 2
+
+
+def test_the_interval_of_a_share_is_that_of_wilson():
+    """In closed form (Wilson 1927)."""
+    none = wilson_interval(0, 9)
+    square = norm.ppf(0.95) ** 2
     assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, square / (9.0 + square)))
     assert wilson_interval(0, 0).total == 0
-    again = self_calibrate(campaign, model, FEW, 6, seed=2, workers=2)
-    assert again == found
-    path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)
+
+
+def test_two_workers_come_to_the_same_self_calibration_as_one(tried):
+    again = self_calibrate(tried.campaign, tried.model, FEW, 6, seed=2, workers=2)
+    assert again == tried.result
+
+
+def test_a_self_calibration_is_written_with_its_cases(tried, tmp_path):
+    path = write_self_calibration(tmp_path / "self_calibration.json", tried.result, ORIGIN)
     stored = json.loads(path.read_text(encoding="utf-8"))
     assert stored["schema"] == "uav-twin self calibration 1"
     assert len(stored["cases"]) == 6

@@ -1,6 +1,6 @@
 """Fits against dense linear algebra: Jacobian, evidence, posterior, leverage; and from far off."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf, log, pi
 
 import numpy as np
@@ -15,13 +15,14 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.fits.fitting import fit, try_fit
+from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.fits.normal_equations import cholesky_factor
 from discrepancy.fits.predictive import residual_set
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from tests.discrepancy.rigs import measured
+from tests.costs import once
+from tests.discrepancy.rigs import FloatArray, measured
 from tests.refusals import Inputs
 
 from . import kit
@@ -136,8 +137,38 @@ def test_a_signal_of_unknown_scale_is_fitted_as_one_whose_scale_is_known(kinds, 
 # ---------------------------------------------------------------- evidence and posterior
 
 
-@pytest.mark.parametrize(
-    ("terms", "zeros", "at_rest"),
+@dataclass(frozen=True)
+class GaussianCase:
+    """A fit of a problem that is linear, and its dense matrices: residual = y - A x."""
+
+    fit: CandidateFit
+    linear: kit.Linear
+    y: FloatArray
+    a: FloatArray
+    hessian: FloatArray
+
+    @property
+    def covariance(self):
+        return np.linalg.inv(self.hessian)
+
+
+@once
+def gaussian_case(terms, zero_deviation, at_rest):
+    """Return a fit where two readings are left out, by terms, deviation of the zeros and beginning."""
+    problem = kit.closed_problem(
+        seed=3,
+        effect=0.1,
+        offset_deviation=zero_deviation,
+        at_rest=at_rest,
+        left_out={2: ((4, 1), (17, 0))},
+    )
+    found = kit.fitted(problem, *terms)
+    linear = kit.Linear(problem, found.candidate)
+    return GaussianCase(found, linear, *linear.dense())
+
+
+GAUSSIAN_CASES = pytest.mark.parametrize(
+    ("terms", "zero_deviation", "at_rest"),
     [
         ((), 0.05, True),
         ((kit.OFFSET,), 0.05, True),
@@ -146,35 +177,49 @@ def test_a_signal_of_unknown_scale_is_fitted_as_one_whose_scale_is_known(kinds, 
         ((), inf, True),
     ],
 )
-def test_evidence_mean_covariance_and_leverage_are_the_gaussian_ones(terms, zeros, at_rest):
-    """The sum of the leverage, by channel in the dense hat matrix, is what the unknowns took."""
-    left_out = {2: ((4, 1), (17, 0))}
-    problem = kit.closed_problem(
-        seed=3, effect=0.1, offset_deviation=zeros, at_rest=at_rest, left_out=left_out
-    )
-    found = kit.fitted(problem, *terms)
-    linear = kit.Linear(problem, found.candidate)
-    y, a, hessian = linear.dense()
-    mean, covariance = np.linalg.solve(hessian, a.T @ y), np.linalg.inv(hessian)
-    x = np.concatenate((found.point.shared, found.point.effect, *found.point.local))
-    shared = problem.shared.unknown_count + len(terms)
-    assert found.converged
+
+
+@GAUSSIAN_CASES
+def test_the_point_of_a_fit_is_the_gaussian_mean(terms, zero_deviation, at_rest):
+    case = gaussian_case(terms, zero_deviation, at_rest)
+    point = case.fit.point
+    mean = np.linalg.solve(case.hessian, case.a.T @ case.y)
+    error = np.concatenate((point.shared, point.effect, *point.local)) - mean
+    assert case.fit.converged
     # a fit ends where a step promises less than CONVERGED, 0.01 nats
-    assert float((x - mean) @ hessian @ (x - mean)) < 0.02
-    np.testing.assert_allclose(found.covariance, covariance[:shared, :shared], rtol=1e-6, atol=1e-12)
-    leverage = np.einsum("ni,ij,nj->n", a, covariance, a)
-    np.testing.assert_allclose(
-        found.absorbed_freedom, np.bincount(linear.groups, leverage, minlength=3), rtol=1e-8
-    )
-    assert found.absorbed_freedom.sum() == pytest.approx(
-        linear.size - covariance.diagonal() @ linear.precision, rel=1e-8
-    )
-    assert problem.sample_counts.sum() == len(leverage)
-    if zeros == inf:  # free zeros are least squares; their evidence is beside another hypothesis' only
-        assert 0.0 in linear.precision
+    assert float(error @ case.hessian @ error) < 0.02
+
+
+@GAUSSIAN_CASES
+def test_the_covariance_of_shared_unknowns_and_effects_is_the_gaussian_one(terms, zero_deviation, at_rest):
+    case = gaussian_case(terms, zero_deviation, at_rest)
+    count = case.linear.problem.shared.unknown_count + len(terms)
+    exact = case.covariance[:count, :count]
+    np.testing.assert_allclose(case.fit.covariance, exact, rtol=1e-6, atol=1e-12)
+
+
+@GAUSSIAN_CASES
+def test_the_freedom_that_the_unknowns_took_is_the_leverage(terms, zero_deviation, at_rest):
+    """By channel, in the dense hat matrix; its sum is the number of unknowns less what priors fix."""
+    case = gaussian_case(terms, zero_deviation, at_rest)
+    leverage = np.einsum("ni,ij,nj->n", case.a, case.covariance, case.a)
+    by_channel = np.bincount(case.linear.groups, leverage, minlength=3)
+    in_all = case.linear.size - case.covariance.diagonal() @ case.linear.precision
+    np.testing.assert_allclose(case.fit.absorbed_freedom, by_channel, rtol=1e-8)
+    assert case.fit.absorbed_freedom.sum() == pytest.approx(in_all, rel=1e-8)
+    assert case.linear.problem.sample_counts.sum() == len(leverage)
+
+
+@GAUSSIAN_CASES
+def test_evidence_is_the_gaussian_one(terms, zero_deviation, at_rest):
+    """Free zeros are least squares: their evidence is beside that of another hypothesis only."""
+    case = gaussian_case(terms, zero_deviation, at_rest)
+    if zero_deviation == inf:
+        assert 0.0 in case.linear.precision
         return
-    exact = multivariate_normal(np.zeros(len(y)), np.eye(len(y)) + a @ a.T).logpdf(y)
-    assert found.log_evidence - 0.5 * len(y) * log(2.0 * pi) == pytest.approx(exact, abs=0.01)
+    count = len(case.y)
+    exact = multivariate_normal(np.zeros(count), np.eye(count) + case.a @ case.a.T).logpdf(case.y)
+    assert case.fit.log_evidence - 0.5 * count * log(2.0 * pi) == pytest.approx(exact, abs=0.01)
 
 
 def test_evidence_with_flat_priors_is_the_limit_of_wide_ones():
@@ -247,9 +292,11 @@ def problem():
 
 
 @given(
-    u=st.floats(-8.0, 8.0), coefficient=st.sampled_from([-1.0, 1.0, 1e100]),
-    reference=st.sampled_from([0.01, 0.3]), iterations=st.sampled_from([0, 4]),
-)  # fmt: skip
+    u=st.floats(-8.0, 8.0),
+    coefficient=st.sampled_from([-1.0, 1.0, 1e100]),
+    reference=st.sampled_from([0.01, 0.3]),
+    iterations=st.sampled_from([0, 4]),
+)
 @example(u=-2.66, coefficient=-1.0, reference=0.01, iterations=0)
 @settings(max_examples=12, deadline=None)
 def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, reference, iterations):
@@ -261,17 +308,26 @@ def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, r
         assert try_fit(problem, candidate, start, iterations=iterations) is None
         assert problem.refusals["ninth_power"].endswith(".")
         return
-    assert np.isfinite(found.log_evidence)
-    assert np.all(np.isfinite(found.covariance))
+    numbers = np.append(found.covariance, found.log_evidence)
+    assert np.all(np.isfinite(numbers))
 
 
-def test_a_search_tells_what_could_not_be_fitted_and_goes_on():
-    effects = [*kit.chosen("quadratic_damping"), *effects_of_file(Inputs(__file__).folder / "explosive.toml")]
+@pytest.fixture(scope="module")
+def verdict_beside_an_explosive_effect():
+    explosive = effects_of_file(Inputs(__file__).folder / "explosive.toml")
     campaign, model = measured(0.02)
-    verdict = investigate(campaign, model, effects, thorough=False).verdict
+    effects = [*kit.chosen("quadratic_damping"), *explosive]
+    return investigate(campaign, model, effects, thorough=False).verdict
+
+
+def test_a_search_goes_on_where_an_effect_could_not_be_fitted(verdict_beside_an_explosive_effect):
+    verdict = verdict_beside_an_explosive_effect
     assert verdict.kind is VerdictKind.NAMED
     assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
-    (left,) = verdict.not_fitted
-    assert left.identifier == "explosive"
-    assert left.reason.startswith("could not be fitted: ")
-    assert left.reason.endswith("is not a finite number at every time.")
+
+
+def test_a_search_tells_what_could_not_be_fitted(verdict_beside_an_explosive_effect):
+    (not_fitted,) = verdict_beside_an_explosive_effect.not_fitted
+    assert not_fitted.identifier == "explosive"
+    assert not_fitted.reason.startswith("could not be fitted: ")
+    assert not_fitted.reason.endswith("is not a finite number at every time.")

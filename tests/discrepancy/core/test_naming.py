@@ -1,6 +1,6 @@
 """Names on simulated campaigns of the chain: half the time steps, nuisances and parameters drawn."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +19,7 @@ from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, SensorSaturation
+from tests.costs import once
 from tests.refusals import Inputs
 
 from . import kit
@@ -73,82 +74,217 @@ NOISES = {"coloured": coloured, "outliers": outliers}
 NOISES |= {"remainder": remainder(5.0, 0.95), "small remainder": remainder(4.0, 0.9)}
 
 
-@pytest.mark.parametrize(
-    ("case", "seed"),
-    [
-        pytest.param(case, seed, id=f"{label} {seed}", marks=[pytest.mark.long] * (where == "long"))
-        for label, case in CASES["case"].items()
-        for where in ("seeds", "long")
-        for seed in case.get(where, ())
-    ],
-)
-def test_the_verdict_on_what_is_hidden(case, seed):
-    """Right names with intervals that hold the truth, groups where data cannot tell, no wrong name."""
-    kinds = tuple(VerdictKind(kind) for kind in case.get("kinds", VerdictKind))
-    hidden, names = [], set(case.get("names", ()))
-    for values in (dict(CASES["hidden"][label]) for label in case.get("hidden", ())):
-        hidden.append((values.pop("effect"), values, values.pop("place", "")))
-    bench, rivals = BENCHES[case.get("bench", "small")], RIVALS[case.get("rivals", "most")]
-    how = {"noise": NOISES.get(case.get("noise")), "noise_scale": case.get("noise_scale", 1.0)}
+@dataclass(frozen=True)
+class HiddenEffect:
+    """An effect of the catalogue that a case hides: identifier, values by name, place."""
+
+    identifier: str
+    values: dict[str, float]
+    place: str
+
+
+@dataclass(frozen=True)
+class NamedCase:
+    """A case of `verdicts.toml`, and what the search concludes of the campaign that it simulates."""
+
+    bench: kit.Bench
+    hidden: tuple[HiddenEffect, ...]
+    laws: ModelPatch
+    words: frozenset[str]
+    """Names of the group, or words of the sentence, that the case asks for."""
+    verdict: Verdict
+    set_probabilities: dict[tuple[str, ...], float]
+    compared_sets: frozenset[tuple[str, ...]]
+    fitted_effects: tuple[str, ...]
+
+    @property
+    def hidden_identifiers(self):
+        """Identifiers of what is hidden, sorted."""
+        return sorted(effect.identifier for effect in self.hidden)
+
+    @property
+    def named_identifiers(self):
+        """Identifiers of what the verdict names, sorted."""
+        return sorted(effect.identifier for effect in self.verdict.effects)
+
+
+def right_kinds(label):
+    """Return the kinds of verdict that are right for a case."""
+    return tuple(VerdictKind(kind) for kind in CASES["case"][label].get("kinds", VerdictKind))
+
+
+def hidden_effect(label):
+    values = dict(CASES["hidden"][label])
+    identifier = values.pop("effect")
+    place = values.pop("place", "")
+    return HiddenEffect(identifier, values, place)
+
+
+@once
+def concluded(label, seed):
+    """Return a case with its verdict; a search takes seconds, and each case is tested for several things."""
+    case = CASES["case"][label]
+    bench = BENCHES[case.get("bench", "small")]
+    rivals = RIVALS[case.get("rivals", "most")]
+    hidden = tuple(hidden_effect(name) for name in case.get("hidden", ()))
     laws = ModelPatch.from_list(case.get("laws", []), "a case")  # that no effect of the catalogue is
-    patch = sum((bench.patch(*item) for item in hidden), laws)
-    verdict, found, fit = reach_verdict(bench.problem(seed, patch, **how), rivals)
-    assert verdict.kind in kinds, verdict.sentence
-    wanted = sorted(item[0] for item in hidden)
-    if verdict.kind is VerdictKind.NAMED or kinds == (VerdictKind.NAMED_IN_PART,):
-        assert sorted(effect.identifier for effect in verdict.effects) == wanted
-    if len(laws) and verdict.kind is VerdictKind.FAMILY:
-        shape = {item.name: item for effect in verdict.effects for item in effect.shape}["velocity_exponent"]
-        assert shape.low < laws.primitives[0].velocity_exponent < shape.high
-    if verdict.kind is VerdictKind.GROUP and names:
-        assert names <= set(verdict.group)
-        assert bench is TIP or names == set(verdict.group)
-    if verdict.kind is VerdictKind.UNEXPLAINED:
-        assert all(words in verdict.sentence for words in names)
-    if kinds == (VerdictKind.NOTHING_MISSING,):
-        assert verdict.log_bayes_factor < 3.0
-        assert verdict.effects == ()
-    if kinds != (VerdictKind.NAMED,):
-        return
-    assert verdict.probability >= 0.95
-    assert all(gate.passed is not False for gate in verdict.gates)
-    assert sum(found.set_probabilities().values()) == pytest.approx(1.0)
-    assert sorted(fit.candidate.identifiers) == wanted
-    # each was tried alone as well: deletion has its comparison
-    tried = {item.candidate.identifiers for item in found.compared_fits().values()}
-    assert {(identifier,) for identifier in wanted} <= tried
-    for effect in verdict.effects:
-        ((_, values, place),) = (item for item in hidden if item[0] == effect.identifier)
-        assert effect.place == place
-        assert_held(effect, values)
+    patch = laws
+    for effect in hidden:
+        patch = patch + bench.patch(effect.identifier, effect.values, effect.place)
+    problem = bench.problem(
+        seed, patch, noise=NOISES.get(case.get("noise")), noise_scale=case.get("noise_scale", 1.0)
+    )
+    verdict, search, fit = reach_verdict(problem, rivals)
+    return NamedCase(
+        bench=bench,
+        hidden=hidden,
+        laws=laws,
+        words=frozenset(case.get("names", ())),
+        verdict=verdict,
+        set_probabilities=search.set_probabilities(),
+        compared_sets=frozenset(item.candidate.identifiers for item in search.compared_fits().values()),
+        fitted_effects=fit.candidate.identifiers,
+    )
 
 
-@pytest.mark.parametrize("place", ["g1", "all strain"])
-def test_a_sensor_that_saturates_is_named_with_its_limit(place):
-    """A softening spring, a gain and a mass are beside it; one limit for all strain is not a sum of
-    gauges.
-    """
-    limit, rivals = 2e-4, RIVALS["soft or saturated"]
-    channel, quantity = ("*", "strain") if place == "all strain" else (place, "")
-    hidden = SensorSaturation(channel, limit, quantity)
-    verdict, _, _ = reach_verdict(SMALL.problem(11, ModelPatch((hidden,))), rivals)
+def each_case(applies):
+    """Return a mark that runs a test for the label and seed of each case to which it applies."""
+    rows = []
+    for label, case in CASES["case"].items():
+        if not applies(label):
+            continue
+        rows += [pytest.param(label, seed, id=f"{label} {seed}") for seed in case.get("seeds", ())]
+        rows += [
+            pytest.param(label, seed, id=f"{label} {seed}", marks=pytest.mark.long)
+            for seed in case.get("long", ())
+        ]
+    return pytest.mark.parametrize(("label", "seed"), rows)
+
+
+def may_be(kind):
+    """Return whether a verdict of a kind is among the right ones, as a function of a case."""
+    return lambda label: kind in right_kinds(label)
+
+
+def must_be(*kinds):
+    """Return whether a verdict of one of these kinds alone is right, as a function of a case."""
+    return lambda label: len(right_kinds(label)) == 1 and right_kinds(label)[0] in kinds
+
+
+@each_case(lambda label: True)
+def test_the_verdict_is_of_a_kind_that_the_data_support(label, seed):
+    verdict = concluded(label, seed).verdict
+    assert verdict.kind in right_kinds(label), verdict.sentence
+
+
+@each_case(lambda label: may_be(VerdictKind.NAMED)(label) or must_be(VerdictKind.NAMED_IN_PART)(label))
+def test_no_other_name_is_given_than_that_of_what_is_hidden(label, seed):
+    case = concluded(label, seed)
+    is_named = case.verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
+    assert case.named_identifiers == case.hidden_identifiers or not is_named
+
+
+@each_case(lambda label: "laws" in CASES["case"][label] and may_be(VerdictKind.FAMILY)(label))
+def test_the_interval_of_a_shape_holds_the_exponent_of_the_hidden_law(label, seed):
+    case = concluded(label, seed)
+    shape = {estimate.name: estimate for effect in case.verdict.effects for estimate in effect.shape}
+    exponent = shape["velocity_exponent"]
+    assert exponent.low < case.laws.primitives[0].velocity_exponent < exponent.high
+
+
+@each_case(must_be(VerdictKind.GROUP))
+def test_a_group_has_the_effects_that_the_data_cannot_distinguish(label, seed):
+    """Beside the tip's deflection alone, further effects are in the group."""
+    case = concluded(label, seed)
+    group = set(case.verdict.group)
+    assert case.words <= group
+    assert case.bench is TIP or case.words == group
+
+
+@each_case(must_be(VerdictKind.UNEXPLAINED))
+def test_an_unexplained_gap_has_its_reason_in_the_sentence(label, seed):
+    case = concluded(label, seed)
+    assert all(words in case.verdict.sentence for words in case.words)
+
+
+@each_case(must_be(VerdictKind.NOTHING_MISSING))
+def test_where_nothing_is_missing_no_effect_is_more_probable(label, seed):
+    verdict = concluded(label, seed).verdict
+    assert verdict.log_bayes_factor < 3.0
+    assert verdict.effects == ()
+
+
+@each_case(must_be(VerdictKind.NAMED))
+def test_a_name_is_probable_and_passes_all_gates(label, seed):
+    case = concluded(label, seed)
+    assert case.verdict.probability >= 0.95
+    assert all(gate.passed is not False for gate in case.verdict.gates)
+    assert sum(case.set_probabilities.values()) == pytest.approx(1.0)
+
+
+@each_case(must_be(VerdictKind.NAMED))
+def test_what_is_named_is_what_was_fitted(label, seed):
+    case = concluded(label, seed)
+    assert sorted(case.fitted_effects) == case.hidden_identifiers
+
+
+@each_case(must_be(VerdictKind.NAMED))
+def test_each_named_effect_was_tried_alone_as_well(label, seed):
+    """So that the deletion of each from the set has its comparison."""
+    case = concluded(label, seed)
+    assert {(identifier,) for identifier in case.hidden_identifiers} <= case.compared_sets
+
+
+@each_case(must_be(VerdictKind.NAMED))
+def test_a_named_effect_has_its_place_and_its_values_within_the_intervals(label, seed):
+    case = concluded(label, seed)
+    hidden = {effect.identifier: effect for effect in case.hidden}
+    for effect in case.verdict.effects:
+        assert effect.place == hidden[effect.identifier].place
+        assert_intervals_hold(effect, hidden[effect.identifier].values)
+
+
+SATURATION_LIMIT = 2e-4
+SATURATED = {"g1": ("g1", ""), "all strain": ("*", "strain")}
+"""Channel and quantity of the hidden limit, by the place that is to be named."""
+
+
+@once
+def verdict_on_saturation(place):
+    """Return the verdict beside a softening spring, a gain and a mass."""
+    channel, quantity = SATURATED[place]
+    hidden = ModelPatch((SensorSaturation(channel, SATURATION_LIMIT, quantity),))
+    verdict, _, _ = reach_verdict(SMALL.problem(11, hidden), RIVALS["soft or saturated"])
+    return verdict
+
+
+@pytest.mark.parametrize("place", SATURATED)
+def test_a_sensor_that_saturates_is_named(place):
+    verdict = verdict_on_saturation(place)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    assert [(effect.identifier, effect.place) for effect in verdict.effects] == [("sensor_saturation", place)]
     assert all(gate.passed is not False for gate in verdict.gates)
-    (effect,) = verdict.effects
-    assert (effect.identifier, effect.place) == ("sensor_saturation", place)
+
+
+@pytest.mark.parametrize("place", SATURATED)
+def test_the_limit_of_a_sensor_that_saturates_is_estimated(place):
+    """One limit for all strain is not a sum of gauges."""
+    (effect,) = verdict_on_saturation(place).effects
     (primitive,) = effect.patch
-    assert (primitive.channel, primitive.quantity) == (channel, quantity)
     (share,) = effect.parameters
     # the limit goes with one over the root of the share; the interval is widened to 99.9 %
-    assert abs(np.log(primitive.limit / limit)) <= 0.5 * np.log(share.high / share.low)
+    largest_error = 0.5 * np.log(share.high / share.low)
+    assert (primitive.channel, primitive.quantity) == SATURATED[place]
+    assert abs(np.log(primitive.limit / SATURATION_LIMIT)) <= largest_error
 
 
-def assert_held(effect, values):
+def assert_intervals_hold(effect, values):
     """Intervals of 90 %, widened to 99.9 %: twice as wide."""
     for estimate in effect.parameters:
         truth = values[estimate.name]
-        middle, half = 0.5 * (estimate.low + estimate.high), 0.5 * (estimate.high - estimate.low)
-        assert abs(truth - middle) <= 2.0 * half + 0.005 * abs(truth), estimate
+        middle = 0.5 * (estimate.low + estimate.high)
+        half_width = 0.5 * (estimate.high - estimate.low)
+        assert abs(truth - middle) <= 2.0 * half_width + 0.005 * abs(truth), estimate
 
 
 @pytest.mark.parametrize("slip_ratio", [0.3, 1.5])
@@ -157,76 +293,155 @@ def test_a_joint_that_slips_is_named_though_it_has_more_elements(slip_ratio):
     values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}
     (joint,) = SMALL.patch("joint_micro_slip", values, "joint")
     problem = SMALL.problem(5, ModelPatch((replace(joint, element_count=400),)))
-    few = replace(problem.campaign, trials=problem.campaign.trials[1:4])  # loads to both sides, a release
+    few_trials = problem.campaign.trials[1:4]  # loads to both sides, a release
+    few = replace(problem.campaign, trials=few_trials)
     verdict, _, _ = reach_verdict(kit.problem_of(few, problem.model), HYSTERESIS)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     (effect,) = verdict.effects
     assert effect.identifier == "joint_micro_slip"
-    assert_held(effect, values)
+    assert_intervals_hold(effect, values)
 
 
-@pytest.mark.parametrize(("gain", "kind"), [(4e-4, VerdictKind.NOTHING_MISSING), (4e-2, VerdictKind.NAMED)])
-def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
-    """Read so finely that it is certain; a gain of four per cent, as certain, is one."""
+@once
+def finely_read():
+    """Return static trials read so finely that every gain is certain, with parameters that are known."""
     bench = static({})
     draw = np.random.default_rng(np.random.SeedSequence(2))  # as `measured` draws the parameters
-    known = {
-        item.name: (item.mean + item.deviation * float(draw.standard_normal()), 1e-7)
-        for item in bench.model.parameters
-    }
-    channels = {
-        key: replace(
-            item, noise=NoiseRecord(0.002 * item.noise.standard_deviation, 200.0), offset_deviation=0.0
-        )
-        for key, item in bench.campaign.channels.items()
-    }
-    fine = replace(bench, campaign=replace(bench.campaign, channels=channels, parameters=known))
-    patch = fine.patch("load_cell", {"gain_error": gain, "tare_ratio": 0.0})
-    verdict, found, fit = reach_verdict(fine.problem(2, patch), kit.chosen("load_cell"))
-    assert verdict.kind is kind, verdict.sentence
-    if kind is VerdictKind.NOTHING_MISSING:
-        assert "below 0.1 % of the quantity" in verdict.sentence
-        assert verdict.effects == ()
-        assert fit is found.no_effect
-        assert found.best().candidate.identifiers == ("load_cell",)
+    known = {}
+    for parameter in bench.model.parameters:
+        value = parameter.mean + parameter.deviation * float(draw.standard_normal())
+        known[parameter.name] = (value, 1e-7)
+    channels = {}
+    for name, channel in bench.campaign.channels.items():
+        noise = NoiseRecord(0.002 * channel.noise.standard_deviation, 200.0)
+        channels[name] = replace(channel, noise=noise, offset_deviation=0.0)
+    return replace(bench, campaign=replace(bench.campaign, channels=channels, parameters=known))
 
 
-def test_without_a_noise_record_the_sentence_says_so():
+@once
+def conclusion_on_a_gain(gain_error):
+    """Return verdict, search and fit of a load cell with a gain error."""
+    bench = finely_read()
+    patch = bench.patch("load_cell", {"gain_error": gain_error, "tare_ratio": 0.0})
+    return reach_verdict(bench.problem(2, patch), kit.chosen("load_cell"))
+
+
+SMALL_GAIN, LARGE_GAIN = 4e-4, 4e-2
+
+
+def test_a_gain_of_four_per_cent_is_a_name():
+    verdict, _, _ = conclusion_on_a_gain(LARGE_GAIN)
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+
+
+def test_a_gain_of_half_a_thousandth_is_no_name():
+    """It is as certain as one of four per cent."""
+    verdict, _, _ = conclusion_on_a_gain(SMALL_GAIN)
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+    assert "below 0.1 % of the quantity" in verdict.sentence
+    assert verdict.effects == ()
+
+
+def test_where_a_gain_is_no_name_the_model_stays_though_the_gain_fits_best():
+    _, search, fit = conclusion_on_a_gain(SMALL_GAIN)
+    assert fit is search.no_effect
+    assert search.best().candidate.identifiers == ("load_cell",)
+
+
+CLOSED_FORM_CASES = [
+    pytest.param(0.0, None, VerdictKind.NOTHING_MISSING, id="nothing hidden, no noise record"),
+    pytest.param(0.4, None, VerdictKind.NAMED, id="offset, no noise record"),
+    pytest.param(0.4, kit.NOISE, VerdictKind.NAMED, id="offset, noise record"),
+]
+
+
+@once
+def conclusion_on_an_offset(offset, noise):
+    """Return verdict, search and fit of the closed form with an offset."""
+    problem = kit.closed_problem(seed=3, effect=offset, noise=noise, offset_deviation=0.0)
+    return reach_verdict(problem, (kit.offset_effect(),))
+
+
+@pytest.mark.parametrize(("offset", "noise", "kind"), CLOSED_FORM_CASES)
+def test_without_a_noise_record_the_sentence_says_so(offset, noise, kind):
     """Neither that nothing is missing nor that the name is all can be said of an absolute fit."""
-    for effect, noise, kind in (
-        (0.0, None, VerdictKind.NOTHING_MISSING),
-        (0.4, None, VerdictKind.NAMED),
-        (0.4, kit.NOISE, VerdictKind.NAMED),
-    ):
-        problem = kit.closed_problem(seed=3, effect=effect, noise=noise, offset_deviation=0.0)
-        verdict, found, fit = reach_verdict(problem, (kit.offset_effect(),))
-        assert verdict.kind is kind, verdict.sentence
-        share = SimulationComparison(found).gap_share(fit, held_out=False)
-        assert share.value == pytest.approx(float(effect > 0.0), abs=0.01)
-        assert ("No noise record" in verdict.sentence) is (noise is None)
-    assert "record" not in verdict.sentence
+    verdict, _, _ = conclusion_on_an_offset(offset, noise)
+    assert verdict.kind is kind, verdict.sentence
+    assert ("No noise record" in verdict.sentence) is (noise is None)
+    assert ("record" in verdict.sentence) is (noise is None)
 
 
-def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_of_a_group():
-    """Which further effect stands beside it stays open; what does not fit alone is not a name so."""
-    problem = SMALL.problem(11, SMALL.patch(*FRICTION))
-    found = reach_verdict(problem, kit.chosen(FRICTION[0]))[1]
+@pytest.mark.parametrize(("offset", "noise", "kind"), CLOSED_FORM_CASES)
+def test_an_offset_is_all_of_the_gap_with_and_without_a_noise_record(offset, noise, kind):
+    _, search, fit = conclusion_on_an_offset(offset, noise)
+    share = SimulationComparison(search).gap_share(fit, held_out=False)
+    assert share.value == pytest.approx(float(offset > 0.0), abs=0.01)
+
+
+# ---------------------------------------------------------------- sets that data cannot tell apart
+
+FRICTION_ALONE = ("coulomb_friction",)
+
+
+@pytest.fixture(scope="module")
+def terms():
+    """Friction, which is hidden, and two effects of sensors."""
     places = {"coulomb_friction": "joint", "load_cell": "", "gauge_gain": "g1"}
-    friction, cell, gain = (EffectTerm(kit.chosen(key)[0], place) for key, place in places.items())
-    for terms in ((cell,), (friction, gain), (cell, gain)):
-        found.record_fit(kit.fitted(problem, *terms), exact=True)
-    right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
-    outcome = VerdictCase(found, {more: 0.7, right: 0.3}).common_effects_verdict()
-    assert outcome[0].kind is VerdictKind.NAMED
-    assert [item.identifier for item in outcome[0].effects] == list(right)
-    assert outcome[0].probability == pytest.approx(1.0)
-    for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
-        assert VerdictCase(found, shares).common_effects_verdict() is None
-    # patch and proof are those of a member that fits, the probability is that of those together
-    verdict, _, nearest = VerdictCase(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).undecided_verdict()
+    return {key: EffectTerm(kit.chosen(key)[0], place) for key, place in places.items()}
+
+
+@pytest.fixture(scope="module")
+def friction_search(terms):
+    """A search for hidden friction, in which sets with the two other effects were fitted as well."""
+    problem = SMALL.problem(11, SMALL.patch(*FRICTION))
+    _, search, _ = reach_verdict(problem, kit.chosen("coulomb_friction"))
+    for names in (("load_cell",), ("coulomb_friction", "gauge_gain"), ("load_cell", "gauge_gain")):
+        search.record_fit(kit.fitted(problem, *(terms[name] for name in names)), exact=True)
+    return search
+
+
+def identifiers(terms, *names):
+    """Return the identifiers of a set of terms, in the order of a candidate."""
+    return Candidate(tuple(terms[name] for name in names)).identifiers
+
+
+def test_what_all_probable_sets_hold_is_named(friction_search, terms):
+    """Which further effect stands beside it stays open."""
+    with_a_gain = identifiers(terms, "coulomb_friction", "gauge_gain")
+    outcome = VerdictCase(friction_search, {with_a_gain: 0.7, FRICTION_ALONE: 0.3}).common_effects_verdict()
+    verdict = outcome[0]
+    assert verdict.kind is VerdictKind.NAMED
+    assert [effect.identifier for effect in verdict.effects] == list(FRICTION_ALONE)
+    assert verdict.probability == pytest.approx(1.0)
+
+
+def test_what_does_not_fit_alone_is_not_named_though_all_probable_sets_hold_it(friction_search, terms):
+    cell_and_gain = identifiers(terms, "load_cell", "gauge_gain")
+    probabilities = {cell_and_gain: 0.6, ("load_cell",): 0.4}
+    assert VerdictCase(friction_search, probabilities).common_effects_verdict() is None
+
+
+def test_nothing_is_named_where_the_model_without_effects_is_probable(friction_search):
+    assert VerdictCase(friction_search, {FRICTION_ALONE: 0.8, (): 0.2}).common_effects_verdict() is None
+
+
+@pytest.fixture(scope="module")
+def undecided(friction_search):
+    """Verdict, search and nearest fit where most of the probability is that of a set that does not fit."""
+    probabilities = {("load_cell",): 0.6, FRICTION_ALONE: 0.38, (): 0.02}
+    return VerdictCase(friction_search, probabilities).undecided_verdict()
+
+
+def test_what_does_not_fit_is_no_part_of_a_group(undecided):
+    verdict, _, nearest = undecided
     assert verdict.kind is VerdictKind.GROUP
-    assert verdict.group == nearest.candidate.identifiers == right
+    assert verdict.group == nearest.candidate.identifiers == FRICTION_ALONE
     assert "cannot tell which" not in verdict.sentence
+
+
+def test_patch_and_proof_of_a_group_are_those_of_a_member_that_fits(undecided):
+    """The probability is that of all members together."""
+    verdict, _, _ = undecided
     assert verdict.probability == pytest.approx(0.38)
     assert verdict.gates[0].passed
 
@@ -280,48 +495,86 @@ def share_of(after, gap, noise):
     return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, is_tested=True)
 
 
-def test_shares_and_their_interval():
-    """Sums that are known: half of the gap is closed, and the interval holds it; the same blocks always."""
+NOISE_SUMS = np.full(40, 10.0)
+"""Sums of squares of the noise, by block."""
+
+
+@pytest.fixture
+def gap_sums():
+    """Sums of squares of a gap, by block, and the share of it that closes half of it, which is not exact."""
     generator = np.random.default_rng(1)
-    noise = np.full(40, 10.0)
     gap = generator.uniform(50.0, 150.0, 40)
-    half = share_of(noise + 0.5 * gap * generator.uniform(0.8, 1.2, 40), gap, noise)
+    remaining = 0.5 * gap * generator.uniform(0.8, 1.2, 40)
+    return gap, share_of(NOISE_SUMS + remaining, gap, NOISE_SUMS)
+
+
+def test_half_of_a_gap_is_a_share_of_a_half_within_its_interval(gap_sums):
+    _, half = gap_sums
     low, high = half.interval
     assert half.value == pytest.approx(0.5, abs=0.05)
     assert low < 0.5 < high
-    better = share_of(noise + 0.3 * gap, gap, noise)
+
+
+def test_a_share_is_larger_where_more_of_the_same_gap_is_closed(gap_sums):
+    gap, half = gap_sums
+    better = share_of(NOISE_SUMS + 0.3 * gap, gap, NOISE_SUMS)
     assert better.is_larger_than(half)
     assert not half.is_larger_than(better)
-    assert share_of(0.9 * noise, gap, noise).value == 1.0
+
+
+def test_the_share_of_a_law_that_leaves_less_than_the_noise_is_one(gap_sums):
+    gap, _ = gap_sums
+    assert share_of(0.9 * NOISE_SUMS, gap, NOISE_SUMS).value == 1.0
+
+
+def law(identifier, port, *, free_shape=False):
+    return EffectTerm(kit.chosen(identifier)[0], port, free_shape=free_shape)
+
+
+BEST_LAW, DRAG, CUBIC = (
+    law("coulomb_friction", "a"),
+    law("quadratic_damping", "a"),
+    law("cubic_stiffness", "b"),
+)
+
+
+def hypothesis(score, share, *terms):
+    """Return a hypothesis that closes a share of a gap of 100."""
+    remaining = 10.0 + (1.0 - share) * np.linspace(90.0, 110.0, 40)
+    return SimpleNamespace(
+        candidate=Candidate(terms), score=score, share=share_of(remaining, 100.0, NOISE_SUMS)
+    )
+
+
+def competing(*hypotheses):
+    """Return which of several hypotheses compete with the first one."""
+    comparison = object.__new__(SimulationComparison)
+    comparison.score = lambda item: item.score
+    comparison.held_out_or_fitted_share = lambda item: item.share
+    comparison.nameable_hypotheses = list(hypotheses)
+    return comparison.competing_hypotheses(hypotheses[0])
 
 
 def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_of_the_gap():
     """The best name, a law with a shape of its own and a longer set are no rivals, nor what is far off."""
-    friction, drag, cubic = (
-        EffectTerm(*one)
-        for one in zip(kit.chosen(FRICTION[0], "quadratic_damping", "cubic_stiffness"), "aab", strict=True)
+    best = hypothesis(0.0, 0.9, BEST_LAW)
+    second = hypothesis(-1.0, 0.9, CUBIC)
+    second_with_a_shape = hypothesis(-2.0, 0.9, law("cubic_stiffness", "b", free_shape=True))
+    no_rivals = (
+        hypothesis(-1.0, 0.9, law("coulomb_friction", "a", free_shape=True)),
+        hypothesis(-1.0, 0.9, law("quadratic_damping", "a", free_shape=True)),
+        hypothesis(-1.0, 0.9, DRAG, CUBIC),
+        hypothesis(-1.0 - SEARCH.force_rival_range, 0.9, DRAG),
+        hypothesis(-1.0, 0.5, DRAG),
     )
+    assert competing(best, second, second_with_a_shape, *no_rivals) == [second]
 
-    def held(score, share, *terms):
-        closed = 10.0 + (1.0 - share) * np.linspace(90.0, 110.0, 40)
-        told = share_of(closed, 100.0, np.full(40, 10.0))
-        return SimpleNamespace(candidate=Candidate(terms), score=score, told=told)
 
-    best = held(0.0, 0.9, friction)
-    second, freed = held(-1.0, 0.9, cubic), held(-2.0, 0.9, replace(cubic, free_shape=True))
-    others = (
-        held(-1.0, 0.9, replace(friction, free_shape=True)), held(-1.0, 0.9, replace(drag, free_shape=True)),
-        held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival_range, 0.9, drag), held(-1.0, 0.5, drag),
-    )  # fmt: skip
-    comparison = object.__new__(SimulationComparison)
-    comparison.score, comparison.held_out_or_fitted_share = (
-        (lambda item: item.score),
-        (lambda item: item.told),
+def test_all_names_that_are_as_close_are_rivals():
+    rivals = competing(
+        hypothesis(0.0, 0.9, BEST_LAW), hypothesis(-1.0, 0.9, DRAG), hypothesis(-1.0, 0.9, CUBIC)
     )
-    comparison.nameable_hypotheses = [best, second, freed, *others]
-    assert comparison.competing_hypotheses(best) == [second]
-    comparison.nameable_hypotheses = [best, held(-1.0, 0.9, drag), second]
-    assert [item.candidate.terms for item in comparison.competing_hypotheses(best)] == [(drag,), (cubic,)]
+    assert [rival.candidate.terms for rival in rivals] == [(DRAG,), (CUBIC,)]
 
 
 # ---------------------------------------------------------------- what a name does not exclude
@@ -335,39 +588,67 @@ def verdict_on(*identifiers, kind=VerdictKind.NAMED):
     return Verdict(kind, "-", 0.99, 20.0, effects=effects)
 
 
-def test_only_names_are_remarked_on_and_likeness_counts_both_ways():
-    for kind in VerdictKind:
-        assert bool(look_alike_remark(verdict_on("load_cell", kind=kind), kit.CATALOGUE)) is (
-            kind is VerdictKind.NAMED
-        )
+def look_alikes_of(*identifiers, compared=kit.CATALOGUE):
+    """Return the remark on what looks like the named effects."""
+    return look_alike_remark(verdict_on(*identifiers), compared)
+
+
+@pytest.mark.parametrize("kind", VerdictKind)
+def test_only_names_are_remarked_on(kind):
+    remark = look_alike_remark(verdict_on("load_cell", kind=kind), kit.CATALOGUE)
+    assert bool(remark) is (kind is VerdictKind.NAMED)
+
+
+def test_likeness_counts_both_ways():
     for effect in kit.CATALOGUE:
         for other in effect.confusable:
-            assert effect.identifier in look_alike_remark(verdict_on(other), kit.CATALOGUE)
-    whole = look_alike_remark(verdict_on("inertia_relief"), kit.CATALOGUE)
-    assert "washout" in whole
-    assert "not compared" not in whole
-    rest = [effect for effect in kit.CATALOGUE if effect.identifier != "washout"]
-    assert "washout was not compared" in look_alike_remark(verdict_on("inertia_relief"), rest)
-    # members of a set are no likenesses of each other
-    both = look_alike_remark(verdict_on("inertia_relief", "washout"), kit.CATALOGUE)
-    assert " do together, within the noise" in both
-    assert not {"washout", "inertia_relief"} & set(both.split("look similar,")[1].replace(",", " ").split())
+            assert effect.identifier in look_alikes_of(other)
 
 
-def test_a_group_says_last_what_these_trials_cannot_test():
-    setting = kit.chain_bench(amplitudes=()).setting
+def test_a_remark_says_which_look_alike_was_not_compared():
+    without_washout = [effect for effect in kit.CATALOGUE if effect.identifier != "washout"]
+    remark = look_alikes_of("inertia_relief")
+    assert "washout" in remark
+    assert "not compared" not in remark
+    assert "washout was not compared" in look_alikes_of("inertia_relief", compared=without_washout)
+
+
+def test_members_of_a_set_are_no_look_alikes_of_each_other():
+    remark = look_alikes_of("inertia_relief", "washout")
+    look_alikes = remark.split("look similar,")[1].replace(",", " ").split()
+    assert " do together, within the noise" in remark
+    assert not {"washout", "inertia_relief"} & set(look_alikes)
+
+
+STATIC_SETTING = kit.chain_bench(amplitudes=()).setting
+"""Static trials alone, which cannot test most effects."""
+
+
+@pytest.fixture(scope="module")
+def untested_sentence():
+    """The sentence of a group, with what static trials cannot test."""
     group = replace(verdict_on("gauge_gain", kind=VerdictKind.GROUP), sentence="Either is missing.")
-    sentence = verdict_with_untested_effects(group, setting, kit.CATALOGUE).sentence
-    assert sentence.startswith("Either is missing. ")
-    told = {effect.name for effect in kit.CATALOGUE if effect.name in sentence}
-    # what is easily taken for it comes first
-    alike = (
+    return verdict_with_untested_effects(group, STATIC_SETTING, kit.CATALOGUE).sentence
+
+
+def test_a_group_says_last_what_these_trials_cannot_test(untested_sentence):
+    testable = [effect for effect in kit.CATALOGUE if effect.unavailable(STATIC_SETTING) is None]
+    assert untested_sentence.startswith("Either is missing. ")
+    assert testable
+    assert not any(effect.name in untested_sentence for effect in testable)
+
+
+def test_what_is_easily_taken_for_a_named_effect_comes_first(untested_sentence):
+    in_order = (
         "stiffness loss outside the modelled regions",
         "stiffness loss of a damage region",
         "misalignment of a gauge",
+        "17 more",
     )
-    places = [sentence.index(name) for name in (*alike, "17 more")]
-    assert places == sorted(places)
-    assert not {effect.name for effect in kit.CATALOGUE if effect.unavailable(setting) is None} & told
+    positions = [untested_sentence.index(words) for words in in_order]
+    assert positions == sorted(positions)
+
+
+def test_a_name_does_not_say_what_these_trials_cannot_test():
     single = verdict_on("load_cell")
-    assert verdict_with_untested_effects(single, setting, kit.CATALOGUE) is single
+    assert verdict_with_untested_effects(single, STATIC_SETTING, kit.CATALOGUE) is single

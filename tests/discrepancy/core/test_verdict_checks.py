@@ -1,12 +1,14 @@
 """What trials say against a verdict, unknown beginnings, and the record of proof beside residuals.nc."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
-from discrepancy.files.verdict import read_verdict
+from discrepancy.files.verdict import VerdictFolder, read_verdict
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
@@ -18,8 +20,9 @@ from discrepancy.report.figures import ReportInput
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
-from discrepancy.workflow import investigate
+from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import PowerDamping
+from tests.costs import once
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import ORIGIN, chosen, integrated, measured, model_of, simulated
 from tests.refusals import Inputs
@@ -125,19 +128,30 @@ def test_a_model_that_is_not_fitted_gives_no_evidence_of_a_force():
 # ---------------------------------------------------------------- what the null hypothesis moves
 
 
-def test_parameters_that_the_model_moves_beyond_two_deviations_are_named_with_their_figures():
+@pytest.fixture(scope="module")
+def stiffer_than_stated():
+    """A problem whose stiffness lies 7.5 stated deviations above its prior, and the unknowns that move."""
     model = held_by_a_spring(stiffness=0.004, damping=0.2)
     problem = kit.problem_of(pushed(model, (1.03, 1.0)), model)
-    none = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
-    (moved,) = moved_unknowns(problem, none)
+    without_effects = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
+    return problem, moved_unknowns(problem, without_effects)
+
+
+def test_a_parameter_that_the_model_moves_beyond_two_deviations_is_found(stiffer_than_stated):
+    _, (moved,) = stiffer_than_stated
     assert moved.name == "stiffness"
     assert moved.deviations == pytest.approx((moved.value - moved.stated) / moved.deviation)
     assert moved.deviations == pytest.approx(7.5, abs=0.3)
+
+
+def test_moved_parameters_are_named_with_their_figures(stiffer_than_stated):
+    problem, (moved,) = stiffer_than_stated
     told = (
         f"the model moves 'stiffness' from 1 ± 0.004 to {moved.value:.4g} ({moved.deviations:.1f} deviations)"
     )
+    found = investigate(problem.campaign, problem.model, chosen("load_cell"), thorough=False)
     assert told in moved_sentence([moved])
-    assert told in investigate(problem.campaign, model, chosen("load_cell"), thorough=False).verdict.sentence
+    assert told in found.verdict.sentence
 
 
 def test_gains_and_zeros_are_named_too():
@@ -201,56 +215,139 @@ ENDS_IN = {"group": VerdictKind.GROUP, "below limit": VerdictKind.BELOW_LIMIT}
 """Kinds of verdict of campaigns that are there for these."""
 
 
+@dataclass(frozen=True)
+class StoredCase:
+    """What was found in a campaign, and the folder of its verdict as it is read back."""
+
+    found: Investigation
+    stored: VerdictFolder
+
+    @property
+    def is_compared(self):
+        """Return whether a hypothesis is proved, with the share of the gap that it closes."""
+        return self.stored.proof is not None and self.stored.proof.closed is not None
+
+    @property
+    def before(self):
+        """Residuals of the model alone, in held-out trials where there are any."""
+        return self.found.before.held_out or self.found.before
+
+    @property
+    def after(self):
+        """Residuals with the hypothesis, as stored, in the same trials."""
+        return self.stored.residuals.held_out or self.stored.residuals
+
+    @property
+    def scores_before(self):
+        return self.stored.proof.held_out_before or self.stored.proof.fitted_before
+
+    @property
+    def scores_after(self):
+        return self.stored.proof.held_out_after or self.stored.proof.fitted_after
+
+
+@once
+def stored_case(case):
+    """Return a case of `CAMPAIGNS`, searched once for all tests that ask about it."""
+    make_campaign, effects = CAMPAIGNS[case]
+    found = investigate(*make_campaign(), chosen(*effects), thorough=False)
+    with TemporaryDirectory() as folder:
+        write_verdict_folder(Path(folder) / "verdict", ReportInput(found, ORIGIN), report=False)
+        stored = read_verdict(Path(folder) / "verdict")
+    return StoredCase(found, stored)
+
+
+def used_residual(residuals, channel):
+    """Return the residual of a channel in all trials that have it, without readings left out."""
+    pieces = []
+    for item in residuals.trials:
+        if channel in item.trial.channels:
+            column = item.column(channel)
+            pieces.append(item.residual[item.used[:, column], column])
+    return np.concatenate(pieces)
+
+
+def sum_of_squares(residuals, noise_deviations):
+    """Return the sum of squares of all residuals over the deviation of their noise."""
+    total = 0.0
+    for item in residuals.trials:
+        standardised = item.residual / noise_deviations[item.trial.name]
+        total += float(np.sum(standardised[item.used] ** 2))
+    return total
+
+
 @pytest.mark.parametrize("case", CAMPAIGNS)
-def test_the_record_of_proof_is_what_the_residuals_show(case, tmp_path):
-    """In thirteen campaigns: share and errors of sentence and file are those of residuals.nc."""
-    made, effects = CAMPAIGNS[case]
-    found = investigate(*made(), chosen(*effects), thorough=False)
+def test_a_verdict_without_a_proof_has_no_hypothesis(case):
+    """And campaigns that are there for a kind of verdict end in it."""
+    found, proof = stored_case(case).found, stored_case(case).stored.proof
     assert found.verdict.kind is ENDS_IN.get(case, found.verdict.kind), found.verdict.sentence
-    write_verdict_folder(tmp_path / "verdict", ReportInput(found, ORIGIN), report=False)
-    stored = read_verdict(tmp_path / "verdict")
-    if stored.proof is None:
-        assert found.fit is None or not found.fit.candidate.terms
-        return
-    proof, after = stored.proof, stored.residuals.held_out or stored.residuals
-    before = found.before.held_out or found.before
-    scores = proof.held_out_after or proof.fitted_after
-    for name in after.channel_names:
-        pairs = [
-            (item.residual[:, item.column(name)], item.used[:, item.column(name)])
-            for item in after.trials
-            if name in item.trial.channels
-        ]
-        residual = np.concatenate([values[used] for values, used in pairs])
-        assert scores.rms[name] == pytest.approx(np.sqrt(np.mean(residual**2)))
-    if proof.closed is None:
-        return
-    noise = {item.trial.name: item.noise_deviation for item in before.trials}
-    total = [
-        sum(
-            float(np.sum((item.residual / noise[item.trial.name])[item.used] ** 2))
-            for item in residuals.trials
+    assert proof is not None or found.fit is None or not found.fit.candidate.terms
+
+
+@pytest.mark.parametrize("case", CAMPAIGNS)
+def test_errors_of_the_proof_are_those_of_the_residuals(case):
+    searched = stored_case(case)
+    if searched.stored.proof is not None:
+        for channel in searched.after.channel_names:
+            rms = np.sqrt(np.mean(used_residual(searched.after, channel) ** 2))
+            assert searched.scores_after.rms[channel] == pytest.approx(rms)
+
+
+@pytest.mark.parametrize("case", CAMPAIGNS)
+def test_the_share_of_the_proof_is_that_of_the_residuals(case):
+    searched = stored_case(case)
+    if searched.is_compared:
+        noise_deviations = {item.trial.name: item.noise_deviation for item in searched.before.trials}
+        before = sum_of_squares(searched.before, noise_deviations)
+        after = sum_of_squares(searched.after, noise_deviations)
+        assert searched.stored.proof.closed.value == pytest.approx(1.0 - after / before)
+        assert not searched.stored.proof.has_grown
+
+
+@pytest.mark.parametrize("case", CAMPAIGNS)
+def test_a_sentence_without_a_full_name_has_share_and_errors_of_the_proof(case):
+    searched = stored_case(case)
+    verdict = searched.stored.verdict
+    if searched.is_compared and verdict.kind in (VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED):
+        errors = rms_errors_text(
+            searched.after.channels, searched.scores_before.rms, searched.scores_after.rms
         )
-        for residuals in (before, after)
-    ]
-    assert proof.closed.value == pytest.approx(1.0 - total[1] / total[0])
-    assert not proof.has_grown
-    if stored.verdict.kind in (VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED):
-        assert percent_with_interval(proof.closed) in stored.verdict.sentence
-        old = proof.held_out_before or proof.fitted_before
-        assert rms_errors_text(after.channels, old.rms, scores.rms) in stored.verdict.sentence
+        assert percent_with_interval(searched.stored.proof.closed) in verdict.sentence
+        assert errors in verdict.sentence
 
 
-def test_a_hypothesis_with_which_the_error_grows_is_not_named():
-    """The outcome of a search names an effect at ten times its size: nothing is named, nothing to apply."""
+def test_the_campaigns_are_of_each_kind_that_these_tests_tell_apart():
+    """So that no test above holds for want of a case."""
+    kinds = {stored_case(case).stored.verdict.kind for case in CAMPAIGNS if stored_case(case).is_compared}
+    unproved = [case for case in CAMPAIGNS if stored_case(case).stored.proof is None]
+    assert {VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED} <= kinds
+    assert unproved
+
+
+@pytest.fixture(scope="module")
+def drag_on_rig():
+    """Quadratic damping, found and named."""
     found = investigate(*rig(0.01), chosen("quadratic_damping"), thorough=False)
-    verdict, fit_of_name = found.verdict, found.fit
-    assert verdict.kind is VerdictKind.NAMED
-    candidate = fit_of_name.candidate
-    values = candidate.add_step(fit_of_name.effect, np.full(candidate.parameter_count, 4.0))
-    worse = fit(found.problem, candidate, replace(fit_of_name.point, effect=values), iterations=0)
-    outcome = check_against_trials(VerdictOutcome(verdict, found.search, worse))
-    assert outcome.verdict.kind is VerdictKind.UNEXPLAINED
-    assert outcome.verdict.effects == outcome.verdict.resembles == ()
-    assert outcome.fit is found.search.no_effect
-    assert "larger (rms of" in outcome.verdict.sentence
+    assert found.verdict.kind is VerdictKind.NAMED
+    return found
+
+
+@pytest.fixture(scope="module")
+def checked_outcome(drag_on_rig):
+    """What is left of an outcome that names the effect at ten times its size."""
+    named = drag_on_rig.fit
+    candidate = named.candidate
+    too_large = candidate.add_step(named.effect, np.full(candidate.parameter_count, 4.0))
+    worse = fit(drag_on_rig.problem, candidate, replace(named.point, effect=too_large), iterations=0)
+    return check_against_trials(VerdictOutcome(drag_on_rig.verdict, drag_on_rig.search, worse))
+
+
+def test_a_hypothesis_with_which_the_error_grows_is_not_named(checked_outcome):
+    verdict = checked_outcome.verdict
+    assert verdict.kind is VerdictKind.UNEXPLAINED
+    assert verdict.effects == verdict.resembles == ()
+    assert "larger (rms of" in verdict.sentence
+
+
+def test_of_a_hypothesis_with_which_the_error_grows_nothing_is_applied(checked_outcome, drag_on_rig):
+    assert checked_outcome.fit is drag_on_rig.search.no_effect

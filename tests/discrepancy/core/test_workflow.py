@@ -47,88 +47,146 @@ def spoilt(seed, change):
     return campaign
 
 
-def test_an_effect_is_named_and_proved_on_trials_not_used():
-    """Draws of its patch have the posterior's spread, and the same seed gives the same verdict."""
+def test_an_effect_is_named():
     found = drag_found()
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
-    assert found.proof.closed.value >= 0.9
-    assert 0.8 <= found.proof.held_out_after.chi_square_per_sample <= 1.2
-    assert found.proof.log_score_gain > 0.0
     assert found.location is not None
+
+
+def test_a_named_effect_is_proved_on_trials_not_used():
+    proof = drag_found().proof
+    assert proof.closed.value >= 0.9
+    assert 0.8 <= proof.held_out_after.chi_square_per_sample <= 1.2
+    assert proof.log_score_gain > 0.0
+
+
+def test_the_time_steps_of_a_search_are_short_enough():
+    found = drag_found()
     assert not any("time steps cost" in remark for remark in found.verdict.remarks)
     assert time_step_error(found.problem, found.fit) < 0.1
-    sets, shares = zip(
-        *((f.candidate.identifiers, p) for f, p in open_hypotheses(found.search, count=4)), strict=True
-    )
-    assert len(set(sets)) == len(sets)
-    assert list(shares) == sorted(shares, reverse=True)
-
-    (draws,), again = (patch_draws(found.problem, found.fit, seed=1, count=300) for _ in range(2))
-    assert again[0] == draws
-    values = np.array([draw.primitives[0].coefficient for draw in draws])
-    effect, spread = found.fit.point.effect, float(np.sqrt(found.fit.effect_covariance[0, 0]))
-    low, high = (
-        found.fit.candidate.patch(found.problem.setting, effect + side * spread).primitives[0].coefficient
-        for side in (-1.0, 1.0)
-    )
-    assert values.std() == pytest.approx(0.5 * (high - low), rel=0.2)
-
-    other = investigate(*measured(0.01), FEW, seed=3, thorough=False)
-    assert other.verdict.sentence == found.verdict.sentence
-    assert other.verdict.probability == found.verdict.probability
-    assert other.proof.closed == found.proof.closed
-    assert other.fit.point.effect.tobytes() == found.fit.point.effect.tobytes()
 
 
-def test_wrong_readings_at_the_ends_of_records_are_left_out():
-    """A heavily damped line would explain the first one; held-out records are judged as well."""
+def test_open_hypotheses_are_sets_each_once_with_the_most_probable_first():
+    hypotheses = open_hypotheses(drag_found().search, count=4)
+    sets = [fit_of_set.candidate.identifiers for fit_of_set, _ in hypotheses]
+    probabilities = [probability for _, probability in hypotheses]
+    assert len(set(sets)) == len(sets) > 0
+    assert probabilities == sorted(probabilities, reverse=True)
+
+
+def test_draws_of_a_patch_have_the_standard_deviation_of_the_posterior():
+    found = drag_found()
+    deviation = float(np.sqrt(found.fit.effect_covariance[0, 0]))
+
+    def coefficient(effect):
+        return found.fit.candidate.patch(found.problem.setting, effect).primitives[0].coefficient
+
+    low = coefficient(found.fit.point.effect - deviation)
+    high = coefficient(found.fit.point.effect + deviation)
+    (draws,) = patch_draws(found.problem, found.fit, seed=1, count=300)
+    drawn = np.array([draw.primitives[0].coefficient for draw in draws])
+    assert drawn.std() == pytest.approx(0.5 * (high - low), rel=0.2)
+
+
+def test_draws_of_a_patch_repeat_with_their_seed():
+    found = drag_found()
+    once = patch_draws(found.problem, found.fit, seed=1, count=300)
+    assert patch_draws(found.problem, found.fit, seed=1, count=300) == once
+
+
+@pytest.fixture(scope="module")
+def drag_found_again():
+    """The same search once more, with the same seed."""
+    return investigate(*measured(0.01), FEW, seed=3, thorough=False)
+
+
+def test_the_same_seed_gives_the_same_verdict(drag_found_again):
+    found = drag_found()
+    assert drag_found_again.verdict.sentence == found.verdict.sentence
+    assert drag_found_again.verdict.probability == found.verdict.probability
+
+
+def test_the_same_seed_gives_the_same_proof_and_the_same_fit_to_the_bit(drag_found_again):
+    found = drag_found()
+    assert drag_found_again.proof.closed == found.proof.closed
+    assert drag_found_again.fit.point.effect.tobytes() == found.fit.point.effect.tobytes()
+
+
+def wrong_row(trial):
+    """Return the row of the wrong reading: a heavily damped line would explain one at the beginning."""
+    return 0 if trial.held_out else -1
+
+
+@pytest.fixture(scope="module")
+def found_beside_wrong_readings():
+    """What is found where one end of each ring-down, those held out as well, has a wrong reading."""
 
     def change(trial):
         if trial.is_dynamic:
             noise = LABORATORY.campaign.channels[trial.channels[0]].noise.standard_deviation
-            trial.values[0 if trial.held_out else -1, 0] += 30.0 * noise
+            trial.values[wrong_row(trial), 0] += 30.0 * noise
 
-    found = judged(spoilt(21, change), thorough=False)
-    assert found.verdict.kind is VerdictKind.NOTHING_MISSING, found.verdict.sentence
-    for trial in found.campaign.trials:
+    return judged(spoilt(21, change), thorough=False)
+
+
+def test_wrong_readings_at_the_ends_of_records_explain_no_effect(found_beside_wrong_readings):
+    verdict = found_beside_wrong_readings.verdict
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+
+
+def test_wrong_readings_at_the_ends_of_records_are_left_out(found_beside_wrong_readings):
+    for trial in found_beside_wrong_readings.campaign.trials:
         if trial.is_dynamic:
-            assert not trial.used[0 if trial.held_out else -1, 0]
+            assert not trial.used[wrong_row(trial), 0]
             assert trial.used.sum() >= trial.used.size - 2
-            assert any(repr(trial.name) in text and "left out" in text for text in found.campaign.remarks)
 
 
-def test_verdicts_that_name_nothing():
-    """Nothing missing has no proof; microstrain for strain is not an effect; an open verdict has
-    experiments.
-    """
-    result = judged(LABORATORY.measured(22))
-    assert result.verdict.kind is VerdictKind.NOTHING_MISSING, result.verdict.sentence
-    assert result.proof is None
-    assert result.verdict.next_experiments == ()
+def test_readings_that_are_left_out_are_remarked_on(found_beside_wrong_readings):
+    campaign = found_beside_wrong_readings.campaign
+    remarks = [remark for remark in campaign.remarks if "left out" in remark]
+    for trial in campaign.trials:
+        if trial.is_dynamic:
+            assert any(repr(trial.name) in remark for remark in remarks)
 
+
+def test_where_nothing_is_missing_there_is_neither_a_proof_nor_an_experiment():
+    found = judged(LABORATORY.measured(22))
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING, found.verdict.sentence
+    assert found.proof is None
+    assert found.verdict.next_experiments == ()
+
+
+def test_microstrain_for_strain_is_an_error_of_the_data_and_no_effect():
     def change(trial):
         trial.values[:, trial.channels.index("g1")] *= 1e6
 
-    result = judged(spoilt(23, change))
-    assert result.verdict.kind is VerdictKind.DATA_ERROR, result.verdict.sentence
-    assert result.search is None
+    found = judged(spoilt(23, change))
+    assert found.verdict.kind is VerdictKind.DATA_ERROR, found.verdict.sentence
+    assert found.search is None
 
+
+def test_the_experiments_that_an_open_verdict_asks_for_tell_no_more_than_there_is_to_know():
+    """Three hypotheses are open: at most log 3."""
     patch = kit.BENCH.patch("clock_error", {"rate_error": 0.005, "phase_zero": 0.0})
-    result = judged(kit.BENCH.measured(1, patch), kit.chosen("clock_error", "load_cell"))
-    assert result.verdict.kind is VerdictKind.GROUP, result.verdict.sentence
-    for item in result.verdict.next_experiments:
-        assert 0.0 < item.information <= np.log(3.0) + 1e-9
+    verdict = judged(kit.BENCH.measured(1, patch), kit.chosen("clock_error", "load_cell")).verdict
+    assert verdict.kind is VerdictKind.GROUP, verdict.sentence
+    for experiment in verdict.next_experiments:
+        assert 0.0 < experiment.information <= np.log(3.0) + 1e-9
 
+
+def test_a_misspelt_parameter_is_refused_with_the_nearest_one():
     misspelt = replace(LABORATORY.measured(1), parameters={"stifness_factor": (1.0, 0.01)})
     with pytest.raises(CampaignDataError, match=r"'stifness_factor'.*stiffness_factor"):
         judged(misspelt)
 
-    # what the model says, to the last bit, and no noise record: nothing to weigh the rest by
+
+def test_exact_readings_without_a_noise_record_have_nothing_missing_and_the_sentence_says_why():
+    """They are what the model says, to the last bit: there is nothing by which to weigh the residuals."""
     exact = campaign_as_predicted(LABORATORY.campaign, LABORATORY.model, LABORATORY.setting)
-    channels = {name: replace(item, noise=None) for name, item in exact.channels.items()}
-    result = judged(replace(exact, trials=exact.fitted, channels=channels), thorough=False)
-    assert result.verdict.kind is VerdictKind.NOTHING_MISSING
-    assert "No noise record" in result.verdict.sentence
+    channels = {name: replace(channel, noise=None) for name, channel in exact.channels.items()}
+    found = judged(replace(exact, trials=exact.fitted, channels=channels), thorough=False)
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING
+    assert "No noise record" in found.verdict.sentence
 
 
 def test_a_gain_far_from_its_prior_is_remarked_on():
@@ -144,20 +202,37 @@ def test_a_gain_far_from_its_prior_is_remarked_on():
         assert ("differs from its stated value" in remarks) is far
 
 
-def test_effects_that_lack_a_port_are_remarked_on_with_the_port_to_declare():
-    chain = LumpedModel.load("three_mass_chain")
-    plan = plan_from_scales(chain, ("x3", "x1"), "end")
-    campaign = example_campaign(chain, "ringdown", 1, plan)
-    assert missing_port_remark(setting_of(campaign, chain), library()) == []
-    bare = LumpedModel(chain.description.model_copy(update={"port": ()}))
-    (remark,) = missing_port_remark(setting_of(campaign, bare), library())
+CHAIN = LumpedModel.load("three_mass_chain")
+CHAIN_PLAN = plan_from_scales(CHAIN, ("x3", "x1"), "end")
+
+
+def remarks_on_ports(kind, *, without_ports):
+    """Return the remarks on ports of an example campaign of the chain."""
+    campaign = example_campaign(CHAIN, kind, 1, CHAIN_PLAN)
+    bare = LumpedModel(CHAIN.description.model_copy(update={"port": ()}))
+    return missing_port_remark(setting_of(campaign, bare if without_ports else CHAIN), library())
+
+
+def test_where_the_model_has_ports_none_is_asked_for():
+    assert remarks_on_ports("ringdown", without_ports=False) == []
+
+
+def test_effects_that_lack_a_port_are_remarked_on():
+    (remark,) = remarks_on_ports("ringdown", without_ports=True)
     assert remark.startswith("Not tested for lack of a port: Coulomb friction, ")
+    assert "drift" not in remark
+
+
+def test_a_remark_on_a_missing_port_says_which_port_to_declare():
+    (remark,) = remarks_on_ports("ringdown", without_ports=True)
     assert "joint micro-slip (Iwan) and Bouc-Wen hysteresis; declare a [[port]]" in remark
     assert "vector = [0, 0, 1] between the ground and 'end'" in remark
-    assert "drift" not in remark
-    static = example_campaign(chain, "static", 1, plan)
-    (remark,) = missing_port_remark(setting_of(static, bare), library())
-    assert "Coulomb" not in remark  # a port would not help: there is no motion
+
+
+def test_no_port_is_asked_for_where_it_would_not_help():
+    """In static trials there is no motion that friction could resist."""
+    (remark,) = remarks_on_ports("static", without_ports=True)
+    assert "Coulomb" not in remark
 
 
 # ---------------------------------------------------------------- remembered responses
@@ -200,27 +275,38 @@ MODEL = held_by_a_spring(stiffness=0.02, damping=0.2)
 BEGIN = {"first": 4.137, "second": 2.221}
 
 
-def pushed(model, factors, *items, slow=0.0):
+def pushed(model, factors, *laws, slow=0.0):
     """Two records of the mass under a force, one held out, its parameters at factors; noise that is slow."""
-    rng, time = np.random.default_rng(7), np.linspace(0.0, 8.0, 201)
+    generator = np.random.default_rng(7)
+    time = np.linspace(0.0, 8.0, 201)
     trials = []
     for name in BEGIN:
-        parts = [
-            rng.normal() * np.sin(2.0 * np.pi * f * time + rng.uniform(0, 6)) for f in (0.4, 0.9, 1.3, 1.7)
-        ]
-        given = {"load_place": "push", "begins": Start.STILL, "held_out": name == "second"}
-        force = 3.0 * np.sum(parts, axis=0)
-        trials.append(Trial.plain(name, TrialKind.FORCED, ("x",), time, force=force, **given))
+        tones = []
+        for frequency in (0.4, 0.9, 1.3, 1.7):
+            amplitude = generator.normal()
+            phase = generator.uniform(0, 6)
+            tones.append(amplitude * np.sin(2.0 * np.pi * frequency * time + phase))
+        trial = Trial.plain(
+            name,
+            TrialKind.FORCED,
+            ("x",),
+            time,
+            force=3.0 * np.sum(tones, axis=0),
+            load_place="push",
+            begins=Start.STILL,
+            held_out=name == "second",
+        )
+        trials.append(trial)
     channels = {"x": Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(NOISE, 500.0))}
     events = tuple(Event("bolt_loose", (name,), time=begin) for name, begin in BEGIN.items())
-    base = Campaign("a bolt", channels, tuple(trials), None, {}, "0" * 64, events=events)
-    for trial in base.trials:
+    campaign = Campaign("a bolt", channels, tuple(trials), None, {}, "0" * 64, events=events)
+    for trial in campaign.trials:
         conditions = Conditions(np.array(factors), refinement=4)
-        shown = observe(model, base, trial, ModelPatch(items), conditions).values
-        trial.values[:] = shown + NOISE * rng.standard_normal(shown.shape)
+        response = observe(model, campaign, trial, ModelPatch(laws), conditions).values
+        trial.values[:] = response + NOISE * generator.standard_normal(response.shape)
         if slow:
-            trial.values[:] += slow * NOISE * kit.coloured(rng, (0.9,), *shown.shape)
-    return base
+            trial.values[:] += slow * NOISE * kit.coloured(generator, (0.9,), *response.shape)
+    return campaign
 
 
 @pytest.fixture(scope="module")
@@ -229,46 +315,77 @@ def campaign():
     return pushed(MODEL, (1.01, 0.9), PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0, windows=windows))
 
 
-def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name():
-    """One channel under a recorded force shows the same of a load cell as of all parameters together."""
+@pytest.fixture(scope="module")
+def gain_or_parameters():
+    """The verdict on one channel under a recorded force, where a load cell may be wrong or all parameters."""
     model = held_by_a_spring(mass=0.004, stiffness=0.004, damping=0.004)
-    found = investigate(pushed(model, (1.05, 1.05, 1.0)), model, kit.chosen("load_cell"), thorough=False)
-    assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
-    assert found.verdict.effects == ()
-    assert "('mass' 11.0, 'stiffness' 1" in found.verdict.sentence
-    assert "with one channel, these data cannot distinguish the two" in found.verdict.sentence
+    campaign = pushed(model, (1.05, 1.05, 1.0))
+    return investigate(campaign, model, kit.chosen("load_cell"), thorough=False).verdict
 
 
-def test_a_law_beside_which_something_slow_is_left_is_named_in_part():
+def test_a_gain_that_only_keeps_parameters_near_their_priors_is_no_name(gain_or_parameters):
+    assert gain_or_parameters.kind is VerdictKind.UNEXPLAINED, gain_or_parameters.sentence
+    assert gain_or_parameters.effects == ()
+
+
+def test_parameters_far_from_their_priors_are_told_with_what_data_cannot_distinguish(gain_or_parameters):
+    assert "('mass' 11.0, 'stiffness' 1" in gain_or_parameters.sentence
+    assert "with one channel, these data cannot distinguish the two" in gain_or_parameters.sentence
+
+
+@pytest.fixture(scope="module")
+def friction_in_part():
+    """What is found where friction acts and something slow remains."""
     friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
     campaign = replace(pushed(MODEL, (1.01, 0.9), friction, slow=1.0), events=())
-    rivals = kit.chosen("coulomb_friction", "quadratic_damping")
-    result = investigate(campaign, MODEL, rivals, thorough=False)
-    found, closed = result.verdict, result.proof.closed
-    assert found.kind is VerdictKind.NAMED_IN_PART, found.sentence
-    (effect,) = found.effects
-    assert effect.identifier == "coulomb_friction"
+    competing = kit.chosen("coulomb_friction", "quadratic_damping")
+    return investigate(campaign, MODEL, competing, thorough=False)
+
+
+def test_a_law_beside_which_something_slow_is_left_is_named_in_part(friction_in_part):
+    verdict = friction_in_part.verdict
+    assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
+    assert [effect.identifier for effect in verdict.effects] == ["coulomb_friction"]
+
+
+def test_a_law_that_is_named_in_part_has_its_coefficient_and_less_than_the_whole_gap(friction_in_part):
+    (effect,) = friction_in_part.verdict.effects
     (law,) = effect.patch.primitives
+    closed = friction_in_part.proof.closed
     assert law.coefficient == pytest.approx(0.4, rel=0.1)
     assert 0.8 < closed.low < closed.value < 1.0
 
 
-def test_friction_that_begins_with_an_event_is_named_with_it(campaign):
-    """What cannot be switched, and campaigns without an event to fit, give no such effect."""
-    found = investigate(campaign, MODEL, [COULOMB], thorough=False).verdict
-    assert found.kind is VerdictKind.NAMED
-    (effect,) = found.effects
-    assert effect.identifier == "coulomb_friction_during_bolt_loose"
+@pytest.fixture(scope="module")
+def verdict_with_event(campaign):
+    return investigate(campaign, MODEL, [COULOMB], thorough=False).verdict
+
+
+def test_friction_that_begins_with_an_event_is_named_with_it(verdict_with_event):
+    assert verdict_with_event.kind is VerdictKind.NAMED
+    identifiers = [effect.identifier for effect in verdict_with_event.effects]
+    assert identifiers == ["coulomb_friction_during_bolt_loose"]
+
+
+def test_the_law_of_an_event_has_its_coefficient_and_its_beginnings(verdict_with_event):
+    (effect,) = verdict_with_event.effects
     (law,) = effect.patch.primitives
+    told = "acts from 4.137 s on in 'first'; from 2.221 s on in 'second'."
     assert law.coefficient == pytest.approx(0.4, rel=0.03)
     assert law.windows == (Window("first", 4.137), Window("second", 2.221))
-    assert found.sentence.endswith("acts from 4.137 s on in 'first'; from 2.221 s on in 'second'.")
+    assert verdict_with_event.sentence.endswith(told)
+
+
+@pytest.mark.parametrize("first_event", [1, 2], ids=["an event of a held-out trial alone", "no event"])
+def test_without_an_event_to_fit_no_effect_begins_with_one(campaign, first_event):
     setting = kit.problem_of(campaign, MODEL).setting
-    for events in ((), campaign.events[1:]):
-        assert (
-            variants_in_events(library(), replace(setting, campaign=replace(campaign, events=events))) == ()
-        )
-    names = {effect.identifier for effect in variants_in_events(library(), setting)}
+    fewer = replace(setting, campaign=replace(campaign, events=campaign.events[first_event:]))
+    assert variants_in_events(library(), fewer) == ()
+
+
+def test_what_can_be_switched_may_begin_with_an_event_and_nothing_else(campaign):
+    variants = variants_in_events(library(), kit.problem_of(campaign, MODEL).setting)
+    names = {effect.identifier for effect in variants}
     assert {"coulomb_friction_during_bolt_loose", "mains_hum_during_bolt_loose"} <= names
     assert not any(name.startswith(("clock_error", "point_mass", "high_pass")) for name in names)
 

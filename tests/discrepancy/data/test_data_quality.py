@@ -320,14 +320,17 @@ def test_what_tells_no_scale_and_no_sign_is_no_fault(campaign, seed):
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT, None])
 @pytest.mark.parametrize("pair", [("g0", "g1"), ("g1", "g2")])
 def test_swapped_channels(campaign, kind, pair):
+    """In the trials of one kind, or in all of them."""
+
     def swap(trial, values):
-        columns = [trial.channels.index(name) for name in pair]
-        values[:, columns] = values[:, columns[::-1]]
+        first, second = (trial.channels.index(name) for name in pair)
+        values[:, [first, second]] = values[:, [second, first]]
         return values
 
-    faults = check_against_model(shown(campaign, swap, *([kind] if kind else [])), CANTILEVER)
-    fault = next(fault for fault in faults if fault.kind is FaultKind.SWAPPED)
-    assert all(name in fault.sentence for name in pair)
+    kinds = [] if kind is None else [kind]
+    faults = check_against_model(shown(campaign, swap, *kinds), CANTILEVER)
+    swapped = next(fault for fault in faults if fault.kind is FaultKind.SWAPPED)
+    assert all(name in swapped.sentence for name in pair)
 
 
 @pytest.mark.parametrize(

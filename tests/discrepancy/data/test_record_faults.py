@@ -54,30 +54,40 @@ def test_a_channel_that_is_another_one(copy, how, digit):
     assert "(the trial 'ring 0', 0 to 7.995 s), and so in 1 more of its trials" in fault.sentence
 
 
-def test_what_moves_alike_is_no_copy():
-    def without_noise(values):
-        values[:, 0] = 20.0 * np.exp(-0.2 * TIME) * np.cos(21.0 * TIME)
-        values[:, 1] = -0.5 * values[:, 0]
+def oscillation_without_noise(values):
+    values[:, 0] = 20.0 * np.exp(-0.2 * TIME) * np.cos(21.0 * TIME)
+    values[:, 1] = -0.5 * values[:, 0]
 
-    def switched(values):
-        values[:, 0] = np.sign(np.cos(21.0 * TIME))
-        values[:, 1] = -0.5 * values[:, 0]
 
-    def warmed(values):
-        values[:, 0] = np.round(20.0 + TIME, 1)
-        values[:, 1] = np.round(18.0 + 1.1 * TIME, 1)
+def switched(values):
+    values[:, 0] = np.sign(np.cos(21.0 * TIME))
+    values[:, 1] = -0.5 * values[:, 0]
 
-    def stepped(values):
-        values[:, 0] = values[:, 1] = np.sign(np.cos(21.0 * TIME))
 
-    for change in (without_noise, switched, warmed, stepped):
-        assert FaultKind.COPIED not in {item.kind for item in check_data(campaign_of(change))}
+def warmed(values):
+    values[:, 0] = np.round(20.0 + TIME, 1)
+    values[:, 1] = np.round(18.0 + 1.1 * TIME, 1)
 
-    def same(values):
-        without_noise(values)
-        values[:, 1] = values[:, 0]
 
-    assert "digit for digit" in only(check_data(campaign_of(same)), FaultKind.COPIED).sentence
+def stepped(values):
+    values[:, 1] = np.sign(np.cos(21.0 * TIME))
+    values[:, 0] = values[:, 1]
+
+
+def copied_without_noise(values):
+    oscillation_without_noise(values)
+    values[:, 1] = values[:, 0]
+
+
+@pytest.mark.parametrize("change", [oscillation_without_noise, switched, warmed, stepped])
+def test_what_moves_alike_is_no_copy(change):
+    kinds = {fault.kind for fault in check_data(campaign_of(change))}
+    assert FaultKind.COPIED not in kinds
+
+
+def test_a_copy_without_noise_is_one():
+    fault = only(check_data(campaign_of(copied_without_noise)), FaultKind.COPIED)
+    assert "digit for digit" in fault.sentence
 
 
 # ---------------------------------------------------------------- units

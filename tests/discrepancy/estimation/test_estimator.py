@@ -68,17 +68,27 @@ def test_a_named_law_is_estimated_if_a_free_shape_of_its_family_leads(friction, 
     assert best.speed_window is not None
 
 
-def test_an_effect_that_only_a_set_found_is_estimated_alone(tmp_path):
-    problem = blind(tmp_path, PLAY, seed=82)
+@pytest.fixture(scope="module")
+def play(tmp_path_factory):
+    """A search for free play, and its hypotheses along a motion that is taken as known."""
+    problem = blind(tmp_path_factory.mktemp("play"), PLAY, seed=82)
     effects = chosen("free_play", "cubic_stiffness", "logger_clock")
     search = ForceSearch(problem)
     followed = search.rank_hypotheses(effects)
-    assert len(followed[0].candidate.terms) > 1  # along a motion taken as known
     best, *_ = refine_hypotheses(search, followed, len(effects))
+    return followed, best, best.candidate.terms[0].patch(problem.setting, best.effect)
+
+
+def test_an_effect_that_only_a_set_found_is_estimated_alone(play):
+    followed, best, _ = play
+    assert len(followed[0].candidate.terms) > 1
     assert best.candidate.identifiers == ("free_play",)
-    (play,) = best.candidate.terms[0].patch(problem.setting, best.effect)
-    assert play.half_width == pytest.approx(6.708e-3, rel=0.01)
-    assert play.stiffness == pytest.approx(644.6, rel=0.02)
+
+
+def test_an_effect_that_only_a_set_found_has_its_values(play):
+    _, _, (law,) = play
+    assert law.half_width == pytest.approx(6.708e-3, rel=0.01)
+    assert law.stiffness == pytest.approx(644.6, rel=0.02)
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -36,17 +36,29 @@ def assert_values_of_the_truth(search: ForceSearch, hypothesis: ForceHypothesis)
     np.testing.assert_allclose(hypothesis.shared, TRUE_UNKNOWNS, atol=0.08)
 
 
-def test_values_are_true_though_the_search_is_linear_about_others(search: ForceSearch) -> None:
+@pytest.fixture(scope="module")
+def estimated(search: ForceSearch) -> ForceHypothesis:
+    """Return the estimate of dry friction, from a fit along the motion of the missing force."""
     (effect,) = chosen("coulomb_friction")
     candidate = Candidate((EffectTerm(effect, "slide"),))
     along = search.fit_along_motion(search.hypothesis_of_all_ports, candidate, np.array([2.0]))
     assert along is not None
-    # without friction the mass and the damping come out wrong, and the trials are linear about that
+    hypothesis = estimate_hypothesis(search, along)
+    assert hypothesis is not None
+    return hypothesis
+
+
+def test_values_are_true_though_the_search_is_linear_about_others(
+    search: ForceSearch, estimated: ForceHypothesis
+) -> None:
+    """Without friction the mass and the damping come out wrong, and the trials are linear about that."""
     assert np.abs(search.point.shared - TRUE_UNKNOWNS).max() > 0.5
-    estimated = estimate_hypothesis(search, along)
-    assert estimated is not None
     assert_values_of_the_truth(search, estimated)
-    assert np.all(np.abs(estimated.linear_trials.trials[0].linearisation_point[:2] - estimated.shared) < 0.1)
+
+
+def test_the_trials_of_an_estimate_are_linear_about_its_own_values(estimated: ForceHypothesis) -> None:
+    about = estimated.linear_trials.trials[0].linearisation_point[:2]
+    assert np.all(np.abs(about - estimated.shared) < 0.1)
 
 
 def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -> None:
@@ -63,16 +75,22 @@ def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -
     )
 
 
-def test_long_records_are_ranked_in_thinned_ones_and_estimated_in_all_samples(
-    search: ForceSearch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def records_count_as_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ranking, "MOST_SAMPLES_OF_FIRST_ROUND", 400)
+
+
+@pytest.mark.usefixtures("records_count_as_long")
+def test_long_records_are_thinned_for_the_ranking(search: ForceSearch) -> None:
     thinned = ranking.search_in_thinned_records(search)
     assert thinned is not None
     assert [trial.stride for trial in thinned.hypothesis_of_all_ports.linear_trials.trials] == [3, 3]
-    effects = chosen("coulomb_friction", "quadratic_damping")
-    best, *others = ranking.rank_by_missing_force(search, effects)
-    assert best.candidate.identifiers == ("coulomb_friction",)
-    for hypothesis in (best, *others):
+
+
+@pytest.mark.usefixtures("records_count_as_long")
+def test_hypotheses_of_long_records_are_estimated_in_all_samples(search: ForceSearch) -> None:
+    hypotheses = ranking.rank_by_missing_force(search, chosen("coulomb_friction", "quadratic_damping"))
+    assert hypotheses[0].candidate.identifiers == ("coulomb_friction",)
+    for hypothesis in hypotheses:
         assert {trial.stride for trial in hypothesis.linear_trials.trials} == {1}
-    assert_values_of_the_truth(search, best)
+    assert_values_of_the_truth(search, hypotheses[0])

@@ -35,33 +35,64 @@ def detectability_of_loss(campaign, beam_model):
     return row, told
 
 
-@pytest.mark.parametrize(("gain_deviation", "noise_factor"), [(0.005, 100.0), (0.02, 45.0)])
-def test_with_the_forecast_noise_the_effect_is_just_seen(gain_deviation, noise_factor, beam_model):
-    """Also where stated gains hide a part of it, so that half the noise is not four times the distance."""
-    campaign = simulated(beam_model, "static", 3)
+NOISE_AND_GAINS = pytest.mark.parametrize(("gain_deviation", "noise_factor"), [(0.005, 100.0), (0.02, 45.0)])
+"""Also where stated gains hide a part of the effect: half the noise is not four times the distance."""
+
+
+@pytest.fixture(scope="module")
+def campaign(beam_model):
+    return simulated(beam_model, "static", 3)
+
+
+@NOISE_AND_GAINS
+def test_the_noise_with_which_an_effect_would_be_seen_is_told(
+    gain_deviation, noise_factor, campaign, beam_model
+):
     noisy = with_noise_and_gains(campaign, noise_factor, gain_deviation)
     row, (told,) = detectability_of_loss(noisy, beam_model)
     assert row.distance < DETECTION_DISTANCE
     assert row.noise_factor >= sqrt(DETECTION_DISTANCE / row.distance)
     assert f"with noise {row.noise_factor:.2g} times smaller" in told
+
+
+@NOISE_AND_GAINS
+def test_with_the_forecast_noise_the_effect_is_just_seen(gain_deviation, noise_factor, campaign, beam_model):
+    noisy = with_noise_and_gains(campaign, noise_factor, gain_deviation)
+    row, _ = detectability_of_loss(noisy, beam_model)
     forecast = with_noise_and_gains(campaign, noise_factor / row.noise_factor, gain_deviation)
-    seen, _ = detectability_of_loss(forecast, beam_model)
+    row_of_forecast, _ = detectability_of_loss(forecast, beam_model)
     # with less noise the distance is that of a smaller change, and the loss is not quite linear
-    assert seen.distance == pytest.approx(DETECTION_DISTANCE, rel=0.1)
+    assert row_of_forecast.distance == pytest.approx(DETECTION_DISTANCE, rel=0.1)
 
 
-def test_where_stated_gains_hide_an_effect_less_noise_is_not_promised(beam_model):
-    campaign = simulated(beam_model, "static", 3)
-    row, (told,) = detectability_of_loss(with_noise_and_gains(campaign, 1.0, 0.12), beam_model)
+HIDING_GAIN = 0.12
+"""A standard deviation of stated gains in which the loss hides."""
+
+
+@pytest.fixture(scope="module")
+def hidden_by_gains(campaign, beam_model):
+    """The detectability of a loss that hides in stated gains, and the sentence about it."""
+    row, (told,) = detectability_of_loss(with_noise_and_gains(campaign, 1.0, HIDING_GAIN), beam_model)
+    return row, told
+
+
+def test_where_stated_gains_hide_an_effect_less_noise_is_not_promised(hidden_by_gains):
+    row, told = hidden_by_gains
     assert isinf(row.noise_factor)
     assert "less noise or more trials would not help" in told
     assert "times smaller" not in told
+
+
+def test_the_gains_that_hide_an_effect_are_told(hidden_by_gains):
+    row, told = hidden_by_gains
     assert any(name.startswith("the gain of g3 (stated to 12 %)") for name in row.imitated_by)
     assert all(name in told for name in row.imitated_by)
-    quiet = with_noise_and_gains(campaign, 1.0 / LARGEST_NOISE_FACTOR, 0.12)
-    assert detectability_of_loss(quiet, beam_model)[0].distance < DETECTION_DISTANCE
-    # what the sentence asks for helps
+
+
+def test_an_effect_that_gains_hide_shows_with_closer_gains_and_not_with_less_noise(campaign, beam_model):
+    quiet = with_noise_and_gains(campaign, 1.0 / LARGEST_NOISE_FACTOR, HIDING_GAIN)
     calibrated = with_noise_and_gains(campaign, 1.0, 0.005)
+    assert detectability_of_loss(quiet, beam_model)[0].distance < DETECTION_DISTANCE
     assert detectability_of_loss(calibrated, beam_model)[0].distance > DETECTION_DISTANCE
 
 

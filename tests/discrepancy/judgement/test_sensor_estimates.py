@@ -45,27 +45,46 @@ def wide_gain(beam_model):
     return investigate(campaign, beam_model, chosen("load_cell", "region_stiffness_loss"), seed=3)
 
 
-def test_the_deviations_are_those_of_all_unknowns_together():
-    """Inverted at once, the normal equations give the same deviations as with the trials eliminated."""
+@pytest.fixture(scope="module")
+def fitted_sensors():
+    """A fit with uncertain gains and zeros, of the closed form."""
     problem = kit.closed_problem(seed=1, gain_deviation=0.02)
-    fitted = kit.fitted(problem)
+    return problem, kit.fitted(problem)
+
+
+def deviations_from_normal_equations(problem, fitted):
+    """Return the standard deviations of gains and zeros, by channel and trial, inverted at once."""
     equations = normal_equations(problem, fitted, fitted.candidate, np.ones(len(problem.channel_names)))
     deviations = np.sqrt(np.diag(np.linalg.inv(equations.matrix)))
-    first = problem.shared.unknown_count
-    wanted = {}
+    by_name = {}
     for index, channel in enumerate(problem.shared.gain_channels, start=problem.shared.parameter_count):
-        wanted[channel, ""] = problem.shared.scale[index] * deviations[index]
+        by_name[channel, ""] = problem.shared.scale[index] * deviations[index]
+    first = problem.shared.unknown_count
     for data in problem.trials:
         for index, column in enumerate(data.unknowns.zero_columns):
             name = data.trial.channels[column], data.trial.name
-            wanted[name] = data.unknowns.scale[index] * deviations[first + index]
+            by_name[name] = data.unknowns.scale[index] * deviations[first + index]
         first += data.unknowns.unknown_count
-    estimates = {(item.channel, item.trial): item for item in sensor_estimates(problem, fitted)}
-    assert estimates.keys() == wanted.keys()
+    return by_name
+
+
+def test_the_deviations_are_those_of_all_unknowns_together(fitted_sensors):
+    """Inverted at once, the normal equations give the same deviations as with the trials eliminated."""
+    exact = deviations_from_normal_equations(*fitted_sensors)
+    estimates = {(item.channel, item.trial): item for item in sensor_estimates(*fitted_sensors)}
+    assert estimates.keys() == exact.keys()
     for name, estimate in estimates.items():
-        assert estimate.deviation == pytest.approx(wanted[name], rel=1e-6)
+        assert estimate.deviation == pytest.approx(exact[name], rel=1e-6)
+
+
+def test_an_estimate_tells_its_distance_from_the_stated_value_in_deviations(fitted_sensors):
+    for estimate in sensor_estimates(*fitted_sensors):
         assert estimate.deviations == pytest.approx(estimate.value / estimate.stated_deviation)
-        assert (estimate.kind is SensorValue.GAIN) == (name[1] == "")
+
+
+def test_a_gain_is_of_all_trials_and_a_zero_of_one(fitted_sensors):
+    for estimate in sensor_estimates(*fitted_sensors):
+        assert (estimate.kind is SensorValue.GAIN) == (estimate.trial == "")
 
 
 def test_a_zero_that_was_not_stated_has_no_distance():
@@ -77,28 +96,45 @@ def test_a_zero_that_was_not_stated_has_no_distance():
     assert row[4:] == ["not stated", ""]
 
 
-def test_a_fitted_gain_is_shown_in_the_output_the_file_and_the_page(wide_gain, tmp_path):
-    verdict = wide_gain.verdict
-    gains = {item.channel: item for item in verdict.sensors if item.kind is SensorValue.GAIN}
-    assert gains.keys() == set(wide_gain.campaign.channels)
+def gains_of(verdict):
+    """Return the estimates of gains, by channel."""
+    return {item.channel: item for item in verdict.sensors if item.kind is SensorValue.GAIN}
+
+
+def printed_gain(content, channel):
+    """Return the row of a gain in the printed table."""
+    (table,) = [item for item in verdict_lines(content) if isinstance(item, Table)]
+    (row,) = [row for row in table.rows if list(row[:2]) == [channel, "gain error"]]
+    return row
+
+
+def test_a_gain_error_is_estimated(wide_gain):
+    gains = gains_of(wide_gain.verdict)
     estimate = gains["g2"]
     own_deviation = 0.005  # of the simulated gauge, before the gain is hidden
+    assert gains.keys() == set(wide_gain.campaign.channels)
     assert abs(estimate.value - GAIN) < 3.0 * hypot(estimate.deviation, own_deviation)
     assert estimate.deviation < 0.005
-    # printed
+
+
+def test_a_fitted_gain_is_printed(wide_gain):
+    estimate = gains_of(wide_gain.verdict)["g2"]
+    _, _, fitted, unit, stated, deviations = printed_gain(ReportInput(wide_gain, ORIGIN), "g2")
+    assert [unit, stated] == ["%", "0 ± 5"]
+    assert float(fitted.split(" ± ")[0]) == pytest.approx(100.0 * estimate.value, abs=0.1)
+    assert float(deviations) == pytest.approx(estimate.deviations, abs=0.06)
+
+
+def test_fitted_gains_are_in_the_file(wide_gain, tmp_path):
+    path = write_verdict(tmp_path / "verdict.json", wide_gain.verdict, None, ORIGIN)
+    assert read_verdict_file(path).verdict.sensors == wide_gain.verdict.sensors
+
+
+def test_a_fitted_gain_is_on_the_page(wide_gain):
     content = ReportInput(wide_gain, ORIGIN)
-    (printed,) = [item for item in verdict_lines(content) if isinstance(item, Table)]
-    (row,) = [row for row in printed.rows if list(row[:2]) == ["g2", "gain error"]]
-    assert row[3:5] == ["%", "0 ± 5"]
-    assert float(row[2].split(" ± ")[0]) == pytest.approx(100.0 * estimate.value, abs=0.1)
-    assert float(row[5]) == pytest.approx(estimate.deviations, abs=0.06)
-    # in the file
-    path = write_verdict(tmp_path / "verdict.json", verdict, None, ORIGIN)
-    assert read_verdict_file(path).verdict.sensors == verdict.sensors
-    # on the page
     page = render_report(content, {}, {})
     assert "Gains and zeros of the channels" in page
-    assert row[2] in page
+    assert printed_gain(content, "g2")[2] in page
 
 
 def test_a_gain_that_was_not_stated_is_shown_itself():
@@ -119,30 +155,46 @@ def test_of_many_channels_the_farthest_are_printed():
     assert [row[0] for row in printed.rows] == names[-MOST_PRINTED_SENSORS:]
 
 
-def test_nothing_missing_says_which_gain_an_error_may_hide_in(beam_model):
-    """A stiffness loss of 20 % hides in gains that are stated to 12 %."""
-    hidden = ("region_stiffness_loss", {"loss": 0.2}, "z2")
-    campaign = with_stated_gains(simulated(beam_model, "static", 3, hidden), 0.12)
-    verdict = investigate(campaign, beam_model, library(), seed=3).verdict
-    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
-    moved = {unknown.name: unknown for unknown in verdict.moved_within_prior}
+@pytest.fixture(scope="module")
+def hidden_in_gains(beam_model):
+    """The verdict on a stiffness loss of 20 % that hides in gains that are stated to 12 %."""
+    loss = ("region_stiffness_loss", {"loss": 0.2}, "z2")
+    campaign = with_stated_gains(simulated(beam_model, "static", 3, loss), 0.12)
+    return investigate(campaign, beam_model, library(), seed=3).verdict
+
+
+def test_gains_that_moved_within_their_priors_are_told(hidden_in_gains):
+    moved = {unknown.name: unknown for unknown in hidden_in_gains.moved_within_prior}
+    assert hidden_in_gains.kind is VerdictKind.NOTHING_MISSING, hidden_in_gains.sentence
     assert "gain of g3" in moved
     assert all(1.0 <= abs(unknown.deviations) <= 2.0 for unknown in moved.values())
-    assert (
-        f"the gain of g3 by {100.0 * moved['gain of g3'].value:+.3g} % (stated to 12 %;" in verdict.sentence
-    )
-    assert "an error of the model of this size would not show" in verdict.sentence
-    assert "gain of g3 moved by" in verdict_card(verdict)
 
 
-def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(beam_model):
-    verdict = investigate(simulated(beam_model, "static", 3), beam_model, chosen("load_cell"), seed=3).verdict
-    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
-    farthest = verdict.moved[0]
-    assert abs(farthest.deviations) > 2.0
-    assert f"{abs(farthest.deviations):.1f} deviations)" in verdict.sentence
-    assert "where an error of the model may hide" in verdict.sentence
-    assert farthest.name in verdict_card(verdict)
+def test_nothing_missing_says_which_gain_an_error_may_hide_in(hidden_in_gains):
+    moved = {unknown.name: unknown for unknown in hidden_in_gains.moved_within_prior}
+    percent = 100.0 * moved["gain of g3"].value
+    assert f"the gain of g3 by {percent:+.3g} % (stated to 12 %;" in hidden_in_gains.sentence
+    assert "an error of the model of this size would not show" in hidden_in_gains.sentence
+    assert "gain of g3 moved by" in verdict_card(hidden_in_gains)
+
+
+@pytest.fixture(scope="module")
+def gain_far_from_stated(beam_model):
+    """The verdict on a campaign without an effect, one of whose drawn gains is far from what is stated."""
+    campaign = simulated(beam_model, "static", 3)
+    return investigate(campaign, beam_model, chosen("load_cell"), seed=3).verdict
+
+
+def test_a_gain_far_from_what_is_stated_is_no_effect(gain_far_from_stated):
+    assert gain_far_from_stated.kind is VerdictKind.NOTHING_MISSING, gain_far_from_stated.sentence
+    assert abs(gain_far_from_stated.moved[0].deviations) > 2.0
+
+
+def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(gain_far_from_stated):
+    farthest = gain_far_from_stated.moved[0]
+    assert f"{abs(farthest.deviations):.1f} deviations)" in gain_far_from_stated.sentence
+    assert "where an error of the model may hide" in gain_far_from_stated.sentence
+    assert farthest.name in verdict_card(gain_far_from_stated)
 
 
 def test_a_moved_zero_has_the_unit_of_the_report():

@@ -174,30 +174,44 @@ def states(filtered):
     return record.filter_before(which, 0, begin, np.arange(1, len(which) + 1))
 
 
-def test_states_and_noise_by_closed_forms():
-    """Backwards a force of a long correlation would grow by e^1000 within a step, and stays finite."""
+def test_a_force_of_a_long_correlation_stays_finite():
+    """Backwards it would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
     filtered = ForceFilter(trial, [(0, Process(1.0, 1e-3))])
+    smoothed = filtered.smooth(trial.residual)
     assert np.isfinite(evidence(filtered))
-    assert np.all(np.isfinite(filtered.smooth(trial.residual)[1]))
-    # a pushed state
+    assert np.all(np.isfinite(smoothed.forces))
+
+
+def test_a_pushed_state_follows_its_closed_form():
+    """Also of a trial that begins at rest under the push, whose state stays where it is."""
     trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
-    generator, push = trial.system.generator, -trial.system.actions[0]
-    wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
-    np.testing.assert_allclose(trial.state_under_force(0, np.ones(len(wanted))), wanted, atol=1e-12)
-    still = replace(trial, begins_at_rest=True).state_under_force(0, np.ones(len(wanted)))
-    np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
-    # noise of a deviation of one, part of it coloured
+    generator = trial.system.generator
+    push = -trial.system.actions[0]
+    exact = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
+    constant_force = np.ones(len(exact))
+    from_zero = trial.state_under_force(0, constant_force)
+    from_rest = replace(trial, begins_at_rest=True).state_under_force(0, constant_force)
+    np.testing.assert_allclose(from_zero, exact, atol=1e-12)
+    np.testing.assert_allclose(from_rest - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
+
+
+def test_simulated_noise_has_its_deviation_and_its_correlation():
+    """A deviation of one, part of it coloured."""
     count = 5000
-    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=(ColouredNoise(0, 0.4, 12.0),))
-    made = _simulated_noise(told)
-    np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
-    assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
-    # noise of first order is taken apart
+    colour = ColouredNoise(0, 0.4, 12.0)
+    noise = _simulated_noise(trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=(colour,)))
+    covariance_of_neighbours = noise[1:, 0] @ noise[:-1, 0] / count
+    np.testing.assert_allclose(noise.std(axis=0), 1.0, rtol=0.1)
+    assert covariance_of_neighbours == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
+
+
+def test_noise_of_first_order_is_taken_apart():
+    """At the sampling interval of its model, and at no other."""
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
-    assert correlated_noise_part(1, noise, 0.01) == (
-        1, pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
-    )  # fmt: skip
+    correlated = correlated_noise_part(1, noise, 0.01)
+    assert (correlated.channel, correlated.share) == (1, pytest.approx(1.0 - 1e-3, abs=2e-3))
+    assert correlated.decay_rate == pytest.approx(-np.log(0.9) / 0.01, rel=1e-6)
     assert correlated_noise_part(1, noise, 0.02) is None
 
 
@@ -280,31 +294,49 @@ def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(
         assert found == pytest.approx(wanted, abs=1e-7)
 
 
+def event_case(folder, kind, seed):
+    """Return a drawn case in which something acts for a while."""
+    return drawn(folder / kind, kind, (1, seed, KINDS.index(kind)))
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
-        ("power", 9), ("leak", 5), ("tank", 3), ("push", 9), ("push", 8), ("friction", 2), ("always", 0),
+        ("power", 9),
+        ("leak", 5),
+        ("tank", 3),
+        ("push", 9),
+        ("push", 8),
+        ("friction", 2),
+        ("always", 0),
         ("nothing", 2),
     ],
-)  # fmt: skip
+)
 def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
-    case = drawn(tmp_path / kind, kind, (1, seed, KINDS.index(kind)))
-    found = found_in(case)
-    counts = counted(case, found)
-    assert counts["close"] == counts["moments"] == 2 * len(case.windows) == len(found)
-    for true, (_, low, high) in zip(np.ravel(case.windows), found, strict=True):
-        wide = high - low  # an interval of 90 % three times as wide fails in one of a million cases
-        assert low - wide < true < high + wide
-    if (kind, seed) != ("leak", 5):
-        return
+    case = event_case(tmp_path, kind, seed)
+    moments = found_in(case)
+    counts = counted(case, moments)
+    assert counts["close"] == counts["moments"] == 2 * len(case.windows) == len(moments)
+    for true, (_, low, high) in zip(np.ravel(case.windows), moments, strict=True):
+        width = high - low  # an interval of 90 % three times as wide fails in one of a million cases
+        assert low - width < true < high + width
+
+
+def test_a_verdict_has_the_windows_in_which_something_acts(tmp_path):
+    case = event_case(tmp_path, "leak", 5)
     problem = problem_of(case)
     verdict = investigate(problem.campaign, problem.model, FEW).verdict
-    told = [window for window in verdict.windows if not window.with_effect]
-    for window, moments in zip(told, case.windows, strict=True):
-        assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=0.01 * case.length)
-        assert window.channels == ("block",)
-        assert window.size > 3.0
-    assert gap_times_sentence(told) in verdict.sentence
+    windows = [window for window in verdict.windows if not window.with_effect]
+    assert gap_times_sentence(windows) in verdict.sentence
+    for window, moments in zip(windows, case.windows, strict=True):
+        assert_window_is_at(window, moments, 0.01 * case.length)
+
+
+def assert_window_is_at(window, moments, tolerance):
+    """Check begin and end [s] of a window in which the block is off by more than three noises."""
+    assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=tolerance)
+    assert window.channels == ("block",)
+    assert window.size > 3.0
 
 
 def test_a_window_whose_readings_are_all_missing_is_drawn():
@@ -317,44 +349,87 @@ def test_a_window_whose_readings_are_all_missing_is_drawn():
     assert len(figure.axes[0].collections) >= len(windows)
 
 
+def moment_at(value: float) -> Moment:
+    return Moment(value, value, value)
+
+
 def test_a_window_without_a_reading_is_none():
     fitted = Bench(count=300).fit(np.random.default_rng(4))
     trial = fitted.trials[0].trial
     first, second, third = (float(time) for time in trial.time[100:103])
-    between = (Moment(value, value, value) for value in (first + 0.1 * (second - first), second - 1e-9))
-    around = (Moment(value, value, value) for value in (first, third))
-    ends = {"first": float(trial.time[0]), "last": float(trial.time[-1]), "size": 1.0}
-    windows = [GapWindow(trial.name, trial.channels, *moments, **ends) for moments in (between, around)]
-    (window,) = add_window_sizes(windows, fitted, fitted)
-    assert window.begin.value == first
-    assert window.size > 0.0
+
+    def window(begin: float, end: float) -> GapWindow:
+        begin_and_end = moment_at(begin), moment_at(end)
+        record = {"first": float(trial.time[0]), "last": float(trial.time[-1])}
+        return GapWindow(trial.name, trial.channels, *begin_and_end, **record, size=1.0)
+
+    between_readings = window(first + 0.1 * (second - first), second - 1e-9)
+    around_a_reading = window(first, third)
+    (weighed,) = add_window_sizes([between_readings, around_a_reading], fitted, fitted)
+    assert weighed.begin.value == first
+    assert weighed.size > 0.0
 
 
-def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
-    """Where none can be weighed (the filter breaks down beside millions of noises), it is told as a whole."""
+@pytest.fixture(scope="module")
+def fitted_beside_event():
+    """A fit of a campaign where g2 of the second release is off by eight noises from 1.2 s to 2 s."""
     event = np.zeros((300, 4))
-    event[120:200, 1] = 16.0  # eight noises, from 1.2 s to 2 s
-    fitted = Bench(count=300).fit(np.random.default_rng(4), extra={1: event})
-    (window,) = windows_of_residuals(fitted)
-    assert (window.trial, window.channels) == ("release 2", ("g2",))
-    assert window.begin.low - 0.01 <= 1.2 <= window.begin.high + 0.01
-    assert window.end.low - 0.01 <= 2.0 <= window.end.high + 0.01
-    assert window.size == pytest.approx(8.0, rel=0.1)
-    assert windows_of_residuals(fitted) == (window,)
-    assert has_gap_beginning_inside((window,))
-    assert gap_times_sentence((window,)).startswith("The gap is there in 'release 2' since 1.")
-    (axis, *_) = time_line_figure((window,)).axes
+    event[120:200, 1] = 16.0
+    return Bench(count=300).fit(np.random.default_rng(4), extra={1: event})
+
+
+@pytest.fixture(scope="module")
+def event_window(fitted_beside_event):
+    """The only window that is found beside it."""
+    (window,) = windows_of_residuals(fitted_beside_event)
+    return window
+
+
+def test_a_window_of_a_campaign_has_trial_channel_and_size(event_window):
+    assert (event_window.trial, event_window.channels) == ("release 2", ("g2",))
+    assert event_window.size == pytest.approx(8.0, rel=0.1)
+
+
+def test_a_window_of_a_campaign_has_its_moments_with_intervals(event_window):
+    assert event_window.begin.low - 0.01 <= 1.2 <= event_window.begin.high + 0.01
+    assert event_window.end.low - 0.01 <= 2.0 <= event_window.end.high + 0.01
+
+
+def test_windows_repeat(fitted_beside_event, event_window):
+    assert windows_of_residuals(fitted_beside_event) == (event_window,)
+
+
+def test_a_window_of_a_campaign_is_told(event_window):
+    assert has_gap_beginning_inside((event_window,))
+    assert gap_times_sentence((event_window,)).startswith("The gap is there in 'release 2' since 1.")
+
+
+def test_a_window_of_a_campaign_is_drawn(event_window):
+    (axis, *_) = time_line_figure((event_window,)).axes
     assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
-    assert windows_of_residuals(Bench(count=300).fit(np.random.default_rng(4))) == ()
-    once = [replace(item, trial=replace(item.trial, time=0.0 * item.trial.time)) for item in fitted.trials]
-    assert windows_of_residuals(replace(fitted, trials=once)) == ()
     assert time_line_figure(()) is None
+
+
+def test_without_an_event_there_is_no_window():
+    assert windows_of_residuals(Bench(count=300).fit(np.random.default_rng(4))) == ()
+
+
+def test_trials_without_a_course_of_time_have_no_window(fitted_beside_event):
+    at_one_time = [
+        replace(item, trial=replace(item.trial, time=0.0 * item.trial.time))
+        for item in fitted_beside_event.trials
+    ]
+    assert windows_of_residuals(replace(fitted_beside_event, trials=at_one_time)) == ()
+
+
+def test_where_no_window_can_be_weighed_the_gap_is_told_as_a_whole(fitted_beside_event, monkeypatch):
+    """The filter breaks down beside millions of noises."""
 
     def broken(*_):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     monkeypatch.setattr("discrepancy.missing_force.windows.find_events", broken)
-    (window,) = windows_of_residuals(fitted)
+    (window,) = windows_of_residuals(fitted_beside_event)
     assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
     assert window.size > 1.0
     assert gap_times_sentence((window,)) == "The gap is there throughout the records."

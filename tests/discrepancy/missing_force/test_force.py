@@ -2,7 +2,9 @@
 
 import shutil
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
+from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
 from discrepancy.missing_force.port_force import explained_variance, missing_force
@@ -35,6 +38,7 @@ from discrepancy.system.response import Conditions
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
+from tests.costs import once
 from tests.discrepancy.core.kit import fitted, problem_of
 from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
 from tests.refusals import Inputs
@@ -92,7 +96,7 @@ def blind(folder, number, seed=1, samples=64):
     return read(folder)
 
 
-@pytest.mark.parametrize(
+LAWS_OF_RIGS = pytest.mark.parametrize(
     ("number", "effect", "port"),
     [
         (CART_IN_AIR, "quadratic_damping", "rail"),
@@ -100,29 +104,61 @@ def blind(folder, number, seed=1, samples=64):
         (STORES, "outflow", "lower outlet"),
     ],
 )
-def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypatch, number, effect, port):
-    monkeypatch.setattr(
-        "discrepancy.missing_force.naming.FOLLOWED_COUNTS", (FOLLOWED_COUNTS[0],)
-    )  # each law alone
-    problem = blind(tmp_path, number)
-    search = ForceSearch(problem)
-    assert (
-        max(search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence) == port
-    )
-    ranked = [item for item in search.rank_hypotheses(available(problem)) if item.candidate.terms]
-    (term,) = ranked[0].candidate.terms
+
+
+@dataclass(frozen=True)
+class RankedLaws:
+    """The search for the missing force of a rig, and the laws that may explain it, the best one first."""
+
+    search: ForceSearch
+    laws: list[ForceHypothesis]
+
+
+@once
+def ranked_laws(number):
+    """Return the ranking of a rig, each law alone, made once for all tests that ask about it."""
+    with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
+        patch.setattr("discrepancy.missing_force.naming.FOLLOWED_COUNTS", (FOLLOWED_COUNTS[0],))
+        problem = blind(Path(folder), number)
+        search = ForceSearch(problem)
+        hypotheses = search.rank_hypotheses(available(problem))
+    return RankedLaws(search, [item for item in hypotheses if item.candidate.terms])
+
+
+@LAWS_OF_RIGS
+def test_a_force_is_most_probable_at_the_port_where_it_acts(number, effect, port):
+    by_port = ranked_laws(number).search.hypothesis_by_port
+    assert max(by_port, key=lambda name: by_port[name].log_evidence) == port
+
+
+@LAWS_OF_RIGS
+def test_the_law_of_the_missing_force_is_ahead_of_all_others(number, effect, port):
+    """Of those of other families, and of a force that follows no law."""
+    ranked = ranked_laws(number)
+    best = ranked.laws[0]
+    (term,) = best.candidate.terms
+    others = [item for item in ranked.laws if item.candidate.terms[0].effect.family != term.effect.family]
     assert (term.effect.identifier, term.place) == (effect, port)
-    families = {ranked[0].candidate.terms[0].effect.family}
-    second = next(item for item in ranked if item.candidate.terms[0].effect.family not in families)
-    assert ranked[0].log_evidence > second.log_evidence + 10.0
-    assert ranked[0].log_evidence > search.hypothesis_of_all_ports.log_evidence + 10.0
-    # its values are where a fit that begins there stays
-    again = search.fit_along_motion(ranked[0], ranked[0].candidate, ranked[0].effect)
-    deviations = np.sqrt(np.diag(ranked[0].effect_covariance))
-    np.testing.assert_allclose((again.effect - ranked[0].effect) / deviations, 0.0, atol=0.4)
-    share = ForceShares(search).gap_share(ranked[0], held_out=False)
+    assert best.log_evidence > others[0].log_evidence + 10.0
+    assert best.log_evidence > ranked.search.hypothesis_of_all_ports.log_evidence + 10.0
+
+
+@LAWS_OF_RIGS
+def test_a_fit_that_begins_at_the_values_of_the_best_law_stays_there(number, effect, port):
+    ranked = ranked_laws(number)
+    best = ranked.laws[0]
+    again = ranked.search.fit_along_motion(best, best.candidate, best.effect)
+    deviations = np.sqrt(np.diag(best.effect_covariance))
+    np.testing.assert_allclose((again.effect - best.effect) / deviations, 0.0, atol=0.4)
+
+
+@LAWS_OF_RIGS
+def test_the_best_law_is_most_of_the_gap(number, effect, port):
+    ranked = ranked_laws(number)
+    share = ForceShares(ranked.search).gap_share(ranked.laws[0], held_out=False)
+    low, high = share.interval
     assert share.value > 0.85
-    assert share.interval[0] <= share.value <= share.interval[1]
+    assert low <= share.value <= high
 
 
 @pytest.mark.parametrize(("number", "effect"), [(PLAY, "free_play"), (SHAKEN, "quadratic_damping")])
@@ -163,38 +199,81 @@ def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
     assert twice.startswith(f"In SI units: {family}, force ")
 
 
-def test_a_report_opens_with_the_missing_force(tmp_path):
-    blind(tmp_path, CART, samples=96)
-    found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml", FEW)
-    missing = found.missing
+@pytest.fixture(scope="module")
+def friction_on_rail(tmp_path_factory):
+    """What is found of a cart on a rail with dry friction."""
+    folder = tmp_path_factory.mktemp("cart")
+    blind(folder, CART, samples=96)
+    return investigate(folder / "campaign", folder / "campaign" / "model.toml", FEW)
+
+
+def test_the_missing_force_is_found_at_its_port_with_its_law(friction_on_rail):
+    missing = friction_on_rail.missing
     assert missing.at_port.port == "rail"
     assert missing.law == "Coulomb friction"
     assert share_of(missing) > 0.9
-    for item in missing.courses:  # a step: its size hardly varies where the cart moves
-        moving = np.abs(item.speed) > 0.2
-        sizes = np.abs(item.force[moving])
-        assert np.std(sizes) < 0.2 * np.mean(sizes)
-        assert np.all(np.sign(item.force[moving]) == np.sign(item.speed[moving]))
-        assert np.all(item.deviation > 0.0)
-    told = found.verdict.force  # as the file of the verdict has it
-    assert (told.port, told.unit, told.law, told.ordered_by) == ("rail", "N", missing.law, ("velocity",))
-    force, speed = (np.concatenate([getattr(c, key) for c in missing.courses]) for key in ("force", "speed"))
+
+
+def test_the_course_of_dry_friction_is_a_step(friction_on_rail):
+    """Its size hardly varies where the cart moves, and its sign is that of the speed."""
+    for course in friction_on_rail.missing.courses:
+        moving = np.abs(course.speed) > 0.2
+        force = course.force[moving]
+        assert np.std(np.abs(force)) < 0.2 * np.mean(np.abs(force))
+        assert np.all(np.sign(force) == np.sign(course.speed[moving]))
+        assert np.all(course.deviation > 0.0)
+
+
+def test_a_verdict_has_port_unit_and_law_of_the_missing_force(friction_on_rail):
+    told = friction_on_rail.verdict.force
+    law = friction_on_rail.missing.law
+    assert (told.port, told.unit, told.law, told.ordered_by) == ("rail", "N", law, ("velocity",))
+
+
+def test_a_verdict_has_the_size_of_the_missing_force_and_of_the_speed(friction_on_rail):
+    told = friction_on_rail.verdict.force
+    courses = friction_on_rail.missing.courses
+    force = np.concatenate([course.force for course in courses])
+    speed = np.concatenate([course.speed for course in courses])
     assert told.rms == pytest.approx(np.sqrt(np.mean(force**2)))
     assert told.speed == pytest.approx(np.sqrt(np.mean(speed**2)))
     assert abs(told.largest.force) == np.abs(force).max()
-    (course,) = (item for item in missing.courses if item.trial == told.largest.trial)
-    assert told.largest.speed == course.speed[course.time == told.largest.time]
-    for share, trials in ((told.fitted, 2), (told.held_out, 1)):
-        assert share.trials == trials
-        assert share.left < 0.3 * share.whole
-    said = force_sentence(told)
-    assert said.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
-    assert "Beside Coulomb friction" in said
-    axes = missing_force_figure(missing).axes
+
+
+def course_of_largest_force(found):
+    """Return the course of the trial in which the missing force is largest."""
+    (course,) = (item for item in found.missing.courses if item.trial == found.verdict.force.largest.trial)
+    return course
+
+
+def test_a_verdict_has_the_speed_at_the_largest_missing_force(friction_on_rail):
+    largest = friction_on_rail.verdict.force.largest
+    course = course_of_largest_force(friction_on_rail)
+    assert largest.speed == course.speed[course.time == largest.time]
+
+
+@pytest.mark.parametrize(("trials", "count"), [("fitted", 2), ("held_out", 1)])
+def test_the_law_leaves_little_of_the_force_in_fitted_and_in_held_out_trials(friction_on_rail, trials, count):
+    share = getattr(friction_on_rail.verdict.force, trials)
+    assert share.trials == count
+    assert share.left < 0.3 * share.whole
+
+
+def test_a_report_opens_with_the_missing_force(friction_on_rail):
+    told = friction_on_rail.verdict.force
+    sentence = force_sentence(told)
+    assert sentence.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
+    assert "Beside Coulomb friction" in sentence
+
+
+def test_the_missing_force_is_drawn_with_two_deviations_about_it(friction_on_rail):
+    axes = missing_force_figure(friction_on_rail.missing).axes
+    course = course_of_largest_force(friction_on_rail)
+    largest = int(np.argmax(np.abs(course.force)))
+    edge = course.time[largest], course.force[largest] + 2.0 * course.deviation[largest]
+    band = axes[2].collections[0].get_paths()[0].vertices
     assert len(axes) == 6
-    at = int(np.argmax(np.abs(course.force)))  # drawn with two deviations about it
-    edge = course.time[at], course.force[at] + 2.0 * course.deviation[at]
-    assert np.isclose(axes[2].collections[0].get_paths()[0].vertices, edge).all(axis=1).any()
+    assert np.isclose(band, edge).all(axis=1).any()
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.05])

@@ -49,14 +49,26 @@ def write_falls(folder, size=400):
     return folder
 
 
-def test_only_the_fall_is_taken_without_its_ends_and_run_reads_it(tmp_path):
-    out, data = tmp_path / "out", write_falls(tmp_path / "data")
-    words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
-    assert "2 trials" in said(*words)
-    read = read_campaign(out)
-    assert is_sound(read, load_model(out / "model.toml"))
-    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
-    for trial in read.trials:
+@pytest.fixture
+def converted_falls(tmp_path):
+    """The folder of a campaign of two falls, and what the command said that wrote it."""
+    out = tmp_path / "out"
+    data = write_falls(tmp_path / "data")
+    command = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
+    return out, said(*command)
+
+
+def test_a_converted_rig_is_a_campaign_of_its_trials(converted_falls):
+    folder, printed = converted_falls
+    campaign = read_campaign(folder)
+    assert "2 trials" in printed
+    assert is_sound(campaign, load_model(folder / "model.toml"))
+    assert [trial.name for trial in campaign.trials] == ["fall_2", "fall_10"]
+
+
+def test_only_the_fall_is_taken_without_its_ends(converted_falls):
+    folder, _ = converted_falls
+    for trial in read_campaign(folder).trials:
         np.testing.assert_allclose(trial.values, 0.2)
         assert (trial.time[0], trial.time[-1]) == pytest.approx((0.04, 0.345))
 
@@ -79,17 +91,26 @@ def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_writte
     assert not out.exists()
 
 
-def test_published_records_are_read_as_they_were_measured(tmp_path):
-    """A fall is not a short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
+def test_a_published_fall_is_not_a_short_record(tmp_path):
     assert is_sound(*rig("falling_phone", tmp_path))
+
+
+def test_readings_at_the_end_of_the_level_sensor_are_left_out(tmp_path):
     tanks, _ = rig("two_tanks", tmp_path)
-    assert [trial.name for trial in tanks.held_out] == ["validation"]
     for trial, left_out in zip(tanks.trials, (47, 37), strict=True):
         assert trial.values.shape == (1024, 1)
         assert int((~trial.used).sum()) == left_out
         assert float(trial.values[trial.used].max()) < 10.0
+
+
+@pytest.mark.parametrize(("name", "held_out"), [("two_tanks", ["validation"]), ("pendulum", ["ilqr"])])
+def test_a_published_record_for_validation_is_held_out(name, held_out, tmp_path):
+    campaign, _ = rig(name, tmp_path)
+    assert [trial.name for trial in campaign.held_out] == held_out
+
+
+def test_the_published_pendulum_has_50_hz(tmp_path):
     pendulum, _ = rig("pendulum", tmp_path)
-    assert [trial.name for trial in pendulum.held_out] == ["ilqr"]
     assert [len(trial.time) for trial in pendulum.trials] == [195, 1000]
     for trial in pendulum.trials:
         assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
@@ -187,15 +208,30 @@ def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path):
         wing_campaign(tmp_path / "one")
 
 
-@pytest.mark.skipif(not WING.is_dir(), reason="the published measurements are not beside the project")
-def test_the_published_measurements_make_a_campaign(tmp_path):
-    made = read_campaign(write_rig_campaign("real_wing", WING, tmp_path / "campaign"))
-    assert [trial.kind for trial in made.trials] == [TrialKind.STATIC] * 2 + [TrialKind.RINGDOWN] * 5
-    assert [trial.name for trial in made.held_out] == ["release 3", "release 5"]
-    np.testing.assert_allclose(made.trials[0].force, [2.4525, 4.905, 7.3575, 9.81])
-    np.testing.assert_allclose(made.trials[1].values[:, 0], [3.3528e-3, 7.2898e-3, 10.7442e-3, 13.7922e-3])
-    assert made.channels[TIP].noise is not None
-    assert made.parameters["young_modulus_factor"] == (1.008, 0.0103)
+@pytest.fixture
+def published_wing(tmp_path):
+    """The campaign of the published measurements of the wing; skips where they are not at hand."""
+    if not WING.is_dir():
+        pytest.skip("the published measurements are not beside the project")
+    return read_campaign(write_rig_campaign("real_wing", WING, tmp_path / "campaign"))
+
+
+def test_the_published_measurements_make_a_campaign(published_wing):
+    kinds = [trial.kind for trial in published_wing.trials]
+    assert kinds == [TrialKind.STATIC] * 2 + [TrialKind.RINGDOWN] * 5
+    assert [trial.name for trial in published_wing.held_out] == ["release 3", "release 5"]
+
+
+def test_the_published_loads_and_deflections_are_read(published_wing):
+    loaded, unloaded = published_wing.trials[:2]
+    deflections = [3.3528e-3, 7.2898e-3, 10.7442e-3, 13.7922e-3]
+    np.testing.assert_allclose(loaded.force, [2.4525, 4.905, 7.3575, 9.81])
+    np.testing.assert_allclose(unloaded.values[:, 0], deflections)
+
+
+def test_the_published_wing_has_its_noise_and_its_modulus(published_wing):
+    assert published_wing.channels[TIP].noise is not None
+    assert published_wing.parameters["young_modulus_factor"] == (1.008, 0.0103)
 
 
 # ---------------------------------------------------------------- the rigs of the notebook and of the cart

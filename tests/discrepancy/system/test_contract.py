@@ -18,13 +18,14 @@ from discrepancy.fmu_models.model import FmuModel
 from discrepancy.system.interface import Model
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
+from discrepancy.system.scales import Scales
 from discrepancy.system.structures import StructureModel, WingModel
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import SystemState
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness
-from tests.discrepancy.rigs import INPUTS, asked, campaign, fmu_rig, seen
+from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, seen
 from tests.refusals import refused
 
 TABLE = INPUTS.table("kinds.toml")
@@ -92,30 +93,85 @@ def test_it_says_which_primitives_it_carries(kind: Kind) -> None:
     assert supported == {*carried, *TABLE["sensors"]}
 
 
+@dataclass(frozen=True)
+class StiffnessAndMass:
+    """Matrices of a kind of model, the row of its load, and the rows of its ports."""
+
+    stiffness: FloatArray
+    mass: FloatArray
+    load_row: FloatArray
+    port_rows: dict[str, FloatArray]
+
+    @property
+    def first_mode(self) -> tuple[float, FloatArray]:
+        """Return the square of the first angular frequency, and its shape."""
+        squares, shapes = eigh(self.stiffness, self.mass, subset_by_index=[0, 0])
+        return float(squares[0]), shapes[:, 0]
+
+    @property
+    def deflection(self) -> FloatArray:
+        """Return the displacements under a unit load."""
+        return np.linalg.solve(self.stiffness, self.load_row)
+
+
+def stiffness_and_mass(kind: Kind) -> StiffnessAndMass:
+    """Return the matrices of a kind of model; those of the FMU are of its one mass."""
+    model = kind.model
+    if not isinstance(model, SystemModel):
+        unit = np.ones(1)
+        ports = dict.fromkeys(kind.ports, unit)
+        return StiffnessAndMass(np.full((1, 1), 1974.0), np.full((1, 1), 2.0), unit, ports)
+    state = SystemState(tuple(model.prior_mean()), (0.0,) * len(model.regions))
+    system = model.system_in_state(state)
+    ports = {name: model.port_rows[name] for name in kind.ports}
+    return StiffnessAndMass(system.stiffness, system.mass, model.force_row(kind.place, state), ports)
+
+
+LARGEST_FORCE = 6.0
+
+
+def scales_of(kind: Kind) -> Scales:
+    """Return the scales in a campaign of loads of up to 6 N and a ring-down that begins at 100 s."""
+    loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -LARGEST_FORCE]))
+    ringdown = replace(kind.trial(TrialKind.RINGDOWN), start=100.0)
+    return kind.model.scales(campaign(loads, ringdown))
+
+
+def tolerance_of(kind: Kind) -> float:
+    return 1e-5 if isinstance(kind.model, WingModel) else 1e-7
+
+
 @pytest.mark.parametrize("kind", ["lumped", "wing", "FMU"], indirect=True)
 def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> None:
-    model = kind.model
-    stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
-    if isinstance(model, SystemModel):
-        state = SystemState(tuple(model.prior_mean()), (0.0,) * len(model.regions))
-        stiffness, mass = (getattr(model.system_in_state(state), name) for name in ("stiffness", "mass"))
-        row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
-    loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))
-    found = model.scales(campaign(loads, replace(kind.trial(TrialKind.RINGDOWN), start=100.0)))
-    (square,), shape = eigh(stiffness, mass, subset_by_index=[0, 0])
-    held, near = np.linalg.solve(stiffness, row), 1e-5 if isinstance(model, WingModel) else 1e-7
-    wanted = {
-        "tip_stiffness": 1.0 / (row @ held), "modal_mass": float(row @ shape[:, 0]) ** -2,
-        "angular_frequency": np.sqrt(square), "force": 6.0, "duration": 59 * 0.005,
-        "campaign_time": 100.0 + 59 * 0.005, "length": kind.stations[-1],
-    }  # fmt: skip
-    assert {name: getattr(found, name) for name in wanted} == pytest.approx(wanted, rel=near)
-    for name, port in zip(kind.ports, rows, strict=True):
-        moved, own = abs(port @ held) * max(6.0, 0.02 / float(row @ held)), found.ports[name]
-        assert (own.displacement, own.stiffness) == pytest.approx(
-            (moved, square / float(port @ shape[:, 0]) ** 2), rel=near
-        )
-        assert own.mean_power(3.0) == 1.0
+    matrices = stiffness_and_mass(kind)
+    square, shape = matrices.first_mode
+    expected = {
+        "tip_stiffness": 1.0 / (matrices.load_row @ matrices.deflection),
+        "modal_mass": float(matrices.load_row @ shape) ** -2,
+        "angular_frequency": np.sqrt(square),
+        "force": LARGEST_FORCE,
+        "duration": 59 * 0.005,
+        "campaign_time": 100.0 + 59 * 0.005,
+        "length": kind.stations[-1],
+    }
+    scales = scales_of(kind)
+    assert {name: getattr(scales, name) for name in expected} == pytest.approx(
+        expected, rel=tolerance_of(kind)
+    )
+
+
+@pytest.mark.parametrize("kind", ["lumped", "wing", "FMU"], indirect=True)
+def test_scales_of_a_port_are_those_of_its_motion_and_of_the_first_mode(kind: Kind) -> None:
+    matrices = stiffness_and_mass(kind)
+    square, shape = matrices.first_mode
+    load_of_release = 0.02 / float(matrices.load_row @ matrices.deflection)
+    for name, row in matrices.port_rows.items():
+        port = scales_of(kind).ports[name]
+        displacement = abs(row @ matrices.deflection) * max(LARGEST_FORCE, load_of_release)
+        modal_stiffness = square / float(row @ shape) ** 2
+        expected = pytest.approx((displacement, modal_stiffness), rel=tolerance_of(kind))
+        assert (port.displacement, port.stiffness) == expected
+        assert port.mean_power(3.0) == 1.0
 
 
 @pytest.mark.parametrize("how", [TrialKind.RINGDOWN, TrialKind.STATIC])

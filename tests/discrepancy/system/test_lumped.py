@@ -106,15 +106,26 @@ def test_hysteresis_remembers_its_path_also_while_it_warms() -> None:
     assert warm == pytest.approx(values, rel=1e-6, abs=1e-10)
 
 
-def test_initial_states_are_shares_of_the_release() -> None:
-    start = shown(CHAIN, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
-    wanted = 0.02 * (1.1 * END / END[2] + 0.05 * SHAPES[:, 1] / SHAPES[2, 1])
-    np.testing.assert_allclose(start, wanted, atol=1e-12)
-    later, initial = ringdown(release=Release(0.02, at_rest=False)), np.array([[0.0, 0.0], [0.3, -0.4]])
-    values = shown(CHAIN, later, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
-    begin = 0.02 * np.outer([0.3, -0.4 * np.sqrt(SQUARE[1])], SHAPES[:, 1] / SHAPES[2, 1]).ravel()
-    wanted = [(expm(MOTION * t) @ begin)[[2, 5]] for t in later.time - 0.02]  # it moves before, too
-    np.testing.assert_allclose(values, wanted, rtol=1e-9, atol=1e-12)
+SECOND_MODE = SHAPES[:, 1] / SHAPES[2, 1]
+"""The second mode over its value at the place of the release."""
+
+
+def test_initial_displacements_are_shares_of_the_release() -> None:
+    """A tenth more of the released shape, and a twentieth of it in the second mode."""
+    first = shown(CHAIN, ringdown(), initial=np.array([[0.1, 0.0], [0.05, 0.0]]))[0]
+    expected = 0.02 * (1.1 * END / END[2] + 0.05 * SECOND_MODE)
+    np.testing.assert_allclose(first, expected, atol=1e-12)
+
+
+def test_initial_displacements_and_speeds_of_a_mode_are_shares_of_the_release() -> None:
+    """The chain moves before its record begins, too: its clock stands at -0.02 s."""
+    moving = ringdown(release=Release(0.02, at_rest=False))
+    initial = np.array([[0.0, 0.0], [0.3, -0.4]])
+    response = shown(CHAIN, moving, outputs=(X3, VELOCITY), initial=initial, clock=(0.0, -0.02))
+    displacement_and_speed = [0.3, -0.4 * np.sqrt(SQUARE[1])]
+    initial_state = 0.02 * np.outer(displacement_and_speed, SECOND_MODE).ravel()
+    states = np.array([expm(MOTION * t) @ initial_state for t in moving.time - 0.02])
+    np.testing.assert_allclose(response, states[:, [2, 5]], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("items", [(), (PowerDamping("joint", 0.2, 2.0, 0.0, 0.1, 1.0),)])
@@ -221,33 +232,43 @@ def joint_speed(push: float, damper: float, x: float, items: tuple[Primitive, ..
     return float(np.sign(push) * size)
 
 
-def integrated(items: tuple[Primitive, ...], time: FloatArray, at: int) -> FloatArray:
-    """Displacements (N, 2) of tip and joint, that has no mass, released `at` a node, by an integrator."""
+def integrated(laws: tuple[Primitive, ...], time: FloatArray, node: int) -> FloatArray:
+    """Displacements (N, 2) of tip and joint, which has no mass, released at a node, by an integrator.
+
+    The joint is node 0. Its displacement is a state of its own: its speed follows from the balance of forces.
+    """
     system = on_joint(3, BETA)
-    stiffness, damping = system.stiffness, BETA * system.stiffness + 0.3 * system.mass
-    inverse = np.linalg.inv(stiffness)
-    inside, at_tip = ([item for item in items if item.port == port] for port in ("joint", "tip"))
+    stiffness = system.stiffness
+    damping = BETA * stiffness + 0.3 * system.mass
+    flexibility = np.linalg.inv(stiffness)
+    laws_at_joint = [law for law in laws if law.port == "joint"]
+    laws_at_tip = [law for law in laws if law.port == "tip"]
 
-    def force(x: float) -> float:
-        return sum(force_of(item, x, 0.0, np.zeros(0)) for item in inside)  # damping is in its speed
+    def force_at_joint(displacement: float) -> float:
+        """Return the force of springs; damping is in the speed of the joint."""
+        return sum(force_of(law, displacement, 0.0, np.zeros(0)) for law in laws_at_joint)
 
-    def held(x: float) -> FloatArray:
-        pull = (0.02 + inverse[at, 0] * force(x)) / inverse[at, at]
-        return inverse[:, at] * pull - inverse[:, 0] * force(x)
+    def held_shape(joint: float) -> FloatArray:
+        """Return the displacements that hold the node at 0.02 m."""
+        force = force_at_joint(joint)
+        pull = (0.02 + flexibility[node, 0] * force) / flexibility[node, node]
+        return flexibility[:, node] * pull - flexibility[:, 0] * force
 
-    def derivative(t: float, y: FloatArray) -> FloatArray:
-        u, v, x = y[:3], y[3:6], y[6]
-        place = np.concatenate(([x], u))
-        push = -stiffness[0] @ place - damping[0, 1:] @ v - force(x)
-        speed = joint_speed(push, damping[0, 0] - 0.3 * LIGHT, x, items)
-        a = -(stiffness @ place)[1:] - damping[1:] @ np.concatenate(([speed], v))
-        a[2] -= sum(force_of(item, u[2], v[2], np.zeros(0)) for item in at_tip)
-        return np.concatenate((v, a, [speed]))
+    def rate(t: float, state: FloatArray) -> FloatArray:
+        masses, speeds, joint = state[:3], state[3:6], state[6]
+        displacements = np.concatenate(([joint], masses))
+        force_on_joint = -stiffness[0] @ displacements - damping[0, 1:] @ speeds - force_at_joint(joint)
+        speed_of_joint = joint_speed(force_on_joint, damping[0, 0] - 0.3 * LIGHT, joint, laws)
+        all_speeds = np.concatenate(([speed_of_joint], speeds))
+        accelerations = -(stiffness @ displacements)[1:] - damping[1:] @ all_speeds
+        accelerations[2] -= sum(force_of(law, masses[2], speeds[2], np.zeros(0)) for law in laws_at_tip)
+        return np.concatenate((speeds, accelerations, [speed_of_joint]))
 
-    x = brentq(lambda x: held(x)[0] - x, 0.0, 3.0 * A if at else 0.03, xtol=1e-14)
-    begin = np.concatenate((held(x)[1:], np.zeros(3), [x]))
-    found = solve_ivp(derivative, (0.0, time[-1]), begin, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
-    return np.asarray(found.y[[2, 6]].T)
+    highest = 3.0 * A if node else 0.03
+    joint = brentq(lambda displacement: held_shape(displacement)[0] - displacement, 0.0, highest, xtol=1e-14)
+    initial = np.concatenate((held_shape(joint)[1:], np.zeros(3), [joint]))
+    solution = solve_ivp(rate, (0.0, time[-1]), initial, t_eval=time, rtol=1e-6, atol=1e-9, max_step=2e-3)
+    return np.asarray(solution.y[[2, 6]].T)
 
 
 @pytest.mark.parametrize(

@@ -29,16 +29,17 @@ OUTPUTS = {"tip": Quantity.DISPLACEMENT, "g1": Quantity.STRAIN}
 
 @pytest.fixture
 def write_ported_beam(write_beam, tmp_path: Path):
-    """A writer of the beam that is pushed at its tip, with ports."""
+    """A writer of the beam that is pushed at its tip, with ports; in a folder of its own if one is named."""
 
-    def write(*ports: str) -> Path:
+    def write(*ports: str, folder: str = "") -> Path:
         changes = {
             "set = [\n": 'set = [\n{ name = "middle", of = "nodes", box = [[50, 0, 0], [50, 20, 10]] },\n',
             'set = "end", force': "point = [100, 10, 5], force",
         }
         if ports:
             changes["parameter = [{"] = f"port = [{', '.join(ports)}]\nparameter = [{{"
-        return write_beam(tmp_path, changes, cells=2)
+        (tmp_path / folder).mkdir(exist_ok=True)
+        return write_beam(tmp_path / folder, changes, cells=2)
 
     return write
 
@@ -72,23 +73,37 @@ def test_a_spring_at_a_port_acts_as_on_the_full_structure(port: str, write_porte
     np.testing.assert_allclose(found[1], np.ravel(wanted), rtol=1e-4)
 
 
-def test_a_port_changes_neither_the_structure_nor_its_fmu(write_ported_beam, tmp_path: Path) -> None:
-    """What a verdict rests on, it changes: an effect may be at the port."""
-    choices, fmus, hashes, rigs = [], [], [], []
-    for number, ports in enumerate([(), (AT_POINT,)]):
-        file = write_ported_beam(*ports)
-        reduced = reduced_model(file)
-        hashes.append(reduced.design_hash)
-        fmus.append(build_fmu(reduced, tmp_path / f"{number}.fmu").path.read_bytes())
-        rigs.append(rig_text(load_structure(file), "beam.fmu"))
-        choices.append(choose_model(file))
-    assert hashes[0] == hashes[1] == choices[0].design_hash == choices[1].design_hash
-    assert fmus[0] == fmus[1]
-    assert choices[0].source_hash == hashes[0] != choices[1].source_hash
-    assert "lug" not in choices[1].model.quantities
-    assert choices[1].model.load_places == choices[0].model.load_places
+@pytest.fixture
+def beams(write_ported_beam) -> tuple[Path, Path]:
+    """The structure files of the beam without and with a port, in folders of their own."""
+    return write_ported_beam(folder="without"), write_ported_beam(AT_POINT, folder="with")
+
+
+def test_a_port_changes_neither_the_structure_nor_its_fmu(beams: tuple[Path, Path], tmp_path: Path) -> None:
+    without, ported = (reduced_model(file) for file in beams)
+    fmu_without = build_fmu(without, tmp_path / "without.fmu").path
+    fmu_ported = build_fmu(ported, tmp_path / "with.fmu").path
+    assert without.design_hash == ported.design_hash
+    assert fmu_without.read_bytes() == fmu_ported.read_bytes()
+
+
+def test_a_verdict_rests_on_the_structure_and_on_its_ports(beams: tuple[Path, Path]) -> None:
+    """An effect may be at the port."""
+    without, ported = (choose_model(file) for file in beams)
+    design_hash = reduced_model(beams[0]).design_hash
+    assert without.design_hash == ported.design_hash == design_hash
+    assert without.source_hash == design_hash != ported.source_hash
+
+
+def test_a_port_is_neither_a_quantity_nor_a_place_of_a_load(beams: tuple[Path, Path]) -> None:
+    without, ported = (choose_model(file).model for file in beams)
+    assert "lug" not in ported.quantities
+    assert ported.load_places == without.load_places
+
+
+def test_the_file_beside_an_fmu_says_which_port_the_fmu_has_not(beams: tuple[Path, Path]) -> None:
     told = "# Not in the FMU, which has no force there: port lug of the structure file."
-    assert [told in text for text in rigs] == [False, True]
+    assert [told in rig_text(load_structure(file), "beam.fmu") for file in beams] == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -64,22 +64,30 @@ def test_a_loss_in_a_region_is_named_with_its_size(kind, beam_model) -> None:
     check_that_the_loss_is_named(investigate(campaign, beam_model, effects, seed=3).verdict)
 
 
-def test_losses_in_two_regions_at_once_are_named_with_their_sizes(beam_model) -> None:
-    campaign = example_campaign(beam_model, "static", 3, usual_plan(beam_model))
-    hidden = {"z1": 0.3, "z2": 0.2}
-    patches = [
-        hiding(campaign, beam_model, "region_stiffness_loss", {"loss": loss}, region)
-        for region, loss in hidden.items()
-    ]
-    both = ModelPatch(tuple(primitive for one in patches for primitive in one))
-    damaged = example_campaign(beam_model, "static", 3, usual_plan(beam_model), both)
-    verdict = investigate(damaged, beam_model, library(), seed=3).verdict
-    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
-    found = {effect.place: effect.parameters[0] for effect in verdict.effects}
-    assert {effect.identifier for effect in verdict.effects} == {"region_stiffness_loss"}
-    assert found.keys() == hidden.keys()
-    for region, loss in hidden.items():
-        assert found[region].low - 0.01 < loss < found[region].high + 0.01
+TWO_LOSSES = {"z1": 0.3, "z2": 0.2}
+
+
+@pytest.fixture(scope="module")
+def verdict_on_two_losses(beam_model):
+    plan = usual_plan(beam_model)
+    campaign = example_campaign(beam_model, "static", 3, plan)
+    primitives = []
+    for region, loss in TWO_LOSSES.items():
+        primitives += hiding(campaign, beam_model, "region_stiffness_loss", {"loss": loss}, region)
+    damaged = example_campaign(beam_model, "static", 3, plan, ModelPatch(tuple(primitives)))
+    return investigate(damaged, beam_model, library(), seed=3).verdict
+
+
+def test_losses_in_two_regions_at_once_are_named(verdict_on_two_losses) -> None:
+    named = {(effect.identifier, effect.place) for effect in verdict_on_two_losses.effects}
+    assert verdict_on_two_losses.kind is VerdictKind.NAMED, verdict_on_two_losses.sentence
+    assert named == {("region_stiffness_loss", region) for region in TWO_LOSSES}
+
+
+@pytest.mark.parametrize("region", TWO_LOSSES)
+def test_losses_in_two_regions_at_once_have_their_sizes(region, verdict_on_two_losses) -> None:
+    (effect,) = (effect for effect in verdict_on_two_losses.effects if effect.place == region)
+    assert effect.parameters[0].low - 0.01 < TWO_LOSSES[region] < effect.parameters[0].high + 0.01
 
 
 def test_without_a_loss_nothing_is_named(beam_model) -> None:
@@ -146,19 +154,33 @@ def test_an_unknown_region_is_refused(beam_model) -> None:
 OWN_NAMES = {'"z1"': '"heel"', '"z2"': '"web"'}
 
 
-def test_the_residuals_have_the_names_of_the_structure(write_beam, tmp_path) -> None:
-    """A campaign that names no load place and no region has neither those of the wing."""
-    own = choose_model(write_beam(tmp_path, OWN_NAMES, cells=2)).model
+@pytest.fixture(scope="module")
+def residuals_of_own_names(write_beam, tmp_path_factory):
+    """Residuals beside a structure with names of its own, and the file in which they are stored.
+
+    The campaign names no load place.
+    """
+    folder = tmp_path_factory.mktemp("own_names")
+    own = choose_model(write_beam(folder, OWN_NAMES, cells=2)).model
     campaign = simulated(own, "static", 3)
     trials = tuple(replace(trial, load_place=DEFAULT_PLACE) for trial in campaign.trials)
-    investigation = investigate(replace(campaign, trials=trials), own, chosen("load_cell"), seed=3)
-    path = write_residuals(tmp_path / "residuals.nc", investigation.after)
+    found = investigate(replace(campaign, trials=trials), own, chosen("load_cell"), seed=3)
+    return found.after, write_residuals(folder / "residuals.nc", found.after)
+
+
+def test_the_residuals_have_the_names_of_the_structure(residuals_of_own_names) -> None:
+    """And none of the wing."""
+    _, path = residuals_of_own_names
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         for group in tree.children.values():
             assert group["region"].values.tolist() == ["heel", "web"]
             assert json.loads(group.attrs["load_place"]) == "push"
             assert not any(word in str(group.attrs) for word in ("z1", "z2", "tip_load"))
-    for fitted, stored in zip(investigation.after.trials, read_residuals(path).trials, strict=True):
+
+
+def test_the_residuals_are_read_back_with_the_regions_of_the_structure(residuals_of_own_names) -> None:
+    residuals, path = residuals_of_own_names
+    for fitted, stored in zip(residuals.trials, read_residuals(path).trials, strict=True):
         assert stored.trial.regions == fitted.trial.regions == ("heel", "web")
         np.testing.assert_array_equal(stored.trial.health, fitted.trial.health)
 

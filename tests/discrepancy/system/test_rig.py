@@ -1,8 +1,7 @@
 """Rigs of all kinds against closed forms and general integrators; effects in windows; clocks of loggers."""
 
-import itertools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,60 +50,114 @@ def uneven(count: int, interval: float) -> FloatArray:
 # ---------------------------------------------------------------- bodies, tanks, motors
 
 
-def test_a_body_falls_as_galilei_says_and_drag_makes_it_a_hyperbolic_tangent() -> None:
-    time, gauge = uneven(200, 0.01), {"accelerometer": Quantity.ACCELERATION}
-    found = seen(rig("falling_body"), trial(time), HEIGHT | gauge)
-    np.testing.assert_allclose(found[:, 0], -0.5 * 9.81 * time**2, rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(found[:, 1], 0.0, atol=1e-12)
+FALL = asked(TrialKind.DRIVEN, uneven(200, 0.01), begins=Start.STILL)
+ACCELEROMETER = {"accelerometer": Quantity.ACCELERATION}
+GRAVITY = 9.81
+
+
+def test_a_body_falls_as_galilei_says() -> None:
+    found = seen(rig("falling_body"), FALL, HEIGHT | ACCELEROMETER)
+    height, acceleration = found.T
+    np.testing.assert_allclose(height, -0.5 * GRAVITY * FALL.time**2, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(acceleration, 0.0, atol=1e-12)
+
+
+def test_drag_makes_the_speed_of_a_fall_a_hyperbolic_tangent() -> None:
     drag = PowerDamping("air", 0.5, 2.0, 0.0, 1.0, 1.0)  # 0.5 v^2
-    found = seen(rig("falling_body"), trial(time), {"height": Quantity.VELOCITY} | gauge, drag, refinement=4)
-    terminal = np.sqrt(2.0 * 9.81 / 0.5)
-    speed = terminal * np.tanh(9.81 * time / terminal)
-    np.testing.assert_allclose(found[:, 0], -speed, atol=1e-5)
-    np.testing.assert_allclose(found[:, 1], 0.5 * speed**2 / 2.0, atol=1e-4)
-    port = rig("falling_body").scales(campaign(trial(time))).ports["air"]  # from what acts and moves
-    assert port.displacement == pytest.approx(0.5 * 9.81 * time[-1] ** 2)
-    assert port.stiffness * port.displacement == pytest.approx(FORCE_PER_RMS * 2.0 * 9.81)
-    assert port.angular_frequency * port.displacement == pytest.approx(9.81 * time[-1])
+    outputs = {"height": Quantity.VELOCITY} | ACCELEROMETER
+    velocity, acceleration = seen(rig("falling_body"), FALL, outputs, drag, refinement=4).T
+    terminal = np.sqrt(2.0 * GRAVITY / 0.5)
+    speed = terminal * np.tanh(GRAVITY * FALL.time / terminal)
+    np.testing.assert_allclose(velocity, -speed, atol=1e-5)
+    np.testing.assert_allclose(acceleration, 0.5 * speed**2 / 2.0, atol=1e-4)
+
+
+def test_the_scales_of_a_fall_come_from_what_acts_and_moves() -> None:
+    duration = FALL.time[-1]
+    port = rig("falling_body").scales(campaign(FALL)).ports["air"]
+    assert port.displacement == pytest.approx(0.5 * GRAVITY * duration**2)
+    assert port.stiffness * port.displacement == pytest.approx(FORCE_PER_RMS * 2.0 * GRAVITY)
+    assert port.angular_frequency * port.displacement == pytest.approx(GRAVITY * duration)
+
+
+OUTLET = 0.08
+"""Outflow of the lower tank over its level [per unit of level]; 0.5 is what the pump gives per volt."""
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.4])
 def test_tanks_begin_settled_and_stay_so(offset: float) -> None:
-    what = trial(uneven(20, 4.0), pump(np.full(20, 2.0)), begins=Start.SETTLED)
-    found = seen(rig("tanks"), what, LOWER, offset=(offset,) if offset else ())
-    np.testing.assert_allclose(found[:, 0], (2.0 + offset) * 0.5 / 0.08, rtol=1e-10)
-    # a force at a state, at rest
-    said = {"kind": TrialKind.STATIC, "begins": Start.SETTLED, "load_place": "pump"}
-    still = trial(np.arange(3.0), force=np.array([0.0, 2.0, -1.0]), **said)
-    pressed = seen(rig("tanks", (', quantity = "voltage"', "")), still, LOWER)
-    np.testing.assert_allclose(pressed[:, 0], still.force * 0.5 / 0.08, rtol=1e-10)
+    constant = trial(uneven(20, 4.0), pump(np.full(20, 2.0)), begins=Start.SETTLED)
+    level = seen(rig("tanks"), constant, LOWER, offset=(offset,) if offset else ())[:, 0]
+    np.testing.assert_allclose(level, (2.0 + offset) * 0.5 / OUTLET, rtol=1e-10)
+
+
+def test_a_force_at_a_state_at_rest_is_held_by_the_outflow() -> None:
+    tanks = rig("tanks", (', quantity = "voltage"', ""))
+    still = trial(
+        np.arange(3.0),
+        force=np.array([0.0, 2.0, -1.0]),
+        kind=TrialKind.STATIC,
+        begins=Start.SETTLED,
+        load_place="pump",
+    )
+    level = seen(tanks, still, LOWER)[:, 0]
+    np.testing.assert_allclose(level, still.force * 0.5 / OUTLET, rtol=1e-10)
 
 
 def test_a_motor_couples_displacements_and_states() -> None:
-    time, generator = uneven(150, 0.02), np.random.default_rng(7)
-    given = np.stack((generator.normal(size=150), 0.1 * generator.normal(size=150)), axis=1)
-    inputs = (("voltage", Quantity.VOLTAGE, given[:, 0]), ("brake", Quantity.TORQUE, given[:, 1]))
-    what = trial(time, *(RecordedInput(*item) for item in inputs))
-    found = seen(rig("motor"), what, {"speed": Quantity.ANGULAR_VELOCITY, "current": Quantity.CURRENT})
-    matrix, into = np.zeros((5, 5)), np.zeros((5, 2))
-    matrix[:2, 2:4] = np.eye(2)
-    matrix[2], matrix[3] = np.array([-3, 3, -0.01, 0, 0.3]) / 0.02, np.array([3, -3, 0, -0.02, 0]) / 0.5
-    matrix[4] = np.array([0, 0, -0.3, 0, -2.0]) / 0.01
-    into[4, 0], into[3, 1] = 100.0, -2.0
-    expected = exact(matrix, into, time, given)
-    np.testing.assert_allclose(found, expected[:, 3:], atol=1e-8 * np.abs(expected).max())
+    time = uneven(150, 0.02)
+    generator = np.random.default_rng(7)
+    voltage = generator.normal(size=150)
+    torque = 0.1 * generator.normal(size=150)
+    driven = trial(
+        time,
+        RecordedInput("voltage", Quantity.VOLTAGE, voltage),
+        RecordedInput("brake", Quantity.TORQUE, torque),
+    )
+    outputs = {"speed": Quantity.ANGULAR_VELOCITY, "current": Quantity.CURRENT}
+
+    response = seen(rig("motor"), driven, outputs)
+
+    # states: two angles, their speeds, the current; inputs: voltage, torque of the brake
+    rate_of_angle = [[0.0, 0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0]]
+    rate_of_rotor_speed = np.array([-3.0, 3.0, -0.01, 0.0, 0.3]) / 0.02
+    rate_of_load_speed = np.array([3.0, -3.0, 0.0, -0.02, 0.0]) / 0.5
+    rate_of_current = np.array([0.0, 0.0, -0.3, 0.0, -2.0]) / 0.01
+    system = np.array([*rate_of_angle, rate_of_rotor_speed, rate_of_load_speed, rate_of_current])
+    effect_of_voltage = [0.0, 0.0, 0.0, 0.0, 100.0]
+    effect_of_torque = [0.0, 0.0, 0.0, -2.0, 0.0]
+    effect_of_inputs = np.column_stack((effect_of_voltage, effect_of_torque))
+    states = exact(system, effect_of_inputs, time, np.column_stack((voltage, torque)))
+    speed_and_current = states[:, 3:]
+    np.testing.assert_allclose(response, speed_and_current, atol=1e-8 * np.abs(states).max())
+
+
+FALL_OF_UNKNOWN_BEGIN = replace(
+    trial(uneven(50, 0.01), begins=Start.UNKNOWN),
+    channels=("h",),
+    values=(3.0 - 2.0 * uneven(50, 0.01))[:, None],
+    used=np.ones((50, 1), dtype=bool),
+)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "largest_height"),
+    [(Quantity.DISPLACEMENT, 3.0), (Quantity.VELOCITY, 3.0 * FALL_OF_UNKNOWN_BEGIN.time[-1])],
+)
+def test_an_unknown_begin_may_be_as_large_as_the_readings(quantity: Quantity, largest_height: float) -> None:
+    duration = FALL_OF_UNKNOWN_BEGIN.time[-1]
+    readings = campaign(FALL_OF_UNKNOWN_BEGIN, h=Channel("h", quantity, "height", None))
+    largest_speed = max(largest_height / duration, GRAVITY * duration)
+    mass_normalised = np.sqrt(2.0) * np.array([largest_height, largest_speed])
+    magnitudes = rig("falling_body").initial_state_magnitudes(readings, FALL_OF_UNKNOWN_BEGIN)
+    assert magnitudes == pytest.approx(mass_normalised, rel=1e-9)
 
 
 def test_an_unknown_begin_takes_any_state() -> None:
-    time, model = uneven(50, 0.01), rig("falling_body")
-    read = {"channels": ("h",), "values": (3.0 - 2.0 * time)[:, None]}
-    what = trial(time, begins=Start.UNKNOWN, **read)
-    for quantity, height in ((Quantity.DISPLACEMENT, 3.0), (Quantity.VELOCITY, 3.0 * time[-1])):
-        given = campaign(what, h=Channel("h", quantity, "height", None))
-        largest = np.sqrt(2.0) * np.array([height, max(height / time[-1], 9.81 * time[-1])])
-        assert model.initial_state_magnitudes(given, what) == pytest.approx(largest, rel=1e-9)
-    found = seen(model, what, HEIGHT, initial=np.sqrt(2.0) * np.array([[3.0, -2.0]]))  # mass-normalised
-    np.testing.assert_allclose(found[:, 0], 3.0 - 2.0 * time - 0.5 * 9.81 * time**2, atol=1e-12)
+    time = FALL_OF_UNKNOWN_BEGIN.time
+    mass_normalised = np.sqrt(2.0) * np.array([[3.0, -2.0]])
+    height = seen(rig("falling_body"), FALL_OF_UNKNOWN_BEGIN, HEIGHT, initial=mass_normalised)[:, 0]
+    np.testing.assert_allclose(height, 3.0 - 2.0 * time - 0.5 * GRAVITY * time**2, atol=1e-12)
 
 
 def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> None:
@@ -133,26 +186,64 @@ def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> Non
 # ---------------------------------------------------------------- drives
 
 
-def test_a_driven_damper_shows_its_forces_and_those_of_laws() -> None:
-    time, model = uneven(400, 0.005), rig("damper")
+@dataclass(frozen=True)
+class DrivenDamper:
+    """A damper whose motion is recorded, with the derivatives of the spline through it."""
+
+    trial: Trial
+    motion: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+
+    @property
+    def linear_force(self) -> FloatArray:
+        """Return the force of mass, damper and spring."""
+        return 0.4 * self.acceleration + 25.0 * self.speed + 300.0 * self.motion
+
+
+@pytest.fixture(scope="module")
+def driven_damper() -> DrivenDamper:
+    time = uneven(400, 0.005)
     motion = 0.02 * np.sin(9.0 * time)
+    settled = trial(time, actuator(motion), begins=Start.SETTLED)
     spline = CubicSpline(time, motion)
-    what = trial(time, actuator(motion), begins=Start.SETTLED)
-    found = seen(model, what, CELL)[:, 0]
-    linear = 0.4 * spline(time, 2) + 25.0 * spline(time, 1) + 300.0 * motion
-    np.testing.assert_allclose(found, linear, rtol=1e-9, atol=1e-9)
-    analytic = 300.0 * motion + 25.0 * 0.18 * np.cos(9.0 * time) - 0.4 * 1.62 * np.sin(9.0 * time)
-    np.testing.assert_allclose(found[5:-5], analytic[5:-5], atol=2e-3)
-    rest = seen(model, what, CELL, FRICTION, PowerStiffness("piston", 5.0, 3.0, 0, 0.02))[:, 0] - linear
-    moving = np.abs(spline(time, 1)) > 0.02
-    expected = 3.0 * np.sign(spline(time, 1)) + 5.0 * (motion / 0.02) ** 3
-    np.testing.assert_allclose(rest[moving], expected[moving], atol=1e-6)
-    # where a drive begins at rest its spline's slope is not quite zero, but friction, of its sign, is
-    time = 0.025 * np.arange(100.0)
-    for motion, begin in ((-0.02 * np.cos(9.0 * time), 0.0), (0.02 * np.sin(9.0 * time), 3.0)):
-        what = trial(time, actuator(motion - motion[0]))
-        rest = (seen(model, what, CELL, FRICTION) - seen(model, what, CELL))[:, 0]
-        assert rest[0] == pytest.approx(begin, abs=1e-6)
+    return DrivenDamper(settled, motion, speed=spline(time, 1), acceleration=spline(time, 2))
+
+
+def test_a_driven_damper_shows_its_forces(driven_damper: DrivenDamper) -> None:
+    """Those of the spline of its motion, and but at the ends those of the motion itself."""
+    time = driven_damper.trial.time
+    force = seen(rig("damper"), driven_damper.trial, CELL)[:, 0]
+    analytic = 300.0 * driven_damper.motion
+    analytic += 25.0 * 0.18 * np.cos(9.0 * time)
+    analytic -= 0.4 * 1.62 * np.sin(9.0 * time)
+    np.testing.assert_allclose(force, driven_damper.linear_force, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(force[5:-5], analytic[5:-5], atol=2e-3)
+
+
+def test_a_driven_damper_shows_the_forces_of_laws(driven_damper: DrivenDamper) -> None:
+    stiffening = PowerStiffness("piston", 5.0, 3.0, 0, 0.02)
+    force = seen(rig("damper"), driven_damper.trial, CELL, FRICTION, stiffening)[:, 0]
+    force_of_laws = force - driven_damper.linear_force
+    moving = np.abs(driven_damper.speed) > 0.02
+    expected = 3.0 * np.sign(driven_damper.speed) + 5.0 * (driven_damper.motion / 0.02) ** 3
+    np.testing.assert_allclose(force_of_laws[moving], expected[moving], atol=1e-6)
+
+
+SLOW_TIME = 0.025 * np.arange(100.0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "first_force"),
+    [(-0.02 * np.cos(9.0 * SLOW_TIME), 0.0), (0.02 * np.sin(9.0 * SLOW_TIME), 3.0)],
+    ids=["from rest", "moving"],
+)
+def test_friction_at_the_begin_of_a_drive_is_none_from_rest(motion: FloatArray, first_force: float) -> None:
+    """Though the slope of the drive's spline is not quite zero there, and friction has its sign."""
+    driven = trial(SLOW_TIME, actuator(motion - motion[0]))
+    model = rig("damper")
+    force_of_friction = (seen(model, driven, CELL, FRICTION) - seen(model, driven, CELL))[:, 0]
+    assert force_of_friction[0] == pytest.approx(first_force, abs=1e-6)
 
 
 @pytest.fixture
@@ -232,20 +323,38 @@ def test_friction_at_a_travelling_base_acts_as_on_a_base_at_rest_under_the_force
     np.testing.assert_allclose(found - way, stretch, rtol=0.0, atol=1e-10)
 
 
-def test_plain_models_take_driven_trials_and_other_begins() -> None:
-    model, time = LumpedModel.load("three_mass_chain"), 0.01 * np.arange(300)
-    force, outputs = np.cos(7.0 * time), {"x1": Quantity.DISPLACEMENT, "x3": Quantity.ACCELERATION}
-    said = {"kind": TrialKind.FORCED, "load_place": "end", "begins": Start.SETTLED}
-    forced = trial(time, force=force, **said)
-    friction = PowerDamping("joint", 0.3, 0.0, 0.0, 1.0, 1.0)
-    for hold, laws in itertools.product((None, *Hold), ((), (friction,))):
-        driven = trial(time, RecordedInput("end", Quantity.FORCE, force, hold), begins=Start.SETTLED)
-        one, other = (seen(model, what, outputs, *laws) for what in (replace(forced, hold=hold), driven))
-        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(one).max())
-    still = seen(model, replace(forced, begins=Start.STILL), outputs)
-    assert still[0, 0] == 0.0
-    blank = trial(np.r_[0.0, time + 1e-9], force=np.r_[0.0, force], **said)
-    np.testing.assert_allclose(still, seen(model, blank, outputs)[1:], atol=1e-6 * np.abs(still).max())
+CHAIN = LumpedModel.load("three_mass_chain")
+CHAIN_OUTPUTS = {"x1": Quantity.DISPLACEMENT, "x3": Quantity.ACCELERATION}
+CHAIN_TIME = 0.01 * np.arange(300)
+CHAIN_FORCE = np.cos(7.0 * CHAIN_TIME)
+
+
+def forced_chain(time: FloatArray, force: FloatArray) -> Trial:
+    """Return a trial of the chain under a force at its end, which it has settled under."""
+    settled = {"kind": TrialKind.FORCED, "load_place": "end", "begins": Start.SETTLED}
+    return trial(time, force=force, **settled)
+
+
+@pytest.mark.parametrize("hold", [None, *Hold])
+@pytest.mark.parametrize("laws", [(), (PowerDamping("joint", 0.3, 0.0, 0.0, 1.0, 1.0),)])
+def test_a_driven_trial_of_a_plain_model_is_one_under_a_force(
+    hold: Hold | None, laws: tuple[PowerDamping, ...]
+) -> None:
+    forced = replace(forced_chain(CHAIN_TIME, CHAIN_FORCE), hold=hold)
+    recorded = RecordedInput("end", Quantity.FORCE, CHAIN_FORCE, hold)
+    driven = trial(CHAIN_TIME, recorded, begins=Start.SETTLED)
+    response = seen(CHAIN, forced, CHAIN_OUTPUTS, *laws)
+    tolerance = 1e-9 * np.abs(response).max()
+    np.testing.assert_allclose(response, seen(CHAIN, driven, CHAIN_OUTPUTS, *laws), atol=tolerance)
+
+
+def test_a_motion_from_rest_is_one_that_had_settled_without_a_force() -> None:
+    forced = forced_chain(CHAIN_TIME, CHAIN_FORCE)
+    from_rest = seen(CHAIN, replace(forced, begins=Start.STILL), CHAIN_OUTPUTS)
+    unloaded_first = forced_chain(np.r_[0.0, CHAIN_TIME + 1e-9], np.r_[0.0, CHAIN_FORCE])
+    settled = seen(CHAIN, unloaded_first, CHAIN_OUTPUTS)[1:]
+    assert from_rest[0, 0] == 0.0
+    np.testing.assert_allclose(from_rest, settled, atol=1e-6 * np.abs(from_rest).max())
 
 
 # ---------------------------------------------------------------- controllers and own laws
@@ -253,42 +362,59 @@ def test_plain_models_take_driven_trials_and_other_begins() -> None:
 
 @pytest.mark.parametrize(("hold", "measured"), [("linear", False), ("zero_order", True)])
 def test_a_pendulum_follows_its_target_as_integrated(hold: str, measured: bool) -> None:
-    model = model_of(INPUTS.text("pendulum.toml") + 'derivative_of = "measurement"\n' * measured)
+    """The controller takes the derivative of the error, or of the measurement alone."""
+    text = INPUTS.text("pendulum.toml")
+    model = model_of(text + 'derivative_of = "measurement"\n' if measured else text)
     time = np.linspace(0.0, 1.5, 90) ** 1.1  # uneven
-    target, weight, servo, gain = 1.5 * np.sin(2.0 * time) + 0.3, 1.1, 0.9, 1.3
-    what = trial(time, RecordedInput("target", Quantity.ANGLE, target, Hold(hold)))
-    outputs = {"angle": Quantity.ANGLE, "torque": Quantity.TORQUE}
-    found = seen(model, what, outputs, parameters=np.array([weight, servo, gain]), refinement=4)
+    target = 1.5 * np.sin(2.0 * time) + 0.3
+    slopes = np.zeros(89) if measured else np.diff(target) / np.diff(time)
+    weight, servo, gain = 1.1, 0.9, 1.3  # the factors of the model's parameters
 
-    def terms(t: float, state: FloatArray, k: int) -> tuple[float, float]:
-        """What is wanted, and the torque that the controller gives."""
-        slope = 0.0 if measured else (target[k + 1] - target[k]) / (time[k + 1] - time[k])
-        wanted = target[k] + slope * (t - time[k])
-        given = servo * (40.0 * (wanted - state[0]) + 30.0 * state[2]) + 2.0 * (slope - state[1])
-        return wanted, gain * given
+    def target_at(t: float, k: int) -> float:
+        return float(target[k] + slopes[k] * (t - time[k]))
+
+    def torque_at(t: float, state: FloatArray, k: int) -> float:
+        """Return the torque that the controller gives; states are angle, speed and integral of the error."""
+        angle, speed, integral = state
+        proportional_and_integral = 40.0 * (target_at(t, k) - angle) + 30.0 * integral
+        return float(gain * (servo * proportional_and_integral + 2.0 * (slopes[k] - speed)))
 
     def rate(t: float, state: FloatArray, k: int) -> list[float]:
-        wanted, torque = terms(t, state, k)
-        push = torque - 0.1 * state[1] - weight * 2.7 * np.sin(state[0])
-        return [state[1], push / 0.14, wanted - state[0]]
+        angle, speed, _ = state
+        moment = torque_at(t, state, k) - 0.1 * speed - weight * 2.7 * np.sin(angle)
+        return [speed, moment / 0.14, target_at(t, k) - angle]
 
-    true = integrated(rate, time, np.zeros(3), parts=True, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(found[:, 0], true[:, 0], atol=1e-4)
-    given = [terms(time[k + 1], true[k + 1], k)[1] for k in range(len(time) - 1)]
-    np.testing.assert_allclose(found[1:, 1], given, atol=6e-3)
+    driven = trial(time, RecordedInput("target", Quantity.ANGLE, target, Hold(hold)))
+    outputs = {"angle": Quantity.ANGLE, "torque": Quantity.TORQUE}
+    response = seen(model, driven, outputs, parameters=np.array([weight, servo, gain]), refinement=4)
+
+    states = integrated(rate, time, np.zeros(3), parts=True, rtol=1e-9, atol=1e-11)
+    torques = [torque_at(time[k + 1], states[k + 1], k) for k in range(len(time) - 1)]
+    np.testing.assert_allclose(response[:, 0], states[:, 0], atol=1e-4)
+    np.testing.assert_allclose(response[1:, 1], torques, atol=6e-3)
 
 
 def test_a_speed_is_held_with_a_proportional_and_an_integral_gain() -> None:
+    """The target of 2.6 is recorded with an offset of 0.4."""
     loop = 'name = "position", quantity = "angular_velocity", reference = "target", vector = 1.0, acts = 1.0'
-    text = f"{INPUTS.text('servo.toml')}controller = [{{ {loop}, proportional = 0.5, integral = 2.0 }}]"
-    time, outputs = np.linspace(0.0, 2.0, 60), {"angle": Quantity.ANGULAR_VELOCITY, "torque": Quantity.TORQUE}
-    what = trial(time, RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 2.6), Hold.ZERO_ORDER))
-    found = seen(model_of(text), what, outputs, offset=(0.4,))
-    true = integrated(
-        lambda t, y: [(0.5 * (3.0 - y[0]) + 2.0 * y[1] - 0.1 * y[0]) / 0.14, 3.0 - y[0]], time, np.zeros(2)
-    )
-    given = 0.5 * (3.0 - true[:, 0]) + 2.0 * true[:, 1]
-    np.testing.assert_allclose(found, np.stack((true[:, 0], given), axis=1), atol=1e-8)
+    servo = INPUTS.text("servo.toml")
+    model = model_of(f"{servo}controller = [{{ {loop}, proportional = 0.5, integral = 2.0 }}]")
+    time = np.linspace(0.0, 2.0, 60)
+    target = RecordedInput("target", Quantity.ANGULAR_VELOCITY, np.full(60, 2.6), Hold.ZERO_ORDER)
+    outputs = {"angle": Quantity.ANGULAR_VELOCITY, "torque": Quantity.TORQUE}
+
+    def torque(speed: Any, integral: Any) -> Any:
+        return 0.5 * (3.0 - speed) + 2.0 * integral
+
+    def rate(t: float, state: FloatArray) -> list[float]:
+        speed, integral = state
+        return [(torque(speed, integral) - 0.1 * speed) / 0.14, 3.0 - speed]
+
+    response = seen(model, trial(time, target), outputs, offset=(0.4,))
+
+    speed, integral = integrated(rate, time, np.zeros(2)).T
+    expected = np.column_stack((speed, torque(speed, integral)))
+    np.testing.assert_allclose(response, expected, atol=1e-8)
 
 
 def test_a_rig_at_rest_has_the_temperature_of_each_level_and_what_holds_it() -> None:
@@ -357,14 +483,19 @@ DRAG = PowerDamping("slide", 40.0, 2.0, 0.0, 1.0, 1.0)
 
 def moved(law: Callable[[float, float, float], float], edges: Any, kind: TrialKind) -> FloatArray:
     """Return the motion under the force, or let go, with `law(t, x, v)` between two edges, piece by piece."""
-    time, pushed = np.union1d(TIME, edges), float(kind is TrialKind.FORCED)
+    time = np.union1d(TIME, edges)
+    is_forced = kind is TrialKind.FORCED
+    begin, end = edges
 
-    def slope(t: float, y: FloatArray, k: int) -> list[float]:
-        own = law(t, *y) if edges[0] <= time[k] < edges[1] else 0.0
-        return [y[1], (pushed * np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
+    def rate(t: float, state: FloatArray, k: int) -> list[float]:
+        displacement, speed = state
+        force_of_law = law(t, displacement, speed) if begin <= time[k] < end else 0.0
+        force = np.interp(t, TIME, FORCE) if is_forced else 0.0
+        return [speed, (force - STIFFNESS * displacement - force_of_law) / MASS]
 
-    start = np.array([0.0 if pushed else 0.05, 0.0])
-    return integrated(slope, time, start, parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
+    initial = np.array([0.0 if is_forced else 0.05, 0.0])
+    states = integrated(rate, time, initial, parts=True, rtol=1e-9)
+    return states[np.isin(time, TIME), 0]
 
 
 @pytest.mark.parametrize(
@@ -445,22 +576,61 @@ def shown(*changes: Primitive, given: Any = LOGGED, at: Any = (1.0, 1.0), what: 
     return observe(SHAKEN, given, what, patch.ModelPatch(changes), Conditions(np.array(at))).values
 
 
-def test_each_logger_has_its_own_clock_and_one_alone_is_a_stiffer_rig_under_a_larger_load() -> None:
-    one, square = shown(patch.LoggerClock("*", RATE), given=replace(LOGGED, loggers={})), (1.0 + RATE) ** 2
-    alias = shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
-    np.testing.assert_allclose(one, alias, atol=1e-9 * np.abs(alias).max())
-    clocks = patch.LoggerClock("film", RATE), patch.LoggerClock("rack", RATE), patch.Clock(RATE, 0.0)
-    film, rack, motion = map(shown, clocks)
+@pytest.fixture(scope="module")
+def alias() -> FloatArray:
+    """The response of a stiffer rig under a larger load, which a fast clock of all loggers resembles."""
+    square = (1.0 + RATE) ** 2
+    return shown(patch.LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
+
+
+@pytest.fixture(scope="module")
+def one_logger() -> FloatArray:
+    """The response where the only logger has a fast clock."""
+    return shown(patch.LoggerClock("*", RATE), given=replace(LOGGED, loggers={}))
+
+
+def test_the_clock_of_one_logger_alone_is_a_stiffer_rig_under_a_larger_load(
+    one_logger: FloatArray, alias: FloatArray
+) -> None:
+    np.testing.assert_allclose(one_logger, alias, atol=1e-9 * np.abs(alias).max())
+
+
+def test_the_clock_of_a_logger_is_not_that_of_the_motion(one_logger: FloatArray, alias: FloatArray) -> None:
+    motion = shown(patch.Clock(RATE, 0.0))
+    assert np.abs(one_logger - motion).max() > 0.05 * np.abs(alias).max()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        patch.LoggerClock("film", RATE),
+        patch.LoggerClock("rack", RATE),
+        patch.Clock(RATE, 0.0),
+        patch.StiffnessDrift(0.05),
+    ],
+    ids=["film", "rack", "motion", "drift"],
+)
+def test_a_clock_counts_from_the_begin_of_a_trial(change: Primitive, alias: FloatArray) -> None:
     later = replace(SWEPT, time=1e5 + STAMPS)  # of the day
-    for change in (*clocks, patch.StiffnessDrift(0.05)):
-        np.testing.assert_allclose(shown(change, what=later), shown(change), atol=1e-5 * np.abs(alias).max())
-    assert np.abs(one - motion).max() > 0.05 * np.abs(alias).max()
+    np.testing.assert_allclose(shown(change, what=later), shown(change), atol=1e-5 * np.abs(alias).max())
+
+
+def test_each_logger_has_its_own_clock(one_logger: FloatArray) -> None:
+    """The rack logs the first channel and the load, the film the second one."""
+    film = shown(patch.LoggerClock("film", RATE))
+    rack = shown(patch.LoggerClock("rack", RATE))
     np.testing.assert_array_equal(film[:, 0], shown()[:, 0])
-    np.testing.assert_array_equal(film[:, 1], motion[:, 1])
-    np.testing.assert_allclose(rack[:, 0], one[:, 0], atol=1e-12)
-    # the camera sees the stretched motion at its own, right times
+    np.testing.assert_array_equal(film[:, 1], shown(patch.Clock(RATE, 0.0))[:, 1])
+    np.testing.assert_allclose(rack[:, 0], one_logger[:, 0], atol=1e-12)
+
+
+def test_a_camera_sees_a_stretched_motion_at_its_own_right_times() -> None:
+    rack = shown(patch.LoggerClock("rack", RATE))
     stretched = replace(SWEPT, time=(1.0 + RATE) * STAMPS)
     true = shown(patch.Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), what=stretched)
     np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
+
+
+def test_the_clock_of_an_unknown_logger_is_refused() -> None:
     with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
         shown(patch.LoggerClock("tape", RATE))

@@ -23,8 +23,9 @@ from discrepancy.system.system_state import SystemState
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import cache_file
 from fe.reduction.reduced_basis import reduce_structure
-from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, RootCompliance
+from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, Primitive, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import load_design
@@ -203,38 +204,74 @@ def test_it_is_the_structure_at_rest(beam: Pair, pushed_beam) -> None:
         beam.both(named, health=health[:, ::-1])
 
 
-@pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT, TrialKind.RINGDOWN, TrialKind.FORCED])
-@pytest.mark.parametrize("laws", [(), (SPRING,)])
-def test_it_is_its_fmu(kind: TrialKind, laws: tuple[PowerStiffness, ...], beam: Pair) -> None:
-    """All kinds of trials, with and without a spring at the tip."""
-    one, other = (
+KINDS_OF_TRIALS = pytest.mark.parametrize(
+    "kind", [TrialKind.STATIC, TrialKind.FLIGHT, TrialKind.RINGDOWN, TrialKind.FORCED]
+)
+WITH_AND_WITHOUT_SPRING = pytest.mark.parametrize("laws", [(), (SPRING,)], ids=["plain", "spring at the tip"])
+
+
+def trial_of_kind(kind: TrialKind, phase: float) -> Trial:
+    """Return forty samples of a trial under a load that oscillates, or of the release."""
+    load = np.sin(np.arange(40) / 4.0 + phase)
+    actions = {TrialKind.FLIGHT: {"load_factor": load}, TrialKind.RINGDOWN: {"release": RELEASED.release}}
+    return record(kind, 40, 2e-5, **actions.get(kind, {"force": 50.0 * load}))
+
+
+def test_it_has_the_parameters_of_its_fmu(beam: Pair) -> None:
+    model, fmu = (
         [(p.name, p.mean, pytest.approx(p.deviation), p.low, p.high) for p in model.parameters]
         for model in beam[:2]
     )
-    assert one == other
-    load = np.sin(np.arange(40) / 4.0 + 0.5 * (not laws))
-    acts = {TrialKind.FLIGHT: {"load_factor": load}, TrialKind.RINGDOWN: {"release": RELEASED.release}}
-    what = record(kind, 40, 2e-5, **acts.get(kind, {"force": 50.0 * load}))
-    assert beam.share(what, *laws) < (5e-3 if what.is_dynamic else 1e-8)
-    if what.is_dynamic:  # from the first step on: the FMU shows no acceleration as it is let go
-        one, other = (values[1:] for values in beam.both(what, *laws, outputs=SHAKEN))
-        assert np.abs(one - other).max() < 5e-3 * np.abs(one).max()
+    assert model == fmu
 
 
-def test_what_no_trial_records_acts_always(write_beam, tmp_path: Path) -> None:
-    """Gravity, where it is not a load factor: at rest and in motion, with a spring that stiffens."""
+@KINDS_OF_TRIALS
+@WITH_AND_WITHOUT_SPRING
+def test_it_responds_as_its_fmu(kind: TrialKind, laws: tuple[PowerStiffness, ...], beam: Pair) -> None:
+    trial = trial_of_kind(kind, phase=0.0 if laws else 0.5)
+    assert beam.share(trial, *laws) < (5e-3 if trial.is_dynamic else 1e-8)
+
+
+@pytest.mark.parametrize("kind", [TrialKind.RINGDOWN, TrialKind.FORCED])
+@WITH_AND_WITHOUT_SPRING
+def test_it_has_the_accelerations_of_its_fmu(
+    kind: TrialKind, laws: tuple[PowerStiffness, ...], beam: Pair
+) -> None:
+    """From the first step on: the FMU shows no acceleration as it is let go."""
+    trial = trial_of_kind(kind, phase=0.0 if laws else 0.5)
+    of_model, of_fmu = (values[1:] for values in beam.both(trial, *laws, outputs=SHAKEN))
+    assert np.abs(of_model - of_fmu).max() < 5e-3 * np.abs(of_model).max()
+
+
+@pytest.fixture
+def beam_under_gravity(write_beam, tmp_path: Path) -> ReducedModel:
+    """The beam whose gravity is an input of its own, not a load factor."""
     changes = {"load_factor": "gee", 'set = "end", force': "point = [100, 10, 5], force"}
-    reduced = reduce_structure(load_and_assemble(write_beam(tmp_path, changes, cells=2))).model
-    model, wanted = StructureModel(reduced), reduced.static_response({"push": 0.0})
-    still = {"force": np.zeros(3)}
-    trials = [record(kind, 3, 1e-4, **still) for kind in (TrialKind.STATIC, TrialKind.FORCED)]
-    for what in trials:
-        found = seen(model, what, BEAM, parameters=model.prior_mean())
-        assert found == pytest.approx(np.tile([wanted.displacement[0], wanted.strain[0]], (3, 1)), rel=1e-6)
-    stiff = PowerStiffness("tip", 100.0, 3.0, 0, 1e-6)
-    held, moved = (seen(model, what, BEAM, stiff, parameters=model.prior_mean()) for what in trials)
-    assert moved == pytest.approx(held, rel=1e-2)
-    assert abs(held[0, 0]) < 0.5 * abs(found[0, 0])
+    return reduce_structure(load_and_assemble(write_beam(tmp_path, changes, cells=2))).model
+
+
+UNLOADED = [record(kind, 3, 1e-4, force=np.zeros(3)) for kind in (TrialKind.STATIC, TrialKind.FORCED)]
+"""At rest and in motion."""
+
+
+@pytest.mark.parametrize("trial", UNLOADED, ids=["static", "forced"])
+def test_what_no_trial_records_acts_always(trial: Trial, beam_under_gravity: ReducedModel) -> None:
+    response = beam_under_gravity.static_response({"push": 0.0})
+    expected = np.tile([response.displacement[0], response.strain[0]], (3, 1))
+    model = StructureModel(beam_under_gravity)
+    assert seen(model, trial, BEAM, parameters=model.prior_mean()) == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_acts_always_acts_on_a_spring_at_rest_and_in_motion(beam_under_gravity: ReducedModel) -> None:
+    """The spring stiffens and holds more than half of the deflection."""
+    model = StructureModel(beam_under_gravity)
+    stiffening = PowerStiffness("tip", 100.0, 3.0, 0, 1e-6)
+    free = seen(model, UNLOADED[0], BEAM, parameters=model.prior_mean())
+    at_rest, in_motion = (
+        seen(model, trial, BEAM, stiffening, parameters=model.prior_mean()) for trial in UNLOADED
+    )
+    assert in_motion == pytest.approx(at_rest, rel=1e-2)
+    assert abs(at_rest[0, 0]) < 0.5 * abs(free[0, 0])
 
 
 def test_a_force_down_beside_a_displacement_up_makes_the_port_of_that_displacement(
@@ -265,25 +302,52 @@ def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> N
 # ---------------------------------------------------------------- the wing
 
 
-def test_effects_that_the_fmu_carries_are_used(tmp_path: Path) -> None:
-    """On a coarse mesh, with two effects in the FMU."""
-    loads = record(TrialKind.STATIC, 5, 0.002, force=np.linspace(-10.0, 10.0, 5))
-    let_go = record(TrialKind.RINGDOWN, 400, 0.002, release=Release(0.01))
-    chain, arrays, items = wing_model(), wing_arrays(), (PointMass(0.3, 0.9), RootCompliance(3e-4))
-    carried = {"mass": PointMass(0.02, 1.2), "root": RootCompliance(1e-5)}
-    rows = [{"id": name, "primitives": ModelPatch((item,)).to_list()} for name, item in carried.items()]
-    content = {"schema": "uav-twin patch 1", "effects": rows, "channels": {}}
-    build_fmu(chain, tmp_path / "wing.fmu", patch=parse_patch(json.dumps(content).encode()), arrays=arrays)
-    (tmp_path / "wing.toml").write_text(INPUTS.text("wing.toml"), encoding="utf-8")
+CARRIED = {"mass": PointMass(0.02, 1.2), "root": RootCompliance(1e-5)}
+"""Effects that the FMU is packed with."""
+
+ADDED = [PointMass(0.3, 0.9), RootCompliance(3e-4)]
+"""Effects that a hypothesis adds to them."""
+
+LOADS = record(TrialKind.STATIC, 5, 0.002, force=np.linspace(-10.0, 10.0, 5))
+LET_GO = record(TrialKind.RINGDOWN, 400, 0.002, release=Release(0.01))
+
+
+@pytest.fixture(scope="module")
+def carrying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
+    """The wing on a coarse mesh, and its FMU with two effects that it carries."""
+    folder = tmp_path_factory.mktemp("carrying")
+    effects = [
+        {"id": name, "primitives": ModelPatch((primitive,)).to_list()} for name, primitive in CARRIED.items()
+    ]
+    content = {"schema": "uav-twin patch 1", "effects": effects, "channels": {}}
+    patch = parse_patch(json.dumps(content).encode())
+    build_fmu(wing_model(), folder / "wing.fmu", patch=patch, arrays=wing_arrays())
+    (folder / "wing.toml").write_text(INPUTS.text("wing.toml"), encoding="utf-8")
     prior = {row["name"]: (row["mean"], row["deviation"]) for row in INPUTS.table("wing.toml")["parameter"]}
-    with closing(FmuModel.load(tmp_path / "wing.toml")) as fmu:
-        parameters = np.array([1.02, 0.17, 0.13, 1.1, 5e-4])
-        packed = Pair(WingModel(arrays, prior=prior), fmu, WING, parameters)
-        for item in items:
-            assert all(model.supports(type(item)) for model in packed[:2])
-            (_, plain), (_, changed) = packed.both(let_go), packed.both(let_go, item)
-            assert np.max(np.abs(changed - plain)) > 0.01 * np.max(np.abs(plain))
-            assert packed.share(let_go, item) < 1e-4
-            assert packed.share(loads, item) < 1e-8
-            with pytest.raises(ModelError, match=f"two primitives '{item.kind}'"):
-                packed.both(loads, item, item)
+    parameters = np.array([1.02, 0.17, 0.13, 1.1, 5e-4])
+    with closing(FmuModel.load(folder / "wing.toml")) as fmu:
+        yield Pair(WingModel(wing_arrays(), prior=prior), fmu, WING, parameters)
+
+
+EACH_ADDED = pytest.mark.parametrize("primitive", ADDED, ids=lambda primitive: primitive.kind)
+
+
+@EACH_ADDED
+def test_effects_that_the_fmu_carries_are_supported(carrying: Pair, primitive: Primitive) -> None:
+    assert all(model.supports(type(primitive)) for model in carrying[:2])
+
+
+@EACH_ADDED
+def test_effects_that_the_fmu_carries_are_used(carrying: Pair, primitive: Primitive) -> None:
+    """In a release they change what the FMU shows, as they change what the model shows."""
+    _, plain = carrying.both(LET_GO)
+    _, changed = carrying.both(LET_GO, primitive)
+    assert np.max(np.abs(changed - plain)) > 0.01 * np.max(np.abs(plain))
+    assert carrying.share(LET_GO, primitive) < 1e-4
+    assert carrying.share(LOADS, primitive) < 1e-8
+
+
+@EACH_ADDED
+def test_an_effect_that_the_fmu_carries_once_is_not_added_twice(carrying: Pair, primitive: Primitive) -> None:
+    with pytest.raises(ModelError, match=f"two primitives '{primitive.kind}'"):
+        carrying.both(LOADS, primitive, primitive)

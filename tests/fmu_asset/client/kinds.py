@@ -98,36 +98,47 @@ HOSTILE, WING_BINDING, SPRING_BINDING = (
 def statics(kind: Kind, ours: OurFmus) -> Shown:
     """The static response to each row of inputs; accelerations are zero."""
     model = ours.model(kind.file)
-    given = {name: value for name, value in kind.parameters.items() if name != "response"}
-    found = [model.static_response({**row, **given}) for row in kind.rows]
-    bounds = {"strain_error_bound": [item.strain_error_bound for item in found]}
+    parameters = {name: value for name, value in kind.parameters.items() if name != "response"}
+    responses = [model.static_response({**row, **parameters}) for row in kind.rows]
+    strains = [response.strain for response in responses]
+    strain_error_bounds = [response.strain_error_bound for response in responses]
     if kind.file == "beam":
-        return [[*item.strain, *item.displacement, 0.0] for item in found], bounds
-    tips = {"tip_displacement": [item.displacement[0] for item in found]}
-    return [item.strain for item in found], bounds | tips
+        values = [[*response.strain, *response.displacement, 0.0] for response in responses]
+        return values, {"strain_error_bound": strain_error_bounds}
+    tip_displacements = [response.displacement[0] for response in responses]
+    return strains, {
+        "strain_error_bound": strain_error_bounds,
+        "tip_displacement": tip_displacements,
+    }
 
 
 def motion(kind: Kind, ours: OurFmus) -> Shown:
     """The modal integrator: a release, loads that jump, health that changes on the way."""
-    model, given = ours.model(kind.file), kind.parameters
-    damping = [
-        given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))
-    ]
-    begin = model.vector(dict(ChainMap(*kind.start.values())))
-    now = ModalIntegrator(model.structure_at(begin), *damping)
-    tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(begin)
-    state = (
-        now.state_after_release(tip, at_start, TIP_FORCE) if tip else now.state_at_rest(at_start)
-    )
-    health, shown = dict.fromkeys(model.regions, 0.0) | kind.start.get("health", {}), []
+    model = ours.model(kind.file)
+    parameters = kind.parameters
+    damping_alpha = parameters.get("damping_alpha", model.damping[0])
+    damping_beta = parameters.get("damping_beta", model.damping[1])
+    initial_inputs = model.vector(dict(ChainMap(*kind.start.values())))
+    integrator = ModalIntegrator(model.structure_at(initial_inputs), damping_alpha, damping_beta)
+    initial_loads = model.load_coefficients(initial_inputs)
+    tip_displacement = parameters.get("initial_tip_displacement", 0.0)
+    if tip_displacement:
+        state = integrator.state_after_release(tip_displacement, initial_loads, TIP_FORCE)
+    else:
+        state = integrator.state_at_rest(initial_loads)
+    health = dict.fromkeys(model.regions, 0.0) | kind.start.get("health", {})
+    outputs = []
     for row in kind.rows:
-        vector = model.vector(row)
-        if health != (health := {name: row[name] for name in model.regions}):
-            was, now = now, ModalIntegrator(model.structure_at(vector), *damping)
-            state = now.take_over(state, was)
-        state = now.advance(state, kind.binding.step_size, model.load_coefficients(vector))
-        shown.append(now.outputs(state))
-    values = np.array(shown)
+        inputs = model.vector(row)
+        health_of_row = {name: row[name] for name in model.regions}
+        if health_of_row != health:
+            health = health_of_row
+            previous = integrator
+            integrator = ModalIntegrator(model.structure_at(inputs), damping_alpha, damping_beta)
+            state = integrator.take_over(state, previous)
+        state = integrator.advance(state, kind.binding.step_size, model.load_coefficients(inputs))
+        outputs.append(integrator.outputs(state))
+    values = np.array(outputs)
     if kind.file == "beam":
         return values, {}
     return values[:, :-1], {"tip_displacement": values[:, -1]}
@@ -159,11 +170,14 @@ def spring(kind: Kind, _: OurFmus) -> Shown:
 
 def lag(kind: Kind, _: OurFmus) -> Shown:
     """Out1' = (K In1 - Out1) / T, exact for inputs that are held; `hold` stops it."""
-    gain, rest = kind.parameters["gain"], math.exp(-kind.binding.interval / kind.parameters["time"])
+    gain = kind.parameters["gain"]
+    decay = math.exp(-kind.binding.interval / kind.parameters["time"])
 
-    def move(out: float, row: dict[str, Any]) -> float:
+    def move(output: float, row: dict[str, Any]) -> float:
+        if row["hold"]:
+            return output
         steady = gain * row["speed"]
-        return out if row["hold"] else steady + (out - steady) * rest
+        return steady + (output - steady) * decay
 
     return after(kind, 0.0, move)[:, np.newaxis], {"count": calls(kind)}
 

@@ -103,15 +103,14 @@ class Slave:
 
     def derivative(self, unknowns: Sequence[str], seed: Mapping[str, float]) -> np.ndarray:
         """Return the directional derivative of variables."""
-        places, given = (
-            [self.reference[n] for n in unknowns],
-            {self.reference[n]: v for n, v in seed.items()},
-        )
-        (results, order), (knowns, sown) = self._whole(places), self._whole(list(given))
+        unknown_references = [self.reference[name] for name in unknowns]
+        seed_by_reference = {self.reference[name]: value for name, value in seed.items()}
+        results, order = self._whole(unknown_references)
+        knowns, known_order = self._whole(list(seed_by_reference))
+        seeds = [seed_by_reference.get(reference, 0.0) for reference in known_order]
         count = [len(order)] if self.three else []
-        seeds = [given.get(place, 0.0) for place in sown]
-        found = self.fmu.getDirectionalDerivative(results, knowns, seeds, *count)
-        return np.array([found[order.index(place)] for place in places])
+        derivatives = self.fmu.getDirectionalDerivative(results, knowns, seeds, *count)
+        return np.array([derivatives[order.index(reference)] for reference in unknown_references])
 
     # ------------------------------------------------------------------ life
 

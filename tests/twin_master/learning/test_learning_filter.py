@@ -1,6 +1,5 @@
 """What is learnt and expected, against sums over all trajectories, draws and factors, and closed forms."""
 
-from functools import cache
 from itertools import product
 from typing import Any
 
@@ -9,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t, norm
 
+from tests.costs import once
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import estimates_of
 from twin_master.learning.draw_posterior import posterior_of_draws
@@ -47,7 +47,7 @@ def observations() -> Float:
     return seen
 
 
-@cache
+@once
 def enumerated(steps: int) -> Float:
     """Return p(path, draw, factor, o) over everything: (paths of S^T, E, R), not normalised."""
     sensor = sensors()
@@ -207,22 +207,36 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
                 np.testing.assert_allclose(found.reward_standard_deviation[t, place], deviation[0], atol=1e-7)
 
 
-def test_predicted_follows_the_scenario_through_the_policy():
+@pytest.fixture(scope="module")
+def predicted_two_steps():
+    """What is predicted two steps ahead of the last one."""
     *_, step = estimates_of(learner_of_all(), observations(), CONTROLS)
     expectation = LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
-    found = expectation.predicted([step.carried], [step.filtered], [POLICY], 2)
-    table = enumerated(STEPS).sum(axis=(0, 1, 2, 5))  # (S, E)
-    table = table / table.sum()
-    matrix, value = model().transition.matrix, sensors().value_per_draw
-    # p(D_t+1, D_t+2, U_t+2, draw), over D_t = n and U_t+1 = u
-    weight = np.einsum("nd,no,ou,uot,tv->otvd", table, matrix[CONTROLS[-1]], POLICY, matrix, POLICY)
-    shown = np.broadcast_to(value.transpose(1, 2, 0, 3), (3, 3, 2, DRAWS, GAUGES))
-    mean, deviation = moments(shown, weight)
-    np.testing.assert_allclose(found.mean[0, 1], mean, atol=1e-8)
-    np.testing.assert_allclose(found.standard_deviation[0, 1], deviation, atol=1e-8)
-    assert np.isnan(found.reward_mean[..., 2]).all()
-    asked = weight.sum(axis=(0, 1, 3)) @ [-0.1, 0.1]
-    assert found.reward_mean[0, 1, 1] == pytest.approx(asked)
+    return expectation.predicted([step.carried], [step.filtered], [POLICY], 2)
+
+
+def joint_two_steps_ahead():
+    """Return p(D_t+1, D_t+2, U_t+2, draw), over D_t = n and U_t+1 = u."""
+    joint = enumerated(STEPS).sum(axis=(0, 1, 2, 5))  # (S, E)
+    filtered = joint / joint.sum()
+    transition = model().transition.matrix
+    return np.einsum("nd,no,ou,uot,tv->otvd", filtered, transition[CONTROLS[-1]], POLICY, transition, POLICY)
+
+
+def test_predicted_follows_the_scenario_through_the_policy(predicted_two_steps):
+    values = sensors().value_per_draw.transpose(1, 2, 0, 3)
+    by_first_state = np.broadcast_to(values, (3, 3, 2, DRAWS, GAUGES))
+    mean, deviation = moments(by_first_state, joint_two_steps_ahead())
+    np.testing.assert_allclose(predicted_two_steps.mean[0, 1], mean, atol=1e-8)
+    np.testing.assert_allclose(predicted_two_steps.standard_deviation[0, 1], deviation, atol=1e-8)
+
+
+def test_of_the_rewards_that_of_the_control_is_predicted(predicted_two_steps):
+    """That of what is observed is not: nothing has been observed there."""
+    control_probability = joint_two_steps_ahead().sum(axis=(0, 1, 3))
+    reward = predicted_two_steps.reward_mean
+    assert np.isnan(reward[..., 2]).all()
+    assert reward[0, 1, 1] == pytest.approx(control_probability @ [-0.1, 0.1])
 
 
 SIGMA = 0.5
@@ -336,15 +350,18 @@ def test_quantiles_are_those_of_the_mixture():
 
 
 def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
+    """Its mean lies half way between draws on both sides."""
     sensor = sensors()
     learner = LearningFilter(model(), sensor, NOTHING, ("e", [1.1, 0.9, 1.0]))
     rewards = RewardModel(sensor, 1.0, (0.0, 0.1), 1.0)
+    expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
     joint = np.zeros((1, 3, 2))
     joint[0, 1, 1] = 1.0
-    told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
-    expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
-    found = expectation.from_marginals(told, joint, slice(None), None)
-    value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
-    np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
-    spread = np.sqrt(weight @ (value - weight @ value) ** 2)
-    np.testing.assert_allclose(found.standard_deviation[0], spread, rtol=1e-9)
+    learnt = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}
+    expected = expectation.from_marginals(learnt, joint, slice(None), None)
+    values = sensor.value_per_draw[:, 1, 1]
+    weights = np.array([0.25, 0.25, 0.5])
+    mean = weights @ values
+    deviation = np.sqrt(weights @ (values - mean) ** 2)
+    np.testing.assert_allclose(expected.mean[0], mean, rtol=1e-12)
+    np.testing.assert_allclose(expected.standard_deviation[0], deviation, rtol=1e-9)

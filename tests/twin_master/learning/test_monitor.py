@@ -147,22 +147,38 @@ def test_a_model_that_takes_the_place_of_another_begins_without_suspicion(loose_
     assert not estimate.notices
 
 
-def test_shares_of_hypotheses_switch_as_their_chain_says():
-    begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
-    weights = HypothesisWeights.initial(0.01, begins, 0, 1)
-    np.testing.assert_allclose(np.exp(weights.current), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
-    hazard, ends, chain = 0.03, hypothesis_weights.END_PROBABILITY, np.zeros((7, 7))
-    chain[0] = hazard * np.array([0.0, 0.0, 0.5, *[0.125] * 4])
+def switching_chain(hazard: float) -> np.ndarray:
+    """Return the transitions (7, 7) of the hypotheses: no fault, after a fault, drift, four gains.
+
+    A fault begins with the hazard, and it ends; after it only a drift begins.
+    """
+    ends = hypothesis_weights.END_PROBABILITY
+    chain = np.zeros((7, 7))
     chain[0, 0] = 1.0 - hazard
-    chain[1, [0, 2]], chain[1, 1] = (ends, 0.5 * hazard), 1.0 - ends - 0.5 * hazard
-    chain[2:, 1], chain[range(2, 7), range(2, 7)] = ends, 1.0 - ends
+    chain[0, 2] = 0.5 * hazard
+    chain[0, 3:] = 0.125 * hazard
+    chain[1, 0] = ends
+    chain[1, 2] = 0.5 * hazard
+    chain[1, 1] = 1.0 - ends - 0.5 * hazard
+    chain[2:, 1] = ends
+    chain[2:, 2:] += (1.0 - ends) * np.eye(5)
+    return chain
+
+
+def test_shares_of_hypotheses_switch_as_their_chain_says():
+    hazard = 0.03
+    shares_at_begin = 0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)])
+    log_shares_at_begin = np.log(shares_at_begin + 1e-300)
+    weights = HypothesisWeights.initial(0.01, log_shares_at_begin, 0, 1)
     expected = np.exp(weights.current)
+    np.testing.assert_allclose(expected, [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
+    chain = switching_chain(hazard)
     for _ in range(40):
-        went = ends * expected[2:]
+        expected_ended = hypothesis_weights.END_PROBABILITY * expected[2:]
         expected = expected @ chain
-        ended = weights.advance(np.log(hazard), begins)
+        ended = weights.advance(np.log(hazard), log_shares_at_begin)
         np.testing.assert_allclose(np.exp(weights.current), expected, rtol=1e-3)
-        np.testing.assert_allclose(ended / ended.sum(), went / went.sum(), rtol=1e-3)
+        np.testing.assert_allclose(ended / ended.sum(), expected_ended / expected_ended.sum(), rtol=1e-3)
     assert np.exp(weights.current).sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -207,25 +223,33 @@ def test_a_fault_that_showed_under_a_control_is_mended_by_that_control():
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_steps(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
     monkeypatch.setattr("twin_master.learning.fault_filter._GAIN_DEVIATIONS", (0.0,) * 4)
-    steps, seen = 4, drawn(np.random.default_rng(8), 4)
-    seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole step
-    known = Noticing(noise_degrees=1e9, onset_steps=3.0)
-    found = estimates_of(watchful(given=known), seen)[-1].suspicion
+    step_count = 4
+    observation = drawn(np.random.default_rng(8), step_count)
+    observation[2, 1] = np.nan  # one gauge is lost
+    observation[1] = np.nan  # a whole step is lost
+    settings = Noticing(noise_degrees=1e9, onset_steps=3.0)
+    suspicion = estimates_of(watchful(given=settings), observation)[-1].suspicion
     model, sensors = small()
-    to_begin = 0.5 / (1.0 + np.arange(steps) / 3.0)
-    first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these steps, and of none of them
+    survival = 0.5 / (1.0 + np.arange(step_count) / 3.0)
+    # that the fault begins at each of these steps, or at none of them
+    begin_probability = np.concatenate([[0.5], -np.diff(survival), [survival[-1]]])
 
     def evidence(gauge: int, gain: float, begin: int) -> float:
-        shown = sensors.value_per_draw[:, :, 0].repeat(steps, axis=1).reshape(2, 3, steps, 3)
-        shown[:, :, begin:, gauge] *= 1.0 + gain
-        density = np.nansum(norm.logpdf(seen, shown), axis=-1).swapaxes(1, 2)  # (E, T, S)
-        paths = ([*trajectories(model, [0] * steps, row)][-1][1] for row in density)
-        return 0.5 * float(sum(joint.sum() for joint in paths))
+        expected = sensors.value_per_draw[:, :, 0].repeat(step_count, axis=1).reshape(2, 3, step_count, 3)
+        expected[:, :, begin:, gauge] *= 1.0 + gain
+        log_density = np.nansum(norm.logpdf(observation, expected), axis=-1).swapaxes(1, 2)  # (E, T, S)
+        total = 0.0
+        for density_of_draw in log_density:
+            *_, (_, joint) = trajectories(model, [0] * step_count, density_of_draw)
+            total += float(joint.sum())
+        return 0.5 * total
 
     for gauge in range(3):
-        each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(steps + 1)]
-        expected = np.log(first @ each / evidence(gauge, 0.0, 0))
-        assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
+        by_begin = [
+            np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(step_count + 1)
+        ]
+        expected = np.log(begin_probability @ by_begin / evidence(gauge, 0.0, 0))
+        assert suspicion.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
 
 def test_the_first_evidence_is_a_ratio_of_two_sums():
@@ -373,20 +397,24 @@ def at_levels(name: str, between: bool) -> Knowledge:
     return prepare_twin(changed_scenario(name, FEW | {"observation": {"between_levels": between}}))
 
 
-@pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 6)])
-def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
+@pytest.mark.parametrize(("between", "flights_with_alarm"), [(True, 0), (False, 6)])
+def test_damage_between_two_levels_raises_no_alarm(between, flights_with_alarm):
     """Six flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
     panel = at_levels("stiffened_panel", between)
-    sensors, shape = panel.sensor_model, panel.model.states.shape
-    table = sensors.mean[:, 1].reshape(*shape, -1)[:, 0, 0]  # (levels, sensors), at full pressure
+    sensors = panel.sensor_model
+    level_counts = panel.model.states.shape
+    at_full_pressure = sensors.mean[:, 1].reshape(*level_counts, -1)[:, 0, 0]  # (levels, sensors)
+    loss_in_levels = np.minimum(0.25 + 0.01 * np.arange(30), 0.4) / 0.25
+    levels = np.arange(level_counts[0])
+    strain = np.column_stack([np.interp(loss_in_levels, levels, column) for column in at_full_pressure.T])
     estimator = WatchfulEstimator(panel.twin().estimator, sensors, panel.draws.values)
-    loss, alarms = np.minimum(0.25 + 0.01 * np.arange(30), 0.4) / 0.25, 0
-    shown = np.stack([np.interp(loss, np.arange(shape[0]), column) for column in table.T], axis=1)
-    for flight in range(6):
-        noise = sensors.standard_deviation * np.random.default_rng(flight).normal(size=shown.shape)
-        estimates = estimates_of(estimator, shown + noise, [1] * 30)
-        alarms += any(notice.kind == "alarm" for one in estimates for notice in one.notices)
-    assert alarms == alarmed
+
+    def has_alarm(flight: int) -> bool:
+        noise = sensors.standard_deviation * np.random.default_rng(flight).normal(size=strain.shape)
+        estimates = estimates_of(estimator, strain + noise, [1] * 30)
+        return any(notice.kind == "alarm" for estimate in estimates for notice in estimate.notices)
+
+    assert [has_alarm(flight) for flight in range(6)].count(True) == flights_with_alarm
 
 
 class TwoFaults:

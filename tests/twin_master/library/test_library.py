@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from twin_master.assets.resolution import Overrides, asset_source
 from twin_master.errors import MissionInputError
 from twin_master.library.grid import SamplingGrid, grid_of_fmu, grid_of_scenario
 from twin_master.library.sampling import blocks_folder, sample_library
+from twin_master.mission.preparation import Knowledge
 from twin_master.network.inference import known_control
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from uav_twin import fly, load_scenario, prepare_twin, resume
@@ -382,34 +383,76 @@ def move(control: str, before: dict[str, float], after: dict[str, float]) -> flo
     return result
 
 
-@pytest.mark.parametrize("believed", ["asset", "library"])
-def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
-    """What all sensors show by draw, state and control; moves; the worth of the sensors that have a limit.
+@dataclass(frozen=True)
+class PumpKnowledge:
+    """What a twin of the pump knows, beside the equations of its sensors by draw, state and control."""
+
+    twin: Knowledge
+    states: list[dict[str, float]]
+    observations: Float
+
+    @property
+    def health(self) -> Float:
+        """Return the health by draw, state and control: temperature and filter have limits."""
+        _, _, temperature, filter_drop = np.moveaxis(self.observations, -1, 0)
+        return 1.0 - np.maximum(temperature / 50.0, filter_drop / 5.0)
+
+
+@pytest.fixture(scope="module", params=["asset", "library"])
+def pump(request, tmp_path_factory) -> PumpKnowledge:
+    """The knowledge from the asset, or from a library.
 
     In a library names and order of states and controls do not matter.
     """
-    table, given = copy.deepcopy(PUMP), Overrides()
-    if believed == "library":
-        given = Overrides(library=sampled(tmp_path))
+    table = copy.deepcopy(PUMP)
+    overrides = Overrides()
+    if request.param == "library":
+        overrides = Overrides(library=sampled(tmp_path_factory.mktemp("pump")))
         table["state"].reverse()
         table["control"].reverse()
-    known = prepare_twin(loaded_from(table, "pump_wear"), given)
-    controls, draws, names = known.model.controls, known.draws.values, known.model.states.names
-    states = [dict(zip(names, row, strict=True)) for row in known.model.states.coordinates.tolist()]
-    shown = np.array([[[show(u, **state, viscosity=e) for u in controls] for state in states] for e in draws])
-    np.testing.assert_allclose(known.sensor_model.value_per_draw, shown, rtol=1e-7)
-    np.testing.assert_array_equal(known.sensor_model.standard_deviation, NOISE)
-    matrix = [[[move(u, a, b) for b in states] for a in states] for u in controls]
-    np.testing.assert_allclose(known.model.transition.matrix, matrix, atol=1e-15)
-    health = 1.0 - np.maximum(shown[..., 2] / 50.0, shown[..., 3] / 5.0)
-    np.testing.assert_allclose(known.rewards.health_per_draw, health, rtol=1e-7)
-    seen = shown[0, 0, 1] + [np.nan, 0.2, 0.3, -0.1]  # a lost sensor says nothing
-    believes = known_control(np.eye(len(states))[4], 1, len(controls))
-    error = np.nanmean(-np.abs(seen - shown[:, 4, 1]) / NOISE, axis=1).mean()
-    found, _ = known.rewards.expectation(believes, seen)
-    assert (found[0], found[2]) == pytest.approx((health[:, 4, 1].mean(), error), rel=1e-7)
-    # Where the cooler cannot hold the oil there is no steady operation.
-    assert math.isnan(steady_temperature(Conditions(2500.0 * math.pi / 30.0, 210e5, 1.0, 0.0, 1.0)))
+    twin = prepare_twin(loaded_from(table, "pump_wear"), overrides)
+    names = twin.model.states.names
+    states = [dict(zip(names, row, strict=True)) for row in twin.model.states.coordinates.tolist()]
+    observations = [
+        [[show(control, **state, viscosity=draw) for control in twin.model.controls] for state in states]
+        for draw in twin.draws.values
+    ]
+    return PumpKnowledge(twin, states, np.array(observations))
+
+
+def test_what_sensors_show_is_what_the_equations_say(pump):
+    sensors = pump.twin.sensor_model
+    np.testing.assert_allclose(sensors.value_per_draw, pump.observations, rtol=1e-7)
+    np.testing.assert_array_equal(sensors.standard_deviation, NOISE)
+
+
+def test_transitions_are_what_the_equations_say(pump):
+    expected = [
+        [[move(control, before, after) for after in pump.states] for before in pump.states]
+        for control in pump.twin.model.controls
+    ]
+    np.testing.assert_allclose(pump.twin.model.transition.matrix, expected, atol=1e-15)
+
+
+def test_health_is_what_the_equations_say_of_the_sensors_that_have_a_limit(pump):
+    np.testing.assert_allclose(pump.twin.rewards.health_per_draw, pump.health, rtol=1e-7)
+
+
+def test_rewards_are_those_of_health_and_of_the_error_of_what_is_seen(pump):
+    """A lost sensor says nothing."""
+    state, control = 4, 1
+    observation = pump.observations[0, 0, control] + [np.nan, 0.2, 0.3, -0.1]
+    belief = known_control(np.eye(len(pump.states))[state], control, len(pump.twin.model.controls))
+    rewards, _ = pump.twin.rewards.expectation(belief, observation)
+    standardised = np.abs(observation - pump.observations[:, state, control]) / NOISE
+    error = -np.nanmean(standardised, axis=1).mean()
+    health = pump.health[:, state, control].mean()
+    assert (rewards[0], rewards[2]) == pytest.approx((health, error), rel=1e-7)
+
+
+def test_where_the_cooler_cannot_hold_the_oil_there_is_no_steady_operation():
+    speed = 2500.0 * math.pi / 30.0
+    assert math.isnan(steady_temperature(Conditions(speed, 210e5, 1.0, 0.0, 1.0)))
 
 
 class CalibratedExchanger:

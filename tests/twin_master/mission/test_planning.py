@@ -4,7 +4,6 @@ import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from scipy.stats import norm
 
 import uav_twin
 from tests.command_line import refused, said
+from tests.costs import once
 from tests.twin_master.runs import edited, estimates_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
@@ -54,7 +54,7 @@ FOUR_STATES = 2 * ((FIVE_LEVELS, "levels_percent = [0, 40]\nprior = [1, 0]"),)
 """A change of the scenario, whose plan takes a second then."""
 
 
-@cache
+@once
 def knowledge(*changes: tuple[str, str]) -> Knowledge:
     return of_wing(scenario(*changes, policy="mode"))[0]
 
@@ -220,14 +220,14 @@ ENDING_REPAIR = (
 REPAIR_2 = 4
 
 
-@cache
+@once
 def stopping() -> Knowledge:
     """Return the knowledge with a policy whose only action is the second repair, which ends the mission."""
     always_repair = BeliefPolicy(np.ones((1, 25)), np.array([REPAIR_2]))
     return following(knowledge_of_scenario(*ENDING_REPAIR), always_repair)
 
 
-@cache
+@once
 def knowledge_of_scenario(*changes: tuple[str, str]) -> Knowledge:
     return of_wing(scenario(*changes))[0]
 
@@ -247,7 +247,7 @@ def test_an_action_that_ends_has_no_value_behind_it():
     assert value == pytest.approx(known.planning_reward[:, REPAIR_2])
 
 
-@cache
+@once
 def planned() -> tuple[Any, Any]:
     known = knowledge(*FOUR_STATES)
     problem = known.problem
@@ -365,7 +365,7 @@ class RationedFleet:
         self.declined = np.setdiff1d(self.wanting, self.inspecting)
 
 
-@cache
+@once
 def rationed_fleet() -> RationedFleet:
     return RationedFleet()
 

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from scipy.stats import norm
 from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
 from tests.command_line import refused, said
+from tests.costs import once
 from tests.twin_master.runs import of_wing
 from twin_master.errors import MissionInputError
 from twin_master.mission import sensor_design
@@ -24,7 +24,7 @@ from twin_master.plan_command import _without_information
 from uav_twin import structure_files
 
 
-@cache
+@once
 def gauged() -> Knowledge:
     return of_wing("level_turns")[0]
 
@@ -61,7 +61,7 @@ def test_readings_are_drawn_in_states_that_are_all_alike_probable(samples, monke
 EVERY_SECOND_GAUGE = range(0, 24, 2)
 
 
-@cache
+@once
 def gauge_readings() -> Any:
     """Return the readings from which gauges of the level turns are chosen."""
     return draw_readings(gauged())

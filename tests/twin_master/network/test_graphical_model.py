@@ -47,26 +47,55 @@ def test_moments_and_marginals_of_a_belief(weights):
     assert np.all(SPACE.standard_deviation(SPACE.certain((0.6, 1.0))) == 0.0)
 
 
-@given(
-    steps=st.lists(st.floats(0.01, 1.0), min_size=0, max_size=4),
-    values=st.lists(st.floats(-10.0, 10.0), min_size=5, max_size=5),
-)
-def test_what_a_table_changes_by_within_an_interval_is_that_of_a_quadrature(steps, values):
-    """Along each factor: the straight line through the level that fits a piecewise linear table best."""
+INTERVAL_CASES = {
+    "steps": st.lists(st.floats(0.01, 1.0), min_size=0, max_size=4),
+    "values": st.lists(st.floats(-10.0, 10.0), min_size=5, max_size=5),
+}
+
+
+def levels_and_changes(steps, values):
+    """Return the levels of a factor a, a table's values there, and the changes (a, b, sensor, factor).
+
+    The table is of two factors, and of one sensor that does not depend on b and one that does.
+    """
     levels = np.concatenate([[0.0], np.cumsum(steps)])
     states = StateSpace((Factor("a", tuple(levels)), Factor("b", (1.0, 2.0))))
-    along = np.array(values[: len(levels)])
-    table = along[:, None, None] * [[1.0, 0.0], [1.0, 3.0]]  # (a, b, sensor)
-    found = states.change_within_interval(table.reshape(-1, 2)).reshape(len(levels), 2, 2, 2)
-    half = np.concatenate([levels[:1], 0.5 * (levels[1:] + levels[:-1]), levels[-1:]])
-    for k, level in enumerate(levels):
-        at = half[k] + (half[k + 1] - half[k]) * (np.arange(20000) + 0.5) / 20000
-        place, change = at - level, np.interp(at, levels, along) - along[k]
-        expected = np.mean(place * change) / np.sqrt(np.mean(place**2)) if len(levels) > 1 else 0.0
-        np.testing.assert_allclose(found[k, :, 0, 0], expected, atol=1e-4)
-        # Of two levels each stands for the half of the step next to it: E[(x / 2)²] = 1 / 12.
-        np.testing.assert_allclose(found[k, :, 1, 1], 3.0 * along[k] / np.sqrt(12.0), atol=1e-12)
-    assert not found[:, :, 0, 1].any()
+    along_a = np.array(values[: len(levels)])
+    table = along_a[:, None, None] * [[1.0, 0.0], [1.0, 3.0]]
+    changes = states.change_within_interval(table.reshape(-1, 2)).reshape(len(levels), 2, 2, 2)
+    return levels, along_a, changes
+
+
+@given(**INTERVAL_CASES)
+def test_what_a_table_changes_by_within_an_interval_is_that_of_a_quadrature(steps, values):
+    """Along each factor: the straight line through the level that fits a piecewise linear table best."""
+    levels, along_a, changes = levels_and_changes(steps, values)
+    middles = 0.5 * (levels[1:] + levels[:-1])
+    edges = np.concatenate([levels[:1], middles, levels[-1:]])
+    midpoints = (np.arange(20000) + 0.5) / 20000
+    for number, level in enumerate(levels):
+        begin, end = edges[number : number + 2]
+        points = begin + (end - begin) * midpoints
+        distance = points - level
+        change = np.interp(points, levels, along_a) - along_a[number]
+        expected = 0.0
+        if len(levels) > 1:
+            expected = np.mean(distance * change) / np.sqrt(np.mean(distance**2))
+        np.testing.assert_allclose(changes[number, :, 0, 0], expected, atol=1e-4)
+
+
+@given(**INTERVAL_CASES)
+def test_of_two_levels_each_stands_for_the_half_of_the_step_next_to_it(steps, values):
+    """E[(x / 2)²] = 1 / 12."""
+    _, along_a, changes = levels_and_changes(steps, values)
+    for value, change in zip(along_a, changes, strict=True):
+        np.testing.assert_allclose(change[:, 1, 1], 3.0 * value / np.sqrt(12.0), atol=1e-12)
+
+
+@given(**INTERVAL_CASES)
+def test_a_sensor_does_not_change_along_a_factor_on_which_it_does_not_depend(steps, values):
+    _, _, changes = levels_and_changes(steps, values)
+    assert not changes[:, :, 0, 1].any()
 
 
 MOVES = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])

@@ -1,5 +1,6 @@
 """Likelihoods of sensors against integrals; rewards and plans against sums, solvers and enumeration."""
 
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -73,51 +74,117 @@ def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, re
     np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
 
 
-@given(
-    seed=SEEDS,
-    factors=st.integers(0, 3),
-    size=st.sampled_from([0.0, 0.3, 3.0, 1e3]),
-    lost=st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS).filter(lambda lost: not all(lost)),
-)
-def test_an_interval_moves_all_sensors_together(seed, factors, size, lost):
-    """Against densities with the whole covariance; a place in the interval and the rest make the same."""
-    rng, values, weight, deviation, observation = random_sensors(seed)
-    observation[lost] = np.nan
-    seen = ~np.isnan(observation)
-    interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factors))
-    covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
-    part = covariance[:, 1][:, seen][:, :, seen]
-    residual = (observation - values[:, :, 1])[..., seen]
-    each = np.array([multivariate_normal.logpdf(residual[:, s], cov=part[s]) for s in range(STATES)])
-    expected = logsumexp(each, b=weight, axis=1)
-    close = {"rtol": 1e-7, "atol": 1e-7}  # the covariance has a condition of up to 1e7
-    model = GaussianSensorModel(values, deviation, weight, interval=interval)
-    np.testing.assert_allclose(model.log_likelihood(observation, 1), expected, **close)
-    np.testing.assert_allclose(model.log_density_of_draws(observation[None], [1])[0], each, **close)
-    assert np.all(np.isneginf(model.log_likelihood(np.full(SENSORS, 1e200), 1)))
-    identified = IdentifiedSensorModel(values, deviation, weight, interval=interval)
-    np.testing.assert_allclose(identified.log_likelihood(observation, 1), expected, **close)
-    np.testing.assert_allclose(identified.log_density_of_draws(observation[None], [1])[0], each, **close)
-    total = np.sqrt(np.einsum("sugg->sug", covariance))
-    np.testing.assert_allclose(model.total_standard_deviation, total)
-    printed = GaussianSensorModel(values, deviation, weight, "inside", interval=interval)
-    density = norm.logpdf(observation, values[:, :, 1], total[:, 1])[..., seen]
-    apart = logsumexp(density, b=weight[:, None, None], axis=0).sum(axis=1)
-    np.testing.assert_allclose(printed.log_likelihood(observation, 1), apart, **close)
+@dataclass(frozen=True)
+class IntervalCase:
+    """Sensors that an interval of values moves together, one observation, and their densities in closed form.
 
-    near = model.fit_within_interval(observation, 1, values[:, :, 1])
-    rest = norm.logpdf(observation, near.value, deviation)[..., seen].sum(axis=-1)
-    np.testing.assert_allclose((rest + near.log_density).T, each, **close)
-    sensor = int(np.flatnonzero(seen)[0])
-    others = np.flatnonzero(seen)[1:]
-    for s in range(STATES if size < 100.0 else 0):  # of one sensor given the others; needs the condition
-        gain = np.linalg.solve(covariance[s, 1][np.ix_(others, others)], covariance[s, 1][others, sensor])
-        mean = values[:, s, 1, sensor] + (observation[others] - values[:, s, 1, others]) @ gain
-        variance = covariance[s, 1, sensor, sensor] - gain @ covariance[s, 1][others, sensor]
-        np.testing.assert_allclose(near.value_by_others[:, s, sensor], mean, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(
-            deviation[sensor] ** 2 / near.one_minus_leverage[s, sensor], variance, rtol=1e-5
-        )
+    Arrays are by draw (E), state (S), control (U) and sensor (G); the control of the observation is 1.
+    """
+
+    values: np.ndarray
+    weight: np.ndarray
+    deviation: np.ndarray
+    observation: np.ndarray
+    interval: np.ndarray
+    covariance: np.ndarray
+
+    @property
+    def is_seen(self):
+        """Return which sensors are not lost."""
+        return ~np.isnan(self.observation)
+
+    @property
+    def log_densities(self):
+        """Return the logarithm of the density (S, E) of what is seen, with the whole covariance."""
+        seen = self.is_seen
+        residual = (self.observation - self.values[:, :, 1])[..., seen]
+        covariances = self.covariance[:, 1][:, seen][:, :, seen]
+        by_state = [
+            multivariate_normal.logpdf(residual[:, state], cov=covariances[state]) for state in range(STATES)
+        ]
+        return np.array(by_state)
+
+    @property
+    def total_deviation(self):
+        """Return the standard deviation (S, U, G) of each sensor alone."""
+        return np.sqrt(np.einsum("sugg->sug", self.covariance))
+
+    def model(self, kind=GaussianSensorModel, *options):
+        return kind(self.values, self.deviation, self.weight, *options, interval=self.interval)
+
+
+@st.composite
+def interval_cases(draw):
+    """Draw sensors, some of them lost, and the size of their interval over their noise."""
+    rng, values, weight, deviation, observation = random_sensors(draw(SEEDS))
+    some_lost = st.lists(st.booleans(), min_size=SENSORS, max_size=SENSORS).filter(lambda lost: not all(lost))
+    observation[draw(some_lost)] = np.nan
+    size = draw(st.sampled_from([0.0, 0.3, 3.0, 1e3]))
+    factor_count = draw(st.integers(0, 3))
+    interval = size * rng.normal(size=(STATES, CONTROLS, SENSORS, factor_count))
+    covariance = interval @ interval.swapaxes(-1, -2) + np.diag(deviation**2)
+    return IntervalCase(values, weight, deviation, observation, interval, covariance)
+
+
+CLOSE = {"rtol": 1e-7, "atol": 1e-7}
+"""The covariance has a condition of up to 1e7."""
+
+
+@given(case=interval_cases())
+@pytest.mark.parametrize("kind", [GaussianSensorModel, IdentifiedSensorModel])
+def test_an_interval_moves_all_sensors_together(kind, case):
+    """Against densities with the whole covariance."""
+    model = case.model(kind)
+    log_likelihood = logsumexp(case.log_densities, b=case.weight, axis=1)
+    log_density_of_draws = model.log_density_of_draws(case.observation[None], [1])[0]
+    np.testing.assert_allclose(model.log_likelihood(case.observation, 1), log_likelihood, **CLOSE)
+    np.testing.assert_allclose(log_density_of_draws, case.log_densities, **CLOSE)
+
+
+@given(case=interval_cases())
+def test_an_observation_far_outside_an_interval_has_no_likelihood(case):
+    assert np.all(np.isneginf(case.model().log_likelihood(np.full(SENSORS, 1e200), 1)))
+
+
+@given(case=interval_cases())
+def test_the_total_deviation_of_a_sensor_is_that_of_noise_and_interval(case):
+    np.testing.assert_allclose(case.model().total_standard_deviation, case.total_deviation)
+
+
+@given(case=interval_cases())
+def test_inside_the_product_over_sensors_an_interval_moves_each_sensor_apart(case):
+    """Where the average over draws is that of each sensor."""
+    model = case.model(GaussianSensorModel, "inside")
+    log_density = norm.logpdf(case.observation, case.values[:, :, 1], case.total_deviation[:, 1])
+    by_sensor = logsumexp(log_density[..., case.is_seen], b=case.weight[:, None, None], axis=0)
+    np.testing.assert_allclose(model.log_likelihood(case.observation, 1), by_sensor.sum(axis=1), **CLOSE)
+
+
+@given(case=interval_cases())
+def test_the_place_within_an_interval_and_the_noise_beside_it_make_the_whole_density(case):
+    fitted = case.model().fit_within_interval(case.observation, 1, case.values[:, :, 1])
+    log_density_of_noise = norm.logpdf(case.observation, fitted.value, case.deviation)
+    of_all_sensors = log_density_of_noise[..., case.is_seen].sum(axis=-1)
+    np.testing.assert_allclose((of_all_sensors + fitted.log_density).T, case.log_densities, **CLOSE)
+
+
+@given(case=interval_cases().filter(lambda case: np.abs(case.interval).max(initial=0.0) < 100.0))
+def test_a_sensor_within_an_interval_is_predicted_from_the_others(case):
+    """By conditioning of Gaussians; needs the condition of the covariance, so the interval is not large."""
+    fitted = case.model().fit_within_interval(case.observation, 1, case.values[:, :, 1])
+    seen = np.flatnonzero(case.is_seen)
+    sensor = seen[0]
+    others = seen[1:]
+    for state in range(STATES):
+        covariance = case.covariance[state, 1]
+        gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, sensor])
+        residual = case.observation[others] - case.values[:, state, 1, others]  # by draw and sensor
+        mean = case.values[:, state, 1, sensor] + residual @ gain
+        variance = covariance[sensor, sensor] - gain @ covariance[others, sensor]
+        variance_by_leverage = case.deviation[sensor] ** 2 / fitted.one_minus_leverage[state, sensor]
+        predicted = fitted.value_by_others[:, state, sensor]
+        np.testing.assert_allclose(predicted, mean, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(variance_by_leverage, variance, rtol=1e-5)
 
 
 def random_values(seed, ties=False):
@@ -177,6 +244,13 @@ LIMIT, LOAD = 2500e-6, (2.0, 3.0)
 SETTINGS = LIMIT, (-0.1, 0.1), 125e-6, LOAD
 
 
+@pytest.fixture
+def quantity():
+    """Strains of five gauges in three states under two controls, in four draws."""
+    rng = np.random.default_rng(11)
+    return QuantityModel(rng.uniform(500e-6, 4000e-6, size=(4, 3, 2, 5)), rng.dirichlet(np.ones(4)))
+
+
 @given(SEEDS)
 def test_rewards_are_sums_over_states_controls_and_draws(seed):
     rng = np.random.default_rng(seed)
@@ -184,27 +258,40 @@ def test_rewards_are_sums_over_states_controls_and_draws(seed):
     joint = rng.dirichlet(np.ones(6)).reshape(3, 2)
     observation = rng.uniform(500e-6, 4000e-6, 5)
     observation[rng.integers(5)] = np.nan
-    probability, value = quantity.draw_weight[:, None, None] * joint, quantity.value_per_draw
+    value = quantity.value_per_draw
+    probability = quantity.draw_weight[:, None, None] * joint
     rewards = [
         1.0 - value.max(axis=3) / LIMIT,
         np.broadcast_to([-0.1, 0.1], probability.shape),
         -np.nanmean(np.abs(observation - value), axis=3) / 125e-6 / LOAD,
     ]
-    model = RewardModel(quantity, *SETTINGS)
-    means, spreads = model.expectation(joint, observation)
-    for i, reward in enumerate(rewards):
-        mean = (probability * reward).sum()
-        spread = np.sqrt((probability * (reward - mean) ** 2).sum())
-        assert means[i] == pytest.approx(mean, abs=1e-12)
-        assert spreads[i] == pytest.approx(spread, abs=1e-7)
-    # A known control has no spread, and without an observation there is no error.
-    mean, spread = model.expectation(known_control(np.full((2, 3), 1 / 3), np.array([0, 1]), 2))
+    means, deviations = RewardModel(quantity, *SETTINGS).expectation(joint, observation)
+    for reward, mean, deviation in zip(rewards, means, deviations, strict=True):
+        expected_mean = (probability * reward).sum()
+        expected_deviation = np.sqrt((probability * (reward - expected_mean) ** 2).sum())
+        assert mean == pytest.approx(expected_mean, abs=1e-12)
+        assert deviation == pytest.approx(expected_deviation, abs=1e-7)
+
+
+def test_a_known_control_has_a_reward_without_a_deviation(quantity):
+    known = known_control(np.full((2, 3), 1 / 3), np.array([0, 1]), 2)
+    mean, deviation = RewardModel(quantity, *SETTINGS).expectation(known)
     np.testing.assert_allclose(mean[:, 1], [-0.1, 0.1], rtol=1e-14)
-    np.testing.assert_allclose(spread[:, 1], 0.0, atol=1e-15)
-    lost, _ = model.expectation(joint, np.full(5, np.nan))
-    assert np.isnan([*mean[:, 2], *spread[:, 2], lost[2]]).all()
-    health = np.tensordot(quantity.draw_weight, 1.0 - value.max(axis=3) / LIMIT, axes=1)
-    np.testing.assert_allclose(model.planning_reward(1.0, 2.5), health + np.array([-0.25, 0.25]), rtol=1e-13)
+    np.testing.assert_allclose(deviation[:, 1], 0.0, atol=1e-15)
+
+
+def test_without_an_observation_there_is_no_error(quantity):
+    model = RewardModel(quantity, *SETTINGS)
+    mean, deviation = model.expectation(known_control(np.full((2, 3), 1 / 3), np.array([0, 1]), 2))
+    mean_of_lost, _ = model.expectation(np.full((3, 2), 1 / 6), np.full(5, np.nan))
+    assert np.isnan([*mean[:, 2], *deviation[:, 2], mean_of_lost[2]]).all()
+
+
+def test_the_reward_of_planning_is_that_of_health_and_of_the_weighted_control(quantity):
+    health_per_draw = 1.0 - quantity.value_per_draw.max(axis=3) / LIMIT
+    health = np.tensordot(quantity.draw_weight, health_per_draw, axes=1)
+    planning_reward = RewardModel(quantity, *SETTINGS).planning_reward(1.0, 2.5)
+    np.testing.assert_allclose(planning_reward, health + np.array([-0.25, 0.25]), rtol=1e-13)
 
 
 def random_problem(seed, states=7, controls=3):

@@ -48,20 +48,34 @@ def decided(knowledge: Knowledge, rule: str, steps: int) -> TwinStep:
     return [twin.step(blind, 1) for _ in range(steps)][-1]
 
 
-def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_step(knowledge):
-    """The policy is 2g from z1 = 60 %, three levels up; nothing is seen, so z1 is binomial with p = 0.1.
+RULES_AND_STEPS = pytest.mark.parametrize(
+    ("rule", "step_count"), list(product(("filtered", "predicted"), (26, 27, 28)))
+)
+
+
+def test_the_policy_is_gentle_from_the_third_level_on(knowledge):
+    """2g from z1 = 60 %, three levels up."""
+    controls = knowledge.plan.control_index.reshape(5, 5)[:, 0]
+    np.testing.assert_array_equal(controls, [1, 1, 1, 0, 0])
+
+
+@RULES_AND_STEPS
+def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_step(knowledge, rule, step_count):
+    """Nothing is seen, so z1 is binomial with p = 0.1.
 
     After 26 transitions p(z1 >= 60 %) = 0.489, after 27 it is 0.515.
     """
-    np.testing.assert_array_equal(knowledge.plan.control_index.reshape(5, 5)[:, 0], [1, 1, 1, 0, 0])
-    for rule, steps in product(("filtered", "predicted"), (26, 27, 28)):
-        step, moves = decided(knowledge, rule, steps), steps - (rule == "filtered")
-        gentle = binom.sf(2, moves, 0.1)
-        np.testing.assert_allclose(step.decision_probability, [gentle, 1.0 - gentle], atol=1e-12)
-        assert step.next_control == int(moves <= 26), (steps, rule)
-        # What is predicted does not depend on the rule.
-        ahead = step.prediction.control_probability[0, 0]
-        assert ahead == pytest.approx(binom.sf(2, steps, 0.1), abs=1e-12)
+    step = decided(knowledge, rule, step_count)
+    transition_count = step_count - 1 if rule == "filtered" else step_count
+    gentle = binom.sf(2, transition_count, 0.1)
+    np.testing.assert_allclose(step.decision_probability, [gentle, 1.0 - gentle], atol=1e-12)
+    assert step.next_control == int(transition_count <= 26)
+
+
+@RULES_AND_STEPS
+def test_what_is_predicted_does_not_depend_on_the_rule_of_decision(knowledge, rule, step_count):
+    gentle = decided(knowledge, rule, step_count).prediction.control_probability[0, 0]
+    assert gentle == pytest.approx(binom.sf(2, step_count, 0.1), abs=1e-12)
 
 
 @pytest.fixture
@@ -113,25 +127,47 @@ def told(step: TwinStep) -> tuple[object, ...]:
     return step.step, step.next_control, step.log_evidence, *arrays
 
 
-def test_a_twin_has_no_last_step_and_smooths_over_its_lag(knowledge, seen):
-    """Step by step it concludes what filter and smoother find in the whole sequence.
-
-    The smoother of a lag is that of the whole history: it needs no likelihood from before.
-    """
-    model, controls = knowledge.model, np.arange(40) % 3 % 2
+@pytest.fixture
+def observation_with_a_gap(seen):
     seen[17] = np.nan
-    bounded, whole, steps = knowledge.twin(lag=5), knowledge.twin(), []
-    for count, (row, control) in enumerate(zip(seen, controls.tolist(), strict=True), start=1):
-        steps.append(whole.step(row, control))
-        assert told(bounded.step(row, model.controls[control])) == told(steps[-1])
+    return seen
+
+
+FORTY_CONTROLS = np.arange(40) % 3 % 2
+
+
+def test_a_twin_smooths_over_its_lag(knowledge, observation_with_a_gap):
+    """The smoother of a lag is that of the whole history: it needs no likelihood from before."""
+    bounded = knowledge.twin(lag=5)
+    unbounded = knowledge.twin()
+    for count, (row, control) in enumerate(
+        zip(observation_with_a_gap, FORTY_CONTROLS.tolist(), strict=True), start=1
+    ):
         first = max(0, count - 6)
+        step = unbounded.step(row, control)
+        assert told(bounded.step(row, knowledge.model.controls[control])) == told(step)
         assert bounded.first_kept == first
-        np.testing.assert_array_equal(bounded.smoothed(), whole.smoothed()[first:])
-    found = filter_sequence(model, controls, knowledge.sensor_model.log_likelihood_sequence(seen, controls))
-    np.testing.assert_allclose([step.filtered for step in steps], found.filtered, atol=1e-14)
-    np.testing.assert_allclose([step.log_evidence for step in steps], found.log_evidence, atol=1e-12)
-    np.testing.assert_allclose(whole.smoothed(), smooth(model, controls, found.log_filtered), atol=1e-14)
-    assert knowledge.twin(lag=0).step(seen[0]).control_index == 1  # the first control of the scenario
+        np.testing.assert_array_equal(bounded.smoothed(), unbounded.smoothed()[first:])
+
+
+def test_a_twin_concludes_step_by_step_what_filter_and_smoother_find_in_the_whole(
+    knowledge, observation_with_a_gap
+):
+    twin = knowledge.twin()
+    steps = [
+        twin.step(row, control)
+        for row, control in zip(observation_with_a_gap, FORTY_CONTROLS.tolist(), strict=True)
+    ]
+    log_likelihood = knowledge.sensor_model.log_likelihood_sequence(observation_with_a_gap, FORTY_CONTROLS)
+    whole = filter_sequence(knowledge.model, FORTY_CONTROLS, log_likelihood)
+    smoothed = smooth(knowledge.model, FORTY_CONTROLS, whole.log_filtered)
+    np.testing.assert_allclose([step.filtered for step in steps], whole.filtered, atol=1e-14)
+    np.testing.assert_allclose([step.log_evidence for step in steps], whole.log_evidence, atol=1e-12)
+    np.testing.assert_allclose(twin.smoothed(), smoothed, atol=1e-14)
+
+
+def test_a_twin_begins_with_the_first_control_of_the_scenario(knowledge, observation_with_a_gap):
+    assert knowledge.twin(lag=0).step(observation_with_a_gap[0]).control_index == 1
 
 
 @pytest.fixture

@@ -33,17 +33,28 @@ def figure_now(run):
     return mission_figure(run, NOW, GAUGES)
 
 
+PERCENT = 100.0
+
+
 @pytest.mark.parametrize("region", [0, 1])
 def test_the_mission_figure_draws_what_is_believed_of_a_region(run, figure_now, region):
     axes = panel(figure_now, f"region {region + 1}")
-    belief = (run.smoothed_until(NOW) @ run.model.states.coordinates)[:, region]
-    prediction = line(axes, "prediction")
-    assert_allclose(line(axes, "past")[:, 1], 100.0 * belief)
-    at_the_time = line(axes, "as seen at the time")[:, 1]
-    assert_allclose(at_the_time, 100.0 * run["filtered/mean"][: NOW + 1, region])
-    assert_array_equal(prediction[:, 0], np.arange(19, 29))
-    assert_allclose(prediction[:, 1], 100.0 * run["predicted/mean"][NOW, :, region])
-    assert_allclose(line(axes, "truth")[:, 1], 100.0 * run.true_state[:29, region])
+    smoothed_means = run.smoothed_until(NOW) @ run.model.states.coordinates
+    filtered_means = run["filtered/mean"][: NOW + 1]
+    past = line(axes, "past")
+    as_seen = line(axes, "as seen at the time")
+    assert_allclose(past[:, 1], PERCENT * smoothed_means[:, region])
+    assert_allclose(as_seen[:, 1], PERCENT * filtered_means[:, region])
+
+
+@pytest.mark.parametrize("region", [0, 1])
+def test_the_mission_figure_draws_what_is_predicted_of_a_region_and_its_truth(run, figure_now, region):
+    axes = panel(figure_now, f"region {region + 1}")
+    steps, prediction = line(axes, "prediction").T
+    truth = line(axes, "truth")
+    assert_array_equal(steps, np.arange(19, 29))
+    assert_allclose(prediction, PERCENT * run["predicted/mean"][NOW, :, region])
+    assert_allclose(truth[:, 1], PERCENT * run.true_state[:29, region])
 
 
 @pytest.mark.parametrize("sensor", GAUGES)
@@ -151,39 +162,60 @@ def test_numbers_beside_an_axis_are_short():
         assert short_number(float(number)) == number
 
 
-def test_maps_show_the_joint_belief_the_policy_and_its_margin(run):
-    figure, steps = belief_figure(run), belief_steps(run)
+def map_of(axes):
+    """Return the values of a map, by the levels of both regions, transposed as they are drawn."""
+    return axes.collections[0].get_array().reshape(5, 5)
+
+
+def test_maps_show_the_joint_belief(run):
+    steps = belief_steps(run)
     assert (steps[0], steps[-1], len(steps)) == (0, 49, 8)
-    for axes, step in zip(figure.axes[:8], steps, strict=True):
-        mesh = axes.collections[0].get_array().reshape(5, 5)
-        assert_array_equal(mesh, run["filtered/probability"][step].reshape(5, 5).T)
+    for axes, step in zip(belief_figure(run).axes[:8], steps, strict=True):
+        assert_array_equal(map_of(axes), run["filtered/probability"][step].reshape(5, 5).T)
         assert f"step {step}" in axes.get_title(loc="left")
-    named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
-    assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
-    figure = policy_figure(run)
-    value = run["policy/action_value"]
-    chosen, margin = (axes.collections[0].get_array().reshape(5, 5) for axes in figure.axes[:2])
-    assert_array_equal(chosen, run["policy/control_index"].reshape(5, 5).T)
-    assert_array_equal(margin, (value[:, 1] - value[:, 0]).reshape(5, 5).T)
+
+
+def test_only_maps_at_the_edge_of_a_figure_have_labels(run):
+    """Two rows of four."""
+    has_labels = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in belief_figure(run).axes[:8]]
+    upper_row = [(False, True), (False, False), (False, False), (False, False)]
+    lower_row = [(True, True), (True, False), (True, False), (True, False)]
+    assert has_labels == upper_row + lower_row
+
+
+def test_maps_show_the_policy_and_its_margin(run):
+    of_controls, of_margin = policy_figure(run).axes[:2]
+    first_value, second_value = run["policy/action_value"].T
+    margin = second_value - first_value
+    assert_array_equal(map_of(of_controls), run["policy/control_index"].reshape(5, 5).T)
+    assert_array_equal(map_of(of_margin), margin.reshape(5, 5).T)
+
+
+def with_factors(run, count, probability):
+    """Return a run whose states are of some factors of two levels each, and its coordinates."""
+    levels = [np.array([0.0, 0.5])] * count
+    coordinates = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, count)
+    names = [f"a{number}" for number in range(count)]
+    factor = run.scenario.state[0]
+    unit_factor = {"unit": "1", "levels": (0.0, 0.5), "prior": (1.0, 0.0)}
+    state = tuple(factor.model_copy(update={"name": name, **unit_factor}) for name in names)
+    policy = {name: ("state", column) for name, column in zip(names, coordinates.T, strict=True)}
+    groups = {
+        "observed": run.tree["observed"].to_dataset(),
+        "filtered": xr.Dataset({"probability": (("step", "state"), probability)}),
+        "policy": xr.Dataset(policy),
+    }
+    scenario = run.scenario.model_copy(update={"state": state})
+    return replace(run, tree=xr.DataTree.from_dict(groups), scenario=scenario), coordinates
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_states_of_another_number_of_factors_show_their_marginals(run, count):
-    levels = [np.array([0.0, 0.5])] * count
-    coordinates = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, count)
     probability = np.random.default_rng(1).dirichlet(np.ones(2**count), 50)
-    each = ({"name": f"a{k}", "unit": "1", "levels": (0.0, 0.5), "prior": (1.0, 0.0)} for k in range(count))
-    state = tuple(run.scenario.state[0].model_copy(update=changes) for changes in each)
-    scenario = run.scenario.model_copy(update={"state": state})
-    groups = {
-        "observed": run.tree["observed"].to_dataset(),
-        "filtered": xr.Dataset({"probability": (("step", "state"), probability)}),
-        "policy": xr.Dataset({f"a{k}": ("state", coordinates[:, k]) for k in range(count)}),
-    }
-    other = replace(run, tree=xr.DataTree.from_dict(groups), scenario=scenario)
-    first = belief_figure(other).axes[0].collections[0].get_array().reshape(2, 50)
-    mean = (probability @ coordinates)[:, 0]
-    assert_allclose(first, np.stack([1 - 2 * mean, 2 * mean]), atol=1e-12)
+    changed, coordinates = with_factors(run, count, probability)
+    of_first_factor = belief_figure(changed).axes[0].collections[0].get_array().reshape(2, 50)
+    mean = probability @ coordinates[:, 0]
+    assert_allclose(of_first_factor, np.stack([1 - 2 * mean, 2 * mean]), atol=1e-12)
 
 
 def run_with_model_error(run, error):
