@@ -15,11 +15,14 @@ from typing import Any, NoReturn
 
 MODULES = ("fcntl", "grp", "pwd", "resource", "termios")
 OF_OS = (
-    "fork", "forkpty", "getpgid", "getuid", "geteuid", "killpg", "mkfifo", "nice", "pidfd_open", "pread",
-    "pwrite", "sched_getaffinity", "setpgid", "setpriority", "setsid", "sysconf",
-    "O_PATH", "O_NOFOLLOW", "O_DIRECTORY",
+    "fork", "forkpty", "getpgid", "getpriority", "getuid", "geteuid", "killpg", "mkfifo", "nice",
+    "pidfd_open", "pread", "pwrite", "readv", "writev", "sched_getaffinity", "setpgid", "setpriority",
+    "setsid", "sysconf", "O_PATH", "O_NOFOLLOW", "O_DIRECTORY", "O_NONBLOCK", "O_CLOEXEC", "WNOHANG",
 )  # fmt: skip
-OF_SIGNAL = ("alarm", "pthread_sigmask", "SIGALRM", "SIGKILL", "SIGXFSZ", "SIGTRAP")
+OF_SIGNAL = (
+    "alarm", "pthread_sigmask", "pidfd_send_signal", "SIGALRM", "SIGBUS", "SIGCHLD", "SIGHUP", "SIGKILL",
+    "SIGPIPE", "SIGQUIT", "SIGSTOP", "SIGTRAP", "SIGTSTP", "SIGTTIN", "SIGTTOU", "SIGUSR1", "SIGXFSZ",
+)  # fmt: skip
 
 
 def _refuse_pipes(*_arguments: Any) -> NoReturn:

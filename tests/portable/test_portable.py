@@ -40,6 +40,45 @@ def ran(
     return process
 
 
+IMPORT_ALL = """
+import importlib, pkgutil, sys
+from tests.portable.other_system import hide_posix
+hide_posix()
+failed = []
+for package in sys.argv[2:]:
+    for module in pkgutil.walk_packages([f"{sys.argv[1]}/{package}"], f"{package}."):
+        if not module.name.endswith("__main__"):
+            try:
+                importlib.import_module(module.name)
+            except (ImportError, AttributeError) as error:
+                failed.append(module.name)
+print(*failed)
+"""
+PACKAGES = (
+    "reporting",
+    "fe",
+    "fmu_asset",
+    "calibration",
+    "scenarios",
+    "twin_master",
+    "discrepancy",
+    "uav_twin",
+)
+LINUX_ALONE = {"fmu_asset.worker.refusal_tracer", "fmu_asset.worker.supervisor"}
+"""Modules of the process that isolates an FMU, which is not started on other systems."""
+
+
+def test_all_modules_but_those_of_the_isolation_are_imported():
+    process = subprocess.run(
+        [sys.executable, "-c", IMPORT_ALL, str(ROOT), *PACKAGES],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert set(process.stdout.split()) <= LINUX_ALONE
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("portable")

@@ -65,6 +65,14 @@ def test_a_verdict_is_written_as_it_was(tmp_path):
     assert again.read_bytes() == GOLDEN.read_bytes()
 
 
+def test_a_verdict_of_an_earlier_version_names_no_plug_ins(tmp_path):
+    content = json.loads(GOLDEN.read_text(encoding="utf-8"))
+    del content["provenance"]["plug_ins"]
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    assert files.read_verdict_file(path).origin.provenance.plug_ins == {}
+
+
 @pytest.mark.parametrize("has_trials_before", [True, False])
 def test_a_verdict_comes_back_equal(tmp_path, has_trials_before):
     proof = prove_effects(FITTED, FITTED)
