@@ -223,21 +223,47 @@ def test_files_that_are_refused(tmp_path, content, sentence):
     assert read_histories(given, load_binding(ROOM)) == (3, {})
 
 
-def test_rows_that_are_joined_by_lines(foreign_fmu, tmp_path):
-    """x' = u - x from rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
-    given, bound, out = tmp_path / "u.csv", INPUTS.folder / "follow.toml", tmp_path / "x.csv"
-    given.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
-    wanted = (foreign_fmu("follow2"), "--binding", bound, "--inputs", given, "--out", out, "--in-process")
-    assert "2 steps to t = 1 s" in said("fmu", "simulate", *wanted, "--interpolation", "linear")
-    rows = np.genfromtxt(out, delimiter=",", names=True)
-    np.testing.assert_allclose(rows["x"], rows["time"] - 1.0 + np.exp(-rows["time"]), atol=1e-14)
-    assert rows["time"].tolist() == [0.0, 0.5, 1.0]
-    given.write_text("time,u\n0,0\n")
-    for more, sentence in (
-        (("--interpolation", "linear"), "leads from one row of the inputs to the next: give two or more"),
-        (("--interpolation", "cubic"), "--interpolation must be zero-order or linear, but 'cubic' was given"),
-    ):
-        assert sentence in refused("fmu", "simulate", *wanted, *more, "--replace", code=None)
+@pytest.fixture
+def follow(foreign_fmu, tmp_path):
+    """The words of a simulation of x' = u - x under the rows of a table, and the tables of in- and output."""
+    inputs = tmp_path / "u.csv"
+    outputs = tmp_path / "x.csv"
+    binding = INPUTS.folder / "follow.toml"
+    words = (
+        foreign_fmu("follow2"),
+        "--binding",
+        binding,
+        "--inputs",
+        inputs,
+        "--out",
+        outputs,
+        "--in-process",
+    )
+    return ("fmu", "simulate", *words), inputs, outputs
+
+
+def test_rows_that_are_joined_by_lines(follow):
+    """From rest under u = t: x = t - 1 + exp(-t); the first row is where the asset starts."""
+    command, inputs, outputs = follow
+    inputs.write_text("time,u\n0,0\n0.5,0.5\n1,1\n")
+    assert "2 steps to t = 1 s" in said(*command, "--interpolation", "linear")
+    rows = np.genfromtxt(outputs, delimiter=",", names=True)
+    time = rows["time"]
+    np.testing.assert_allclose(rows["x"], time - 1.0 + np.exp(-time), atol=1e-14)
+    assert time.tolist() == [0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "sentence"),
+    [
+        ("linear", "leads from one row of the inputs to the next: give two or more"),
+        ("cubic", "--interpolation must be zero-order or linear, but 'cubic' was given"),
+    ],
+)
+def test_rows_that_cannot_be_joined_are_refused(follow, interpolation, sentence):
+    command, inputs, _ = follow
+    inputs.write_text("time,u\n0,0\n")
+    assert sentence in refused(*command, "--interpolation", interpolation, "--replace", code=None)
 
 
 def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path):

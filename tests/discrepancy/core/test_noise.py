@@ -102,17 +102,26 @@ def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, si
     assert ljung_box(rest)[1] > 1e-3
 
 
+def covariance_of_autoregression(coefficients, count):
+    """Return the Toeplitz covariance of so many samples of a process with innovations of deviation one."""
+    pulse = np.r_[1.0, np.zeros(3000)]
+    impulse_response = lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], pulse)
+    length = len(impulse_response)
+    return toeplitz([impulse_response[: length - lag] @ impulse_response[lag:] for lag in range(count)])
+
+
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
 def test_whitening_is_that_of_the_whole_covariance(coefficients):
     """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
-    pulse = np.r_[1.0, np.zeros(3000)]
-    impulse = lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], pulse)
-    covariance = toeplitz([impulse[: len(impulse) - lag] @ impulse[lag:] for lag in range(40)])
-    noise = NoiseModel(1.0, float(np.sqrt(covariance[0, 0])), inf, np.array(coefficients), INTERVAL, ())
-    x = np.random.default_rng(0).standard_normal((2, 40))
-    white = noise.whiten(x, INTERVAL)
-    np.testing.assert_allclose(white @ white.T, x @ np.linalg.solve(covariance, x.T), rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(noise.whiten(x[:, :2], INTERVAL), white[:, :2], rtol=1e-12)
+    covariance = covariance_of_autoregression(coefficients, 40)
+    deviation = float(np.sqrt(covariance[0, 0]))
+    noise = NoiseModel(1.0, deviation, inf, np.array(coefficients), INTERVAL, ())
+    samples = np.random.default_rng(0).standard_normal((2, 40))
+    white = noise.whiten(samples, INTERVAL)
+    white_of_first_two = noise.whiten(samples[:, :2], INTERVAL)
+    expected = samples @ np.linalg.solve(covariance, samples.T)
+    np.testing.assert_allclose(white @ white.T, expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(white_of_first_two, white[:, :2], rtol=1e-12)
 
 
 # ---------------------------------------------------------------- statistics of residuals

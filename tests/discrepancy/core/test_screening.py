@@ -157,29 +157,57 @@ def test_the_absolute_gate_tells_the_variance_against_the_recorded_noise(simulat
     assert tests["variance of y1"] == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("spread", [0.01, 1.0])
-def test_draws_have_the_moments_of_a_gaussian_of_a_box_and_of_a_bent_ridge(spread):
-    """Looked for at first as widely as they should be, or a hundred times closer."""
-    root = np.array([[1.0, 0.0, 0.0], [0.9, 0.2, 0.0], [0.0, 0.3, 2.0]])
-    covariance = root @ root.T
+SPREADS = pytest.mark.parametrize("spread", [0.01, 1.0])
+"""Standard deviations in which draws are looked for at first: a hundred times too small, or right."""
 
-    def gaussian(x):
-        return 0.5 * float((x - 1.0) @ np.linalg.solve(covariance, x - 1.0))
+COVARIANCE_ROOT = np.array([[1.0, 0.0, 0.0], [0.9, 0.2, 0.0], [0.0, 0.3, 2.0]])
+COVARIANCE = COVARIANCE_ROOT @ COVARIANCE_ROOT.T
 
-    draws, again = (importance_draws(gaussian, np.ones(3), spread * np.eye(3)) for _ in range(2))
-    deviations = np.sqrt(np.diag(covariance))
+
+def draws_of_gaussian(spread):
+    """Return draws about one, with the covariance above."""
+
+    def potential(x):
+        return 0.5 * float((x - 1.0) @ np.linalg.solve(COVARIANCE, x - 1.0))
+
+    return importance_draws(potential, np.ones(3), spread * np.eye(3))
+
+
+@SPREADS
+def test_draws_have_the_moments_of_a_gaussian(spread):
+    draws = draws_of_gaussian(spread)
+    deviations = np.sqrt(np.diag(COVARIANCE))
     np.testing.assert_allclose((draws.mean(axis=0) - 1.0) / deviations, 0.0, atol=0.15)
     np.testing.assert_allclose(draws.std(axis=0), deviations, rtol=0.1)
-    assert draws.tobytes() == again.tobytes()
-    box = importance_draws(
-        lambda x: np.inf if np.abs(x).max() > 1.0 else 0.0, np.zeros(2), spread * np.eye(2)
-    )
-    np.testing.assert_allclose(np.quantile(box, (0.05, 0.95), axis=0).T, [(-0.9, 0.9)] * 2, atol=0.07)
-    bent = importance_draws(
-        lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2, np.zeros(2), spread * np.eye(2)
-    )
-    np.testing.assert_allclose(np.quantile(bent[:, 0], (0.05, 0.95)), (-1.645, 1.645), atol=0.5)
-    assert np.abs(bent[:, 1] - bent[:, 0] ** 2).mean() == pytest.approx(0.16, rel=0.2)
+
+
+@SPREADS
+def test_draws_repeat(spread):
+    assert draws_of_gaussian(spread).tobytes() == draws_of_gaussian(spread).tobytes()
+
+
+@SPREADS
+def test_draws_have_the_quantiles_of_a_box(spread):
+    def potential(x):
+        return np.inf if np.abs(x).max() > 1.0 else 0.0
+
+    draws = importance_draws(potential, np.zeros(2), spread * np.eye(2))
+    low, high = np.quantile(draws, (0.05, 0.95), axis=0)
+    np.testing.assert_allclose(low, -0.9, atol=0.07)
+    np.testing.assert_allclose(high, 0.9, atol=0.07)
+
+
+@SPREADS
+def test_draws_follow_a_bent_ridge(spread):
+    """The second unknown is the square of the first, a standard normal one, to a deviation of 0.2."""
+
+    def potential(x):
+        along, across = x
+        return 0.5 * along**2 + 0.5 * ((across - along**2) / 0.2) ** 2
+
+    along, across = importance_draws(potential, np.zeros(2), spread * np.eye(2)).T
+    np.testing.assert_allclose(np.quantile(along, (0.05, 0.95)), (-1.645, 1.645), atol=0.5)
+    assert np.abs(across - along**2).mean() == pytest.approx(0.16, rel=0.2)
 
 
 def test_without_a_record_nothing_absolute_is_said_but_of_colour():

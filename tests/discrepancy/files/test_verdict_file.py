@@ -217,20 +217,23 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
 
 
 def test_residuals_come_back_to_the_last_bit(tmp_path):
+    """With a noise record, an unknown zero, no noise record, a missing reading, a place and named regions."""
     samples = np.random.default_rng(0).standard_normal(50)
     noise = NoiseRecord(2.0, inf, samples, 0.01, "pre-trigger")
     channels = dict(FITTED.channels)
     channels["g2"] = replace(channels["g2"], noise=noise, station=0.4, offset_deviation=inf)
     channels["g3"] = replace(channels["g3"], noise=None)
-    item = FITTED.trials[0]
-    used, residual = item.used.copy(), item.residual.copy()
-    used[3, 1], residual[3, 1] = False, nan
-    place = replace(item.trial, used=used, load_place=(1.0, 0.35), regions=("web", "z2"))
-    trials = (replace(item, trial=place, residual=residual), *FITTED.trials[1:])
-    trials = tuple(replace(one, sensitivity=None) for one in trials)  # which is not stored
-    fitted = replace(FITTED, channels=channels, trials=trials)
-    back = read_residuals(write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"}))
-    assert alike(fitted, back)
+    first, *others = FITTED.trials
+    used = first.used.copy()
+    used[3, 1] = False
+    residual = first.residual.copy()
+    residual[3, 1] = nan
+    trial = replace(first.trial, used=used, load_place=(1.0, 0.35), regions=("web", "z2"))
+    changed_first = replace(first, trial=trial, residual=residual)
+    stored_parts = tuple(replace(item, sensitivity=None) for item in (changed_first, *others))
+    fitted = replace(FITTED, channels=channels, trials=stored_parts)
+    path = write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"})
+    assert alike(fitted, read_residuals(path))
 
 
 @pytest.fixture

@@ -227,15 +227,17 @@ def test_where_the_model_is_off_many_samples_are_far_out_and_none_is_an_outlier(
 
 
 def test_where_the_model_is_far_off_no_cell_is_judged():
-    """What was fitted is uncertain by the size of what is left."""
-    told = Bench(count=120).fit(np.random.default_rng(5))
-    generator, trials = np.random.default_rng(6), []
-    for item in told.trials:
-        wide = 200.0 * generator.standard_normal((*item.residual.shape, 1))
-        trials.append(replace(item, leverage=np.ones_like(item.leverage), sensitivity=wide))
-    found = locate(replace(told, trials=tuple(trials)))
-    assert not any(cell.axis != "frequency" for cell in found.cells)
-    assert any("no single cell of the map can be judged" in remark for remark in found.remarks)
+    """What was fitted is uncertain by the size of the residual."""
+    fitted = Bench(count=120).fit(np.random.default_rng(5))
+    generator = np.random.default_rng(6)
+    uncertain_trials = []
+    for item in fitted.trials:
+        sensitivity = 200.0 * generator.standard_normal((*item.residual.shape, 1))
+        leverage = np.ones_like(item.leverage)
+        uncertain_trials.append(replace(item, leverage=leverage, sensitivity=sensitivity))
+    location = locate(replace(fitted, trials=tuple(uncertain_trials)))
+    assert not any(cell.axis != "frequency" for cell in location.cells)
+    assert any("no single cell of the map can be judged" in remark for remark in location.remarks)
 
 
 def test_without_a_noise_record_nothing_absolute_is_said():

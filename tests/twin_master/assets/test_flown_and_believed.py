@@ -77,28 +77,66 @@ def test_a_subclass_of_a_pair_changes_what_the_twin_predicts():
     assert DoubledPredictions(model, model).observation_table(None, None).item() == 6.0
 
 
-def test_a_library_in_the_published_format_is_multilinear_between_its_levels(content, tmp_path):
-    library, levels = loaded(tmp_path, content), content["states"]
-    assert (library.controls, library.states.shape, library.gauge_count) == (("2g", "3g"), (3, 2), 24)
+@pytest.fixture
+def library(content, tmp_path):
+    return loaded(tmp_path, content)
+
+
+@pytest.fixture
+def strain_of_3g(content):
+    """The mean strains by both levels and gauge."""
+    first_levels, second_levels = content["states"]
+    microstrain = [
+        [content["observations"][str(z1)][str(z2)]["3g"]["mean"] for z2 in second_levels]
+        for z1 in first_levels
+    ]
+    return 1e-6 * np.array(microstrain)
+
+
+def test_a_library_in_the_published_format_has_controls_states_gauges_and_draws(library):
+    assert library.controls == ("2g", "3g")
+    assert (library.states.shape, library.gauge_count) == ((3, 2), 24)
     np.testing.assert_array_equal(library.young_modulus_factor, [0.994, 1.0, 1.004, 1.008, 1.014])
-    told = content["observations"]
-    table = 1e-6 * np.array([[told[str(z1)][str(z2)]["3g"]["mean"] for z2 in levels[1]] for z1 in levels[0]])
+
+
+def test_a_library_in_the_published_format_has_the_strains_of_its_states_and_draws(
+    library, content, strain_of_3g
+):
     state = library.states.index((0.4, 0.8))
-    np.testing.assert_allclose(library.strain[state, 1], table[2, 1])
-    draw = 1e-6 * np.array(told["40"]["80"]["3g"]["0.994"])
-    np.testing.assert_allclose(library.strain_per_draw[0, state, 1], draw)
-    between = RegularGridInterpolator(levels, table)
-    for place in [(0.0, 0.0), (0.4, 0.8), (0.2, 0.0), (0.07, 0.21), (0.39, 0.8)]:
-        (expected,) = between(100.0 * np.array(place))
-        np.testing.assert_allclose(library.strain_at(place, 1), expected, rtol=1e-13)
-    single = loaded(tmp_path, content | {"states": [levels[0], [0]]})  # of one region, as it were
-    expected = [0.65, 0.35] @ table[:2, 0]
-    np.testing.assert_allclose(single.strain_at((0.07, 0.0), 1), expected, rtol=1e-13)
+    first_draw = content["observations"]["40"]["80"]["3g"]["0.994"]
+    np.testing.assert_allclose(library.strain[state, 1], strain_of_3g[2, 1])
+    np.testing.assert_allclose(library.strain_per_draw[0, state, 1], 1e-6 * np.array(first_draw))
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.4, 0.8), (0.2, 0.0), (0.07, 0.21), (0.39, 0.8)])
+def test_a_library_in_the_published_format_is_multilinear_between_its_levels(
+    place, library, content, strain_of_3g
+):
+    (expected,) = RegularGridInterpolator(content["states"], strain_of_3g)(100.0 * np.array(place))
+    np.testing.assert_allclose(library.strain_at(place, 1), expected, rtol=1e-13)
+
+
+@pytest.fixture
+def library_of_one_region(content, tmp_path):
+    """A library whose second region has one level."""
+    first_levels, _ = content["states"]
+    return loaded(tmp_path, content | {"states": [first_levels, [0]]})
+
+
+def test_a_library_of_one_region_is_linear_between_its_levels(library_of_one_region, strain_of_3g):
+    expected = 0.65 * strain_of_3g[0, 0] + 0.35 * strain_of_3g[1, 0]
+    np.testing.assert_allclose(library_of_one_region.strain_at((0.07, 0.0), 1), expected, rtol=1e-13)
+
+
+def test_another_level_than_the_only_one_is_refused(library_of_one_region):
     with pytest.raises(MissionInputError, match=r"covers z2 from 0 to 0, got 0\.1"):
-        single.strain_at((0.07, 0.1), 1)
-    for outside in (0.41, -0.01, np.nan):
-        with pytest.raises(MissionInputError, match=r"covers z1 from 0 to 0\.4"):
-            library.strain_at((outside, 0.0), 0)
+        library_of_one_region.strain_at((0.07, 0.1), 1)
+
+
+@pytest.mark.parametrize("outside", [0.41, -0.01, np.nan])
+def test_a_state_outside_the_levels_of_a_library_is_refused(outside, library):
+    with pytest.raises(MissionInputError, match=r"covers z1 from 0 to 0\.4"):
+        library.strain_at((outside, 0.0), 0)
 
 
 def cell(content: dict[str, Any], draw: str) -> list[float]:
@@ -134,21 +172,28 @@ def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path,
         asset_source(scenario).check()
 
 
+def smallest_credible_set(weights):
+    """Return the states at least as probable as p, for the largest p at which they hold 90 %."""
+    for least in (5, 4, 3, 2, 1):
+        states = [state for state, weight in enumerate(weights) if weight >= least]
+        if 10 * sum(weights[state] for state in states) >= 9 * sum(weights):
+            return states
+    raise AssertionError("the set of all states holds everything")
+
+
 @given(
     weights=st.lists(st.integers(0, 5), min_size=25, max_size=25).filter(any),
     truth=st.tuples(st.integers(0, 80), st.integers(0, 80)),
 )
 def test_the_credible_set_by_enumeration(weights, truth):
-    """The set of all states at least as probable as p, for the largest p at which it holds 90 %."""
+    """Of a truth half way between two levels, both count."""
     model = build_graphical_model(load_scenario("level_turns").scenario)
     probability = np.array(weights) / sum(weights)
-    sets = [[s for s in range(25) if weights[s] >= least] for least in (5, 4, 3, 2, 1)]
-    smallest = next(s for s in sets if 10 * sum(weights[i] for i in s) >= 9 * sum(weights))
-    away = np.abs(np.rint(100.0 * model.states.coordinates) - truth)
-    nearest = (away == away.min(axis=0)).all(axis=1)  # also two levels, of a truth half way between them
-    expected = bool(nearest[smallest].any())
-    found = in_credible_set(model, probability[None], np.array([truth]) / 100.0)
-    assert found.tolist() == [expected]
+    distance = np.abs(np.rint(100.0 * model.states.coordinates) - truth)
+    is_nearest = (distance == distance.min(axis=0)).all(axis=1)
+    expected = bool(is_nearest[smallest_credible_set(weights)].any())
+    is_inside = in_credible_set(model, probability[None], np.array([truth]) / 100.0)
+    assert is_inside.tolist() == [expected]
 
 
 def test_a_model_error_reaches_the_twin(library_file, tmp_path):

@@ -26,17 +26,28 @@ def knowledge(library_file: Path) -> Knowledge:
     return of_library("paper_level_turns", library_file)[0]
 
 
-def test_the_transitions_of_a_scenario():
-    """Those of the paper multiplied by a factor, and as tables; see the pump for those of each state."""
-    table = table_of("level_turns")
-    model = build_graphical_model(parse_scenario(table, "x"), 3.0)
-    at = model.states.index
+def test_the_published_transitions_of_a_scenario_are_multiplied_by_a_factor():
+    model = build_graphical_model(parse_scenario(table_of("level_turns"), "x"), 3.0)
     assert model.transition.matrix[1, 0, 1] == pytest.approx(0.3 * 0.7)
-    z1, z2 = ((p * np.roll(np.eye(5), 1, axis=1) + (1 - p) * np.eye(5)).tolist() for p in (0.25, 0.5))
-    tables = {control: {"z1": z1, "z2": z2} for control in ("2g", "3g")}
-    table["transition"] = {"kind": "independent_tables", "tables": tables}
-    matrix = build_graphical_model(parse_scenario(table, "x")).transition.matrix
-    assert matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
+
+
+def worsening_by_one_level(probability: float) -> list[list[float]]:
+    """Return the transitions of a factor of five levels; the last one goes on to the first."""
+    to_next_level = np.roll(np.eye(5), 1, axis=1)
+    transition: list[list[float]] = (probability * to_next_level + (1 - probability) * np.eye(5)).tolist()
+    return transition
+
+
+def test_the_transitions_of_a_scenario_are_those_of_its_tables():
+    """See the pump for those of each state."""
+    scenario = table_of("level_turns")
+    tables = {"z1": worsening_by_one_level(0.25), "z2": worsening_by_one_level(0.5)}
+    by_control = dict.fromkeys(("2g", "3g"), tables)
+    scenario["transition"] = {"kind": "independent_tables", "tables": by_control}
+    model = build_graphical_model(parse_scenario(scenario, "x"))
+    before = model.states.index((0.8, 0.0))
+    after = model.states.index((0.0, 0.2))
+    assert model.transition.matrix[0, before, after] == pytest.approx(0.25 * 0.5)
 
 
 def decided(knowledge: Knowledge, rule: str, steps: int) -> TwinStep:
