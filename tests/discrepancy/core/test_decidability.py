@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from math import inf, log
 
+import jsonschema
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -22,7 +23,8 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
 from discrepancy.report.decidability_text import group_lines
-from discrepancy.self_calibration import outcome_of, self_calibrate, wilson_interval, write_self_calibration
+from discrepancy.self_calibration import outcome_of, self_calibrate, wilson_interval
+from discrepancy.self_calibration_file import self_calibration_schema, write_self_calibration
 from discrepancy.simulation import Simulator
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -300,4 +302,5 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)
     stored = json.loads(path.read_text(encoding="utf-8"))
     assert stored["schema"] == "uav-twin self calibration 1"
+    jsonschema.validate(stored, self_calibration_schema())
     assert len(stored["cases"]) == 6
