@@ -47,7 +47,8 @@ def schema(
             return
         width = 2 + max(map(len, FORMATS))
         for entry in FORMATS.values():
-            typer.echo(f"{entry.name:{width}}{entry.notation.upper()}  {entry.title.replace('`', '')}")
+            title = entry.title.replace("`", "")
+            typer.echo(f"{entry.name:{width}}{entry.notation.upper()}  {title}")
         return
     file_format = find_format(name)
     text = file_format.schema_text()
