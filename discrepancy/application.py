@@ -408,12 +408,27 @@ def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> st
 
 
 def _command_with_model(command: str, model: Path) -> str:
-    """Return the command of a verdict with another model and another folder."""
+    """Return the command of a verdict with another model and another folder, for this folder.
+
+    Paths below the working folder are written relative to it, and a default seed is left out.
+    """
     words = shlex.split(command)
     campaign_index = 4 if words[3] == "--from-run" else 3
     campaign = Path(words[campaign_index]).name
-    if "--model" in words:
-        index = words.index("--model")
-        del words[index : index + 2]
-    out = f"verdicts/{campaign}_{model.stem}"
-    return shlex.join([*words, "--model", str(model), "--out", out])
+    replaced_options = ["--model"]
+    if "--seed" in words and words[words.index("--seed") + 1] == "0":
+        replaced_options.append("--seed")
+    for option in replaced_options:
+        if option in words:
+            index = words.index(option)
+            del words[index : index + 2]
+    words += ["--model", str(model), "--out", f"verdicts/{campaign}_{model.stem}"]
+    return shlex.join(_relative_to_working_folder(word) for word in words)
+
+
+def _relative_to_working_folder(word: str) -> str:
+    """Return a word of a command, relative if it is a path below the working folder."""
+    path = Path(word)
+    if path.is_absolute() and path.is_relative_to(Path.cwd()):
+        return str(path.relative_to(Path.cwd()))
+    return word

@@ -8,31 +8,24 @@ its verdict is compared with the hidden effect. Motion is simulated with half th
 fits.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
 
 from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.document import Origin, plain_data
 from discrepancy.errors import ModelError
 from discrepancy.judgement.separability import usable_effects
 from discrepancy.simulation import HiddenEffect, Simulator
 from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import check_and_prepare, investigate
-from reporting.files import atomic_write_text
-from reporting.json_file import JsonObject
 
-SELF_CALIBRATION_NAME = "self_calibration.json"
-SCHEMA = "uav-twin self calibration 1"
 NULL_SHARE = 3
 """Every so many campaigns one contains no effect."""
 NOTHING = "nothing"
@@ -45,7 +38,17 @@ OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 
 @dataclass(frozen=True)
 class ParameterCoverage:
-    """A parameter of a named effect: its true value, and the 90 % interval that was found."""
+    """A parameter of a named effect: its true value, and the 90 % interval that was found.
+
+    Attributes
+    ----------
+    parameter : str
+        Name of the parameter.
+    true : float
+        The value with which the campaign was simulated [unit of the parameter].
+    low, high : float
+        Limits of the 90 % interval that was found [unit of the parameter].
+    """
 
     parameter: str
     true: float
@@ -387,54 +390,6 @@ def outcome_of(
     if kind in (VerdictKind.FAMILY, VerdictKind.NAMED_IN_PART):
         return OUTCOMES[kind] if hidden in named else "wrong"
     return kind.value
-
-
-def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin: Origin) -> Path:
-    """Write `self_calibration.json`: every case, the proportions and the confusion matrix.
-
-    The file is written completely or not at all.
-
-    Raises
-    ------
-    reporting.errors.FileNotWrittenError
-        If the file cannot be written.
-    """
-    rows, columns, counts = self_calibration.confusion()
-    content = {
-        "schema": SCHEMA,
-        **plain_data(origin),
-        "seed": self_calibration.seed,
-        "not_detectable": list(self_calibration.not_detectable),
-        "outcomes": {
-            "with_an_effect": _outcome_table(self_calibration, null=False),
-            "with_nothing": _outcome_table(self_calibration, null=True),
-        },
-        "coverage_90": _proportion_table(self_calibration.coverage()),
-        "confusion": {"hidden": rows, "verdict": columns, "counts": counts.tolist()},
-        "cases": [plain_data(case) for case in self_calibration.cases],
-    }
-    return atomic_write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
-
-
-def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> JsonObject:
-    """Return the proportions of all outcomes as plain data, by outcome.
-
-    Parameters
-    ----------
-    self_calibration : SelfCalibration
-        The cases.
-    null : bool
-        True for campaigns without an effect, False for those with one.
-    """
-    table = {}
-    for outcome in ordered_outcomes(self_calibration, null=null):
-        table[outcome] = _proportion_table(self_calibration.share(outcome, null=null))
-    return table
-
-
-def _proportion_table(proportion: Proportion) -> JsonObject:
-    """Return a proportion as plain data."""
-    return {**plain_data(proportion), "share": plain_data(proportion.value)}
 
 
 def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:

@@ -12,7 +12,7 @@ from discrepancy.judgement.conclusion import named_effects
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
-from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
+from discrepancy.self_calibration_file import SELF_CALIBRATION_NAME, write_self_calibration
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_so_far import SO_FAR_NAME
 from discrepancy.workflow import patch_draws

@@ -61,7 +61,7 @@ from discrepancy.verdict_remarks import (
 )
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
-from reporting.words import brief, is_or_are
+from reporting.words import brief, is_or_are, rows_of_table
 
 if TYPE_CHECKING:  # it takes long to import
     from matplotlib.axes import Axes
@@ -376,11 +376,11 @@ def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             is_wrong = wrong_end_readings(residual, data.weight > 0.0, noise)
             is_wrong &= ~_accepts_outliers(campaign, trial)
             for column in np.flatnonzero(is_wrong.any(axis=0)):
-                count = int(is_wrong[:, column].sum())
+                rows = np.flatnonzero(is_wrong[:, column]).tolist()
                 new_remarks.append(
-                    f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the "
-                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far from both model "
-                    "and neighbours, and left out."
+                    f"{len(rows)} of {len(is_wrong)} readings of {trial.channels[column]!r} at the "
+                    f"ends of the trial {trial.name!r} ({rows_of_table(rows)}) "
+                    f"{is_or_are(len(rows))} far from both model and neighbours, and left out."
                 )
             trials[trial.name] = replace(trial, used=trial.used & ~is_wrong)
     if not new_remarks:

@@ -1,7 +1,7 @@
 """Numbers, lists of words and names of parameters, as sentences show them."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 
 LONGEST_FACT = 60
@@ -12,6 +12,8 @@ WHOLE_FROM, POWERS_FROM = 1e3, 1e7
 
 MOST_LISTED = 30
 """Largest number of words that `comma_list` writes out."""
+MOST_LISTED_ROWS = 5
+"""Largest number of rows that `rows_of_table` writes out."""
 
 _LISTED_ITEMS = 3  # of a collection in `brief`
 
@@ -96,6 +98,21 @@ def comma_list(words: Iterable[object]) -> str:
     if len(texts) > MOST_LISTED:
         return f"{listed} and {len(texts) - MOST_LISTED} more"
     return listed
+
+
+def rows_of_table(indices: Sequence[int]) -> str:
+    """Return which rows of a table are meant: "row 8", "rows 8, 9 and 12", "rows 8, 9 and 3 more".
+
+    Parameters
+    ----------
+    indices : sequence of int
+        The indices of the rows, from 0. The text counts from 1, without the line of headings.
+    """
+    numbers = [str(index + 1) for index in indices]
+    if len(numbers) > MOST_LISTED_ROWS:
+        further_count = len(numbers) - MOST_LISTED_ROWS + 1
+        numbers = [*numbers[: MOST_LISTED_ROWS - 1], f"{further_count} more"]
+    return f"{'row' if len(indices) == 1 else 'rows'} {listing(numbers)}"
 
 
 _LONG_HASH = re.compile(r"(SHA-256 [0-9a-f]{12})[0-9a-f]{52}")

@@ -148,8 +148,11 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
     panels = new_panels(len(rows), axes)
     for panel, (group_name, factor) in zip(panels, rows, strict=True):
         group = fleet.children[group_name]
-        believed = group["filtered"].to_dataset()["mean"].sel(region=factor).values
-        truth = group["truth"].to_dataset()["state"].sel(region=factor).values
+        stored_unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
+        has_one_unit = ", " not in stored_unit  # factors may differ in their unit
+        scale, unit = printed_state(stored_unit) if has_one_unit else (1.0, "SI")
+        believed = scale * group["filtered"].to_dataset()["mean"].sel(region=factor).values
+        truth = scale * group["truth"].to_dataset()["state"].sel(region=factor).values
         steps = np.flatnonzero(~np.isnan(believed).all(axis=0))
         quantiles = np.nanquantile(believed[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
         style.band(panel, steps, quantiles[0], quantiles[4], style.PRESENT)
@@ -158,7 +161,7 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
         known_steps = np.flatnonzero(~np.isnan(truth).all(axis=0))
         true_median = np.nanmedian(truth[:, known_steps], axis=0)
         panel.plot(known_steps, true_median, **style.TRUTH_LINE, label="truth, median of the twins")
-        panel.set_ylabel(f"{factor} (SI)")
+        panel.set_ylabel(f"{factor}, {unit}")
         panel.set_title(group_name, loc="left")
         panel.set_xlabel(group.attrs["step_name"])
     panels[0].legend(frameon=False)

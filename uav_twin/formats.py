@@ -135,6 +135,18 @@ _FORMATS = (
         "reference/verdict.md",
         "discrepancy.verdict_so_far:so_far_schema",
     ),
+    _json(
+        "self-calibration",
+        "results on simulated campaigns, `self_calibration.json`",
+        "how_to/discrepancy.md",
+        "discrepancy.self_calibration_file:self_calibration_schema",
+    ),
+    _json(
+        "calibration",
+        "figures of a calibration, `calibration.json`",
+        "how_to/calibrate_a_wing.md",
+        "calibration.result.json_record:CalibrationRecord",
+    ),
     _json("message", "message to a watch", "how_to/watch.md", f"{_RECORDS}:ObservationMessage"),
     _json("decision", "decision of a watch", "how_to/watch.md", f"{_RECORDS}:DecisionRecord"),
     _json("heartbeat", "heartbeat of a watch", "how_to/watch.md", f"{_RECORDS}:HeartbeatRecord"),

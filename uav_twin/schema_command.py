@@ -45,8 +45,10 @@ def schema(
         if json:
             print_json({key: entry.title for key, entry in FORMATS.items()})
             return
+        width = 2 + max(map(len, FORMATS))
         for entry in FORMATS.values():
-            typer.echo(f"{entry.name:16}{entry.notation.upper()}  {entry.title.replace('`', '')}")
+            title = entry.title.replace("`", "")
+            typer.echo(f"{entry.name:{width}}{entry.notation.upper()}  {title}")
         return
     file_format = find_format(name)
     text = file_format.schema_text()

@@ -69,6 +69,7 @@ ACCEPTABLE = (
     "outliers",
     "too short",
     "undersampled",
+    "frequency",
     "unit slip",
     "input slip",
     "sign",

@@ -8,6 +8,10 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from discrepancy.campaign import schema
+from discrepancy.campaign.column_remarks import (
+    remarks_on_missing_columns,
+    remarks_on_unused_columns,
+)
 from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.noise_records import pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Event
@@ -106,10 +110,11 @@ def assemble_campaign(
     CampaignFileError, CampaignDataError
         For the causes of `read_campaign`.
     """
-    remarks = _remarks_on_unused_columns(section, tables)
+    remarks = remarks_on_unused_columns(section, tables)
     trials = tuple(
         read_trial(trial, tables[trial.file], section, remarks) for trial in section.trial
     )
+    remarks += remarks_on_missing_columns(section, tables)
     measured_channels = {name for trial in trials for name in trial.channels}
     for channel in section.channel:
         if channel.name not in measured_channels:
@@ -135,29 +140,6 @@ def assemble_campaign(
         events=tuple(complete_events(section.event, trials, CAMPAIGN_FILE)),
         remarks=(*section.remarks, *new_remarks),
     )
-
-
-def _remarks_on_unused_columns(
-    section: schema.CampaignSection, tables: Mapping[str, TextTable]
-) -> list[str]:
-    """Return a remark on each column that no channel and no input reads."""
-    used_columns = {
-        *schema.INPUT_COLUMNS,
-        *(recorded_input.table_column for recorded_input in section.columns),
-    }
-    files_of_columns: dict[str, list[str]] = {}
-    for file in dict.fromkeys(trial.file for trial in section.trial):
-        for column in tables[file].columns:
-            if column not in used_columns and not column.startswith(schema.OF_REGION):
-                files_of_columns.setdefault(column, []).append(file)
-    remarks = []
-    for column, files in files_of_columns.items():
-        further_files = f" and {len(files) - 1} more" if len(files) > 1 else ""
-        remarks.append(
-            f"{files[0]}{further_files}: no channel has the column {column!r}, which is left out; "
-            "if that is not meant, check its spelling."
-        )
-    return remarks
 
 
 def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:

@@ -26,7 +26,7 @@ from discrepancy.campaign.sampling import check_sampling
 from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.table_file import TextTable
-from reporting.words import counted, is_or_are
+from reporting.words import counted, is_or_are, rows_of_table
 
 LATEST_FIRST_SAMPLE = 1.5
 """Latest time of the first sample after a release from rest, in sampling intervals."""
@@ -280,10 +280,11 @@ def _read_channel(
     if not is_used.all():
         rows = np.arange(len(values))
         values[~is_used] = np.interp(rows[~is_used], rows[is_used], values[is_used])
-        count = int((~is_used).sum())
+        empty_rows = np.flatnonzero(~is_used).tolist()
         remarks.append(
-            f"{count} of {len(values)} readings of {channel.name!r} in the trial {section.name!r} "
-            f"{is_or_are(count)} empty and left out."
+            f"{len(empty_rows)} of {len(values)} readings of {channel.name!r} in the trial "
+            f"{section.name!r} ({rows_of_table(empty_rows)}) {is_or_are(len(empty_rows))} empty "
+            "and left out."
         )
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):

@@ -345,12 +345,11 @@ def _trial_section(
                 left_out[name] = tuple(rows.tolist())
     is_driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
     states_begin = is_driven or trial.begins is not records.Start.SETTLED
-    names_in_order = [name for name in campaign.channels if name in trial.channels]
     keys = {**trial.keys_in_file, "file": file}
     return schema.TrialSection(
         **keys,
         left_out=left_out,
         start=trial.start if trial.start or not trial.is_dynamic else None,
         begins=trial.begins if states_begin else None,
-        channels=None if list(trial.channels) == names_in_order else trial.channels,
+        channels=None if trial.channels == tuple(campaign.channels) else trial.channels,
     )

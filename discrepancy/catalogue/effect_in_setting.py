@@ -11,7 +11,7 @@ from discrepancy.catalogue.entry import ROW, EffectKeys, Number, Setting
 from discrepancy.system.interface import Model
 from discrepancy.system.scales import PortScale
 from discrepancy.system.structures import StructureModel
-from fe.runtime.patch import EVERY_CHANNEL, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, LocalStiffnessLoss, Primitive
 from fe.runtime.port_laws import PLANFORM
 from fe.runtime.wing_rows import PORTS
 
@@ -19,6 +19,8 @@ Names = tuple[str, ...]
 DYNAMIC = frozenset({TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN})
 SKINS = {"lower skin": 1.0, "upper skin": -1.0}
 """Skin with a crack, and the sign of x that opens it: upward bending stretches the lower skin."""
+SIDES = {"open at positive x": 1.0, "open at negative x": -1.0}
+"""Side on which a crack opens in a model without skins, and the sign of the port's x there."""
 EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states."""
 ALL = "all "
@@ -158,6 +160,11 @@ class EffectInSetting:
         return tuple(port for port in ports if port not in scales or condition(scales[port]))
 
     @property
+    def crack_sides(self) -> Names:
+        """Sides of a port on which a crack may be: the skins of a wing, or the signs of x."""
+        return tuple(SKINS) if self.setting.model.supports(LocalStiffnessLoss) else tuple(SIDES)
+
+    @property
     def turning_ports(self) -> Names:
         """Force ports whose motion changes direction, for forces with a memory or a zero position.
 
@@ -172,7 +179,8 @@ class EffectInSetting:
         Parameters
         ----------
         place : str
-            Name of one of the effect's places, such as a port, "root, lower skin" or "all strain".
+            Name of one of the effect's places, such as a port, "root, lower skin", "rail, open at
+            positive x" or "all strain".
 
         Returns
         -------
@@ -181,7 +189,7 @@ class EffectInSetting:
         """
         if self.section.places == "skins at ports":
             port, _, skin = place.rpartition(", ")
-            return (Target(port, number=SKINS[skin]),)
+            return (Target(port, number=(SKINS | SIDES)[skin]),)
         if place == EVERY_PORT:
             return tuple(Target(port) for port in self.state_ports)
         if self.section.places == "mains lines":

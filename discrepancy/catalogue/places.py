@@ -1,22 +1,24 @@
 """The places where an effect may act, by the word in its file, such as "ports" or "runs"."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isinf
 
 import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased_frequency
-from discrepancy.campaign.records import FloatArray, Quantity
+from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.catalogue.effect_in_setting import (
     ALL,
     CHANNELS_OR_ALL_OF_A_QUANTITY,
     EVERY_PORT,
-    SKINS,
     EffectInSetting,
     Names,
 )
 from discrepancy.catalogue.entry import Setting
 from fe.runtime.patch import EVERY_CHANNEL, LocalStiffnessLoss, RegionStiffnessLoss
+
+_SAME_FREQUENCY = 0.01
+"""Relative difference up to which a line is seen at its own frequency, beside rounded times."""
 
 
 def _with_place_of_all(names: Names) -> Names:
@@ -36,8 +38,8 @@ def _runs(effect: EffectInSetting) -> Names:
 
 
 def _skins_at_ports(effect: EffectInSetting) -> Names:
-    """Return both skins at each port of forces."""
-    return tuple(f"{port}, {skin}" for port in effect.force_ports() for skin in SKINS)
+    """Return both skins, or both signs of x, at each port of forces."""
+    return tuple(f"{port}, {side}" for port in effect.force_ports() for side in effect.crack_sides)
 
 
 def _held_ports(effect: EffectInSetting) -> Names:
@@ -111,7 +113,8 @@ def _loggers(effect: EffectInSetting) -> Names:
 def mains_lines(setting: Setting) -> Names:
     """Return the mains frequencies that records can show, such as "50 Hz" or "50 or 400 Hz".
 
-    Sampling shifts a mains frequency to its alias. A line is left out if its alias has less than
+    Sampling shifts a mains frequency above half the sampling rate to its alias, which the name
+    tells then, as in "400 Hz (seen at 100 Hz)". A line is left out if its alias has less than
     one period in every record, because it then looks like an offset. Lines whose aliases differ by
     less than half a period in every record cannot be distinguished, and form one place.
     """
@@ -136,7 +139,21 @@ def mains_lines(setting: Setting) -> Names:
                 break
         else:
             groups.append([frequency])
-    return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
+    names = []
+    for group in groups:
+        frequencies = " or ".join(f"{frequency:g}" for frequency in group)
+        names.append(f"{frequencies} Hz{_alias_clause(group[0], trials)}")
+    return tuple(names)
+
+
+def _alias_clause(frequency: float, trials: Sequence[Trial]) -> str:
+    """Return at which frequency a line is seen, for a name; empty where it is not shifted."""
+    aliases = {float(f"{aliased_frequency(frequency, trial.interval):.3g}") for trial in trials}
+    if not aliases or max(aliases) >= frequency * (1.0 - _SAME_FREQUENCY):
+        return ""
+    if len(aliases) > 1:
+        return f" (seen at {min(aliases):g} to {max(aliases):g} Hz)"
+    return f" (seen at {aliases.pop():g} Hz)"
 
 
 def _channels_or_all_of_a_quantity(effect: EffectInSetting) -> Names:

@@ -23,6 +23,7 @@ class FaultKind(StrEnum):
     UNDERSAMPLED = "undersampled"
     MISSING_OUTPUT = "missing output"
     WRONG_QUANTITY = "wrong quantity"
+    FREQUENCY = "frequency"  # ring-downs oscillate far from the model's first frequency
     UNIT_SLIP = "unit slip"
     UNIT_DOUBT = "unit doubt"  # a factor between two units that may also be physical
     INPUT_SLIP = "input slip"  # force or load factor of a trial in another unit

@@ -11,6 +11,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, Hold, Trial, Tria
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
+from discrepancy.checks.frequency import frequency_faults
 from discrepancy.checks.quality import dead_fault, is_still
 from discrepancy.checks.rest import noise_record_faults
 from discrepancy.checks.scales import (
@@ -101,6 +102,8 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
 
     The scale is the ratio of data to prediction for each channel and trial. The checks are:
 
+    - Frequency: ring-downs oscillate more than four times slower or faster than the model's first
+      mode. The other checks are then left out, because they would only repeat it.
     - Unit slip: two units of the channel's quantity differ by the scale in all its trials (within a
       factor of 3 for slips from 200 on, 2 from 20 on, 1.35 from 7 on, 1.1 below). If all channels
       of a trial have the same slip, the input of that trial has it.
@@ -125,6 +128,11 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     faults: list[DataFault] = []
     if model.oscillates:
         frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
+        wrong_frequencies = tuple(frequency_faults(campaign, model.name, frequency))
+        marked_faults = mark_accepted(wrong_frequencies, campaign)
+        if any(fault.fatal for fault in marked_faults):
+            return marked_faults
+        faults += wrong_frequencies
         faults += _length_faults(campaign, frequency)
         faults += noise_record_faults(campaign, frequency)
     predictions: dict[str, FloatArray] = {}

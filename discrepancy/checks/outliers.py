@@ -19,6 +19,7 @@ from discrepancy.checks.local_polynomial import (
 )
 from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, row_outlier
 from reporting.arrays import LEAST_DIVISOR
+from reporting.words import rows_of_table
 
 LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
@@ -81,7 +82,7 @@ def mark_outliers(campaign: Campaign) -> Campaign:
         outliers = "is an outlier" if count == 1 else "are outliers"
         remarks.append(
             f"{count} of {reading_count} readings of {channel!r} in the trial {trial.name!r} "
-            f"{outliers} and left out."
+            f"({rows_of_table(np.flatnonzero(is_outlier).tolist())}) {outliers} and left out."
         )
     trials = tuple(replace(trial, used=is_used[trial.name]) for trial in campaign.trials)
     return replace(campaign, trials=trials, remarks=tuple(remarks))

@@ -13,7 +13,6 @@ from functools import cache, cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
@@ -26,6 +25,7 @@ from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
+from reporting.probabilities import probability_of_some
 
 from .closed_share import closed_share_text
 from .conclusion import ComparedHypothesis
@@ -371,7 +371,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             )
         if not is_counted.any():
             return 0.0
-        return float(np.exp(logsumexp(scores[is_counted]) - logsumexp(scores)))
+        return probability_of_some(scores, is_counted)
 
     def _is_refuted_by_trials(self, hypothesis: HypothesisT) -> bool:
         """Return whether trials show that a hypothesis does not explain enough of the gap."""

@@ -10,13 +10,13 @@ force if it can be estimated, else by simulations under a noise as large as thei
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import logsumexp
 
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.search.strategy import Search
 from discrepancy.search.wide_noise import compare_under_wide_noise
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
+from reporting.probabilities import normalised_probabilities
 from reporting.words import capital, listing, small
 
 from .closed_share import compared_trials_text, percent_with_interval
@@ -518,7 +518,7 @@ def _outcome_of_comparison(
             other_hypotheses.append(hypothesis)
     listed_hypotheses: list[HypothesisT] = [*members, *other_hypotheses]
     scores = np.array([comparison.score(hypothesis) for hypothesis in listed_hypotheses])
-    probabilities = np.exp(scores - logsumexp(scores)).tolist()
+    probabilities = normalised_probabilities(scores).tolist()
     weighted_hypotheses: list[WeightedHypothesis] = []
     for hypothesis, hypothesis_probability in zip(listed_hypotheses, probabilities, strict=True):
         weighted_hypotheses.append(WeightedHypothesis(hypothesis, hypothesis_probability))

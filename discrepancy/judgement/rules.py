@@ -17,6 +17,7 @@ from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES
+from reporting.probabilities import total_probability
 from reporting.words import listing
 
 from .conclusion import (
@@ -245,7 +246,9 @@ class VerdictCase:
             members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are not members, and their probability is not counted
         passing_members = [member for member in members if not member.absolute_fit.has_failed]
-        probability = sum(self.probabilities[member.effect_names] for member in passing_members)
+        probability = total_probability(
+            self.probabilities[member.effect_names] for member in passing_members
+        )
         # an effect with its canonical and with a free shape is one member
         distinct_members: dict[EffectSet, FittedEffectSet] = {}
         for member in passing_members:
@@ -263,7 +266,7 @@ class VerdictCase:
         return self.conclusion.build_outcome(
             VerdictKind.BELOW_LIMIT,
             below_limit_sentence(possible_effects),
-            sum(self.probabilities[names] for names in self.probable_sets),
+            total_probability(self.probabilities[names] for names in self.probable_sets),
             self.leading_fit,
             group=tuple(possible_effects),
             gates=(check_absolute_fit(self.problem, self.leading_fit),),
@@ -288,7 +291,7 @@ class VerdictCase:
         return self.conclusion.build_outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
-            sum(self.probabilities[names] for names in self.probable_sets),
+            total_probability(self.probabilities[names] for names in self.probable_sets),
             gates=(most_probable.absolute_fit,),
             resembles=names_without_free_shape(most_probable.effect_names),
         )

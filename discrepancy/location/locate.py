@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from discrepancy.campaign.noise_tests import holm_rejections, variance_p_value
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import (
     Dependence,
@@ -38,6 +38,7 @@ from discrepancy.location.residuals import (
     mean_square_ratio,
     without_coloured_records,
 )
+from reporting.words import comma_list, rows_of_table
 
 GLOBAL_LEVEL = 0.01
 """Rate of false alarms of the global verdict."""
@@ -201,25 +202,28 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     tuple of str
         The remark, or nothing if there is no outlier.
     """
-    counts: dict[str, int] = {}
+    phrases = []
     for fitted_trial in residuals.trials:
         if not fitted_trial.trial.is_dynamic:
             continue
         for column, name in enumerate(fitted_trial.trial.channels):
-            count = _count_isolated_outliers(np.abs(fitted_trial.standardised[:, column]))
-            counts[name] = counts.get(name, 0) + count
-    phrases = [f"{name} ({count})" for name, count in counts.items() if count]
+            is_outlier = _isolated_outliers(np.abs(fitted_trial.standardised[:, column]))
+            rows = np.flatnonzero(is_outlier).tolist()
+            if rows:
+                phrases.append(
+                    f"{rows_of_table(rows)} of {name!r} in the trial {fitted_trial.trial.name!r}"
+                )
     if not phrases:
         return ()
     return (
         f"Single samples lie beyond {_LEAST_OUTLIER:g} standard deviations of both the noise and "
-        f"the other residuals, but their neighbours do not: {', '.join(phrases)}; if they are "
-        "errors of the data, leave them out.",
+        f"the other residuals, but their neighbours do not: {comma_list(phrases)}; if they are "
+        "errors of the data, leave them out by `left_out` of the trial.",
     )
 
 
-def _count_isolated_outliers(absolute_residuals: FloatArray) -> int:
-    """Return the number of isolated outliers in a record.
+def _isolated_outliers(absolute_residuals: FloatArray) -> BoolArray:
+    """Return which samples (N,) of a record are isolated outliers.
 
     Parameters
     ----------
@@ -228,16 +232,14 @@ def _count_isolated_outliers(absolute_residuals: FloatArray) -> int:
     """
     finite = absolute_residuals[np.isfinite(absolute_residuals)]
     if not finite.size:
-        return 0
+        return np.zeros(len(absolute_residuals), dtype=bool)
     limit = _LEAST_OUTLIER * max(1.0, float(np.median(finite)) / _MEDIAN_OF_ABSOLUTE_NORMAL)
     neighbours = np.full((2, len(absolute_residuals)), np.nan)
     neighbours[0, 1:] = absolute_residuals[:-1]
     neighbours[1, :-1] = absolute_residuals[1:]
     # next to a gap a neighbour is nan, and the comparison with it is false
-    is_isolated_outlier = (absolute_residuals > limit) & (
-        neighbours.max(axis=0) < 0.5 * absolute_residuals
-    )
-    return int(is_isolated_outlier.sum())
+    is_isolated: BoolArray = neighbours.max(axis=0) < 0.5 * absolute_residuals
+    return is_isolated & (absolute_residuals > limit)
 
 
 def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Disagreement | None:

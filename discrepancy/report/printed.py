@@ -150,7 +150,9 @@ def check_lines(
     held_out = ", ".join(trial.name for trial in campaign.held_out) or "none"
     trials = counted(len(campaign.trials), "trial")
     channels = counted(len(campaign.channels), "channel")
-    yield (f"{campaign.name}: {trials}, {channels}, beside {model.name}; held out: {held_out}.")
+    compared_with = "a model of the same name" if model.name == campaign.name else model.name
+    yield f"Campaign {campaign.name}, compared with {compared_with}."
+    yield f"{trials}, {channels}; held out: {held_out}."
     for fault in faults:
         yield f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}"
     for remark in campaign.remarks:
@@ -160,6 +162,7 @@ def check_lines(
     table = tables.printed_sizes_table(separability)
     if table.rows:
         yield table
+        yield from _meanings_of_parameters(separability)
     yield from _lines_on_untestable_effects(separability)
     for detectability in separability.detectability:
         identifier = detectability.effect.identifier
@@ -168,6 +171,24 @@ def check_lines(
             yield f"Confused: {identifier} with {listing(others)}."
     yield from group_lines(separability, "to which is said above")
     yield from campaign_needs(separability, campaign, catalogue, model.kinds)
+
+
+def _meanings_of_parameters(separability: Separability) -> Iterator[str]:
+    """Yield what each parameter of the table means, with the effects that have it."""
+    effects_by_meaning: dict[tuple[str, str], list[str]] = {}
+    for row in separability.detectability:
+        for parameter in row.effect.parameters:
+            if not row.reason and parameter.name == row.parameter:
+                meaning = parameter.name.replace("_", " "), parameter.description
+                effects_by_meaning.setdefault(meaning, []).append(row.effect.identifier)
+    yield "The parameters are sizes without a unit where none is given:"
+    for (name, description), identifiers in effects_by_meaning.items():
+        yield f"  {name} ({', '.join(identifiers)}): {description}"
+    if any("(seen at" in row.place for row in separability.detectability):
+        yield (
+            "A mains line above half the sampling rate is seen at its alias, and only if the "
+            "logger has no filter against it."
+        )
 
 
 def _lines_on_untestable_effects(separability: Separability) -> Iterator[str]:

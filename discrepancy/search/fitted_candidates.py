@@ -1,7 +1,6 @@
 """The candidates that a search has fitted, with their scores and probabilities."""
 
 from dataclasses import dataclass, field
-from math import exp
 
 from scipy.special import logsumexp
 
@@ -16,6 +15,7 @@ from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.proof_record import ErrorComparison
 from discrepancy.search_settings import SEARCH
+from reporting.probabilities import normalised_probabilities
 
 
 @dataclass
@@ -128,14 +128,10 @@ class FittedCandidates:
             identifiers: float(logsumexp(set_scores))
             for identifiers, set_scores in scores_by_set.items()
         }
-        log_total = float(logsumexp(list(log_weights.values())))
-        sets_by_probability = sorted(
-            log_weights.items(), key=lambda set_and_weight: -set_and_weight[1]
-        )
-        return {
-            identifiers: min(exp(log_weight - log_total), 1.0)
-            for identifiers, log_weight in sets_by_probability
-        }
+        sets_in_order = sorted(log_weights, key=lambda identifiers: -log_weights[identifiers])
+        log_weights_in_order = [log_weights[identifiers] for identifiers in sets_in_order]
+        probabilities = normalised_probabilities(log_weights_in_order).tolist()
+        return dict(zip(sets_in_order, probabilities, strict=True))
 
     def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
         """Store a fit unless an earlier fit of the same candidate has more evidence."""

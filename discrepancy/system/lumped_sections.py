@@ -23,8 +23,50 @@ def as_list(value: object) -> list[object] | tuple[object, ...]:
     return value if isinstance(value, list | tuple) else [value]
 
 
+_VECTOR_FORMS = "a number or a list of numbers is expected, as 1.0 or [1.0, 0.0]"
+_ROWS_FORMS = (
+    "a number, a list of numbers (the only row) or a list of rows is expected, as 2.0, "
+    "[2.0, 1.0] or [[2.0, 0.0], [0.0, 1.0]]"
+)
+_MATRIX_FORMS = (
+    "a number, a list of numbers (the diagonal) or a list of rows is expected, as 2.0, "
+    "[2.0, 1.0] or [[2.0, 0.0], [0.0, 1.0]]"
+)
+
+
+def _refuse_other_forms(value: object, expected: str) -> None:
+    """Refuse a value that is neither a number, nor a list of numbers, nor a list of lists.
+
+    Parameters
+    ----------
+    value : object
+        The value as the file states it.
+    expected : str
+        The forms that are expected, for the message.
+
+    Raises
+    ------
+    ValueError
+        If the value has another form, or mixes numbers and lists.
+    """
+    entries = as_list(value)
+    are_lists = [isinstance(entry, list | tuple) for entry in entries]
+    are_numbers = [
+        isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries
+    ]
+    if not all(are_lists) and not all(are_numbers):
+        raise ValueError(f"{expected}, but {value!r} was given")
+
+
+def _as_numbers(value: object) -> object:
+    """Return a vector as a list of numbers, given the list or one number."""
+    _refuse_other_forms(value, _VECTOR_FORMS)
+    return as_list(value)
+
+
 def _as_rows(value: object) -> object:
     """Return a matrix as a list of rows, given the rows, the only row, or one number."""
+    _refuse_other_forms(value, _ROWS_FORMS)
     entries = as_list(value)
     if entries and isinstance(entries[0], list | tuple):
         return entries
@@ -33,6 +75,7 @@ def _as_rows(value: object) -> object:
 
 def _as_matrix(value: object) -> object:
     """Return a matrix as a list of rows, given the rows, its diagonal, or one number."""
+    _refuse_other_forms(value, _MATRIX_FORMS)
     entries = as_list(value)
     if entries and isinstance(entries[0], list | tuple):
         return entries
@@ -48,7 +91,7 @@ _NumbersOrRows = Number | tuple[Number, ...] | tuple[tuple[Number, ...], ...]
 Vector = Annotated[
     tuple[Number, ...],
     Field(min_length=1),
-    BeforeValidator(as_list, json_schema_input_type=Number | tuple[Number, ...]),
+    BeforeValidator(_as_numbers, json_schema_input_type=Number | tuple[Number, ...]),
 ]
 Rows = Annotated[
     tuple[tuple[Number, ...], ...],

@@ -7,7 +7,7 @@ from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError
 
 from .binding import Binding
-from .bound_variables import InputBinding, ScalarBinding, VectorBinding
+from .bound_variables import InputBinding, PortBinding, ScalarBinding, VectorBinding
 from .layout import VariableElements, find_variable
 from .slots import InputSlot
 from .units import conversion
@@ -153,8 +153,8 @@ class BindingResolver:
     def misfits(self) -> list[str]:
         """Return the messages about all entries of the binding that do not fit the FMU.
 
-        Ports are left out, because each of their quantities depends on the others. Of a list of
-        variables only the first misfit is stated.
+        Of a list of variables only the first misfit is stated. The quantities of a port are
+        compared with each other only if each of them fits the FMU.
         """
         messages: dict[str, str] = {}
         for label, entry in self._labelled_entries():
@@ -164,7 +164,39 @@ class BindingResolver:
                 self._check_entry(label, entry)
             except BindingError as error:
                 messages[label] = str(error)
+        for name, port in self.binding.port.items():
+            messages |= self._misfits_of_port(name, port)
         return [*messages.values()]
+
+    def _misfits_of_port(self, name: str, port: PortBinding) -> dict[str, str]:
+        """Return the messages about a port that does not fit the FMU, by their places."""
+        messages: dict[str, str] = {}
+        for quantity, vector in port.quantities.items():
+            label = f"port.{name}.{quantity}"
+            for variable, unit in zip(vector.variables, vector.units, strict=True):
+                try:
+                    self._check_port_variable(label, ScalarBinding(variable=variable, unit=unit))
+                except BindingError as error:
+                    messages.setdefault(label, str(error))
+        if not messages:
+            try:
+                self._quantities_of_port(name, port)
+            except BindingError as error:
+                messages[f"port.{name}"] = str(error)
+        return messages
+
+    def _check_port_variable(self, label: str, entry: ScalarBinding) -> None:
+        """Refuse a variable of a port that the FMU does not have, or has of another type or unit.
+
+        Raises
+        ------
+        BindingError
+            If it does not fit the FMU.
+        """
+        causality = "input" if self._is_input(entry.variable) else "output"
+        variable = self.find(entry.variable, label, causality).variable
+        definitions = self.description.units_of(variable)
+        conversion(entry.unit, variable, definitions, where=self.place_in_binding(label))
 
     def _labelled_entries(self) -> Iterator[tuple[str, ScalarBinding]]:
         """Yield each variable that the binding names, with its place in the binding."""
@@ -215,21 +247,27 @@ class BindingResolver:
         """
         quantities = []
         for port_name, port in self.binding.port.items():
-            force_count = len(port.force.variables)
-            is_output_of_quantity: dict[str, bool] = {}
-            for quantity, vector in port.quantities.items():
-                name = f"{port_name}.{quantity}"
-                is_output_of_quantity[quantity] = self._is_output_vector(
-                    f"port.{name}", vector, force_count
-                )
-                quantities.append(PortQuantity(name, vector, is_output_of_quantity[quantity]))
-            force_is_output = is_output_of_quantity.pop("force")
-            if force_is_output in is_output_of_quantity.values():
-                side = "outputs" if force_is_output else "inputs"
-                raise BindingError(
-                    f"In {self.place_in_binding(f'port.{port_name}')}, force and motion are both "
-                    f"{side} of the FMU; at a port one is given for the other."
-                )
+            quantities += self._quantities_of_port(port_name, port)
+        return quantities
+
+    def _quantities_of_port(self, port_name: str, port: PortBinding) -> list[PortQuantity]:
+        """Return the quantities of a port; for errors see `port_quantities`."""
+        quantities = []
+        force_count = len(port.force.variables)
+        is_output_of_quantity: dict[str, bool] = {}
+        for quantity, vector in port.quantities.items():
+            name = f"{port_name}.{quantity}"
+            is_output_of_quantity[quantity] = self._is_output_vector(
+                f"port.{name}", vector, force_count
+            )
+            quantities.append(PortQuantity(name, vector, is_output_of_quantity[quantity]))
+        force_is_output = is_output_of_quantity.pop("force")
+        if force_is_output in is_output_of_quantity.values():
+            side = "outputs" if force_is_output else "inputs"
+            raise BindingError(
+                f"In {self.place_in_binding(f'port.{port_name}')}, force and motion are both "
+                f"{side} of the FMU; at a port one is given for the other."
+            )
         return quantities
 
     def _is_output_vector(self, label: str, vector: VectorBinding, force_count: int) -> bool:

@@ -143,8 +143,16 @@ def test_the_command_of_a_verdict_repeats_the_run_in_any_folder(laboratory, tmp_
 def test_the_command_of_a_verdict_of_a_flight_gets_another_model():
     command = "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --model own.toml --seed 0"
     assert _command_with_model(command, Path("two/one.json")) == (
-        "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --seed 0 --model two/one.json "
+        "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --model two/one.json "
         "--out verdicts/m1_one"
+    )
+
+
+def test_the_next_command_is_relative_to_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = f"uav-twin discrepancy run {tmp_path}/my_cart --model {tmp_path}/m.toml --seed 7"
+    assert _command_with_model(command, tmp_path / "m_patched.toml") == (
+        "uav-twin discrepancy run my_cart --seed 7 --model m_patched.toml --out verdicts/my_cart_m_patched"
     )
 
 

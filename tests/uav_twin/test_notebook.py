@@ -78,9 +78,9 @@ def test_a_fleet_shows_how_its_twins_fared_and_their_courses(library_file, tmp_p
     parse(text)
     assert "rms error of the estimated z1" in text
     panels = flown.plot()
-    assert [panel.get_ylabel() for panel in panels] == ["z1 (SI)", "z2 (SI)"]
+    assert [panel.get_ylabel() for panel in panels] == ["z1, %", "z2, %"]
     believed = uav_twin.open_fleet(flown.folder)["growing_damage/filtered/mean"].values[..., 0]
-    np.testing.assert_allclose(panels[0].get_lines()[0].get_ydata(), np.median(believed, axis=0))
+    np.testing.assert_allclose(panels[0].get_lines()[0].get_ydata(), 100.0 * np.median(believed, axis=0))
 
 
 def test_a_calibration_shows_prior_and_posterior_of_each_parameter():

@@ -1,7 +1,7 @@
 """Outcomes, damage and decisions of the twins of a fleet, read from the fleet's store."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,6 +26,7 @@ from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
@@ -34,10 +35,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Estimated:
-    """An estimated quantity with its standard error; NaN if it cannot be estimated."""
+    """An estimated quantity with its standard error; NaN if it cannot be estimated.
+
+    Attributes
+    ----------
+    value, error : float
+        The estimate, and its standard error.
+    unit : str
+        The unit of both; empty for a plain number, or where factors of a state differ in it.
+    """
 
     value: float
     error: float
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -364,15 +374,22 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
             )
         if not np.isnan(outcomes.early_fallbacks.value):
             figures["early fallback"] = outcomes.early_fallbacks
+        state_unit = unit_of_states(group)
         for name, rms, bias in zip(
             stored_values(group, "filtered/region"), outcomes.rms, outcomes.bias, strict=True
         ):
-            figures[f"filtered rms error of {name}"] = rms
-            figures[f"bias of {name}"] = bias
+            figures[f"filtered rms error of {name}"] = replace(rms, unit=state_unit)
+            figures[f"bias of {name}"] = replace(bias, unit=state_unit)
     figures["log evidence of a step"] = outcomes.log_evidence
     if is_truth_known:
         figures["true state in the 90 % set"] = outcomes.credible_coverage
     return figures
+
+
+def unit_of_states(group: "xr.DataTree") -> str:
+    """Return the unit of the stored factors of the state; empty if they differ in it."""
+    unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
+    return "" if ", " in unit else unit
 
 
 def _counts_of_twins(group: "xr.DataTree") -> dict[str, Estimated | int]:
@@ -421,8 +438,8 @@ PRINTED_FIGURES_OF_FLEETS = {
     "early fallback": _PrintedFigure(
         "assets whose control changed before the damage called for it", 100.0, "%"
     ),
-    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of} (SI)"),
-    "bias of ": _PrintedFigure("mean error of the estimated {of} (SI)"),
+    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of}"),
+    "bias of ": _PrintedFigure("mean error of the estimated {of}"),
     "log evidence of a step": _PrintedFigure("log evidence of a step", unit="nat"),
     "true state in the 90 % set": _PrintedFigure(
         "steps in which the set of states with a probability of 90 % has the true one", 100.0, "%"
@@ -464,8 +481,12 @@ def _figure_text(figure: Estimated | int | None, printed_figure: _PrintedFigure)
         return ""
     if isinstance(figure, int):
         return str(figure)
-    value = printed_figure.scale * figure.value
-    error = printed_figure.scale * figure.error
+    scale = printed_figure.scale
+    unit = printed_figure.unit
+    if figure.unit:
+        scale, unit = printed_state(figure.unit, "percentage points")
+    value = scale * figure.value
+    error = scale * figure.error
     # One twin has no standard error.
     text = plus_minus(value, error) if np.isfinite(error) else significant(value)
-    return f"{text} {printed_figure.unit}".rstrip()
+    return f"{text} {unit}".rstrip()

@@ -17,11 +17,12 @@ from benchmarks.effect_pages import FOLDER, pages
 from benchmarks.effect_pictures import FLOWS, REGION_LOSSES, draw, picture_setting
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
-from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
+from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.places import mains_lines
 from discrepancy.errors import CatalogueError
-from discrepancy.sources.examples import example_campaign, plan_from_scales
+from discrepancy.model_choice import load_model
+from discrepancy.sources.examples import example_campaign, plan_from_scales, usual_plan
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import ACROSS, Conditions
 from discrepancy.system.sensing import observe
@@ -372,11 +373,11 @@ LINE = patches.DecayingLine("tip", 7.0, 0.01, 0.2, 0.0)
     ("rate", "lines"),
     [
         (1000.0, ("50 Hz", "60 Hz", "400 Hz")),
-        (60.0, ("50 Hz", "400 Hz")),  # 60 Hz is a constant
-        (110.0, ("50 or 60 Hz", "400 Hz")),
-        (50.0, ("60 Hz",)),
-        (50.001, ("60 Hz",)),  # 50 Hz shows at 0.001 Hz
-        (20.0, ("50 Hz",)),  # at 10 Hz, every second sample of the other sign
+        (60.0, ("50 Hz (seen at 10 Hz)", "400 Hz (seen at 20 Hz)")),  # 60 Hz is a constant
+        (110.0, ("50 or 60 Hz", "400 Hz (seen at 40 Hz)")),
+        (50.0, ("60 Hz (seen at 10 Hz)",)),
+        (50.001, ("60 Hz (seen at 10 Hz)",)),  # 50 Hz shows at 0.001 Hz
+        (20.0, ("50 Hz (seen at 10 Hz)",)),  # every second sample of the other sign
         (10.0, ()),
     ],
 )
@@ -387,6 +388,14 @@ def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
     assert mains_lines(given) == lines
     (hum,) = chosen("mains_hum")
     assert (hum.unavailable(given) is None) == bool(lines)
+
+
+def test_a_crack_of_a_model_without_skins_has_a_sign_of_the_motion_as_its_place():
+    rig = load_model("single_mass_rig")
+    releases = example_campaign(rig, "ringdown", 3, usual_plan(rig))
+    (crack,) = chosen("breathing_crack")
+    places = crack.places(Setting(releases, rig, rig.scales(releases)))
+    assert places == ("slide, open at positive x", "slide, open at negative x")
 
 
 # ---------------------------------------------------------------- what a campaign cannot carry

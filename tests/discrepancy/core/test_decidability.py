@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass, replace
 from math import inf, log
 
+import jsonschema
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -24,13 +25,8 @@ from discrepancy.judgement.next_experiment import (
 )
 from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
 from discrepancy.report.decidability_text import group_lines
-from discrepancy.self_calibration import (
-    SelfCalibration,
-    outcome_of,
-    self_calibrate,
-    wilson_interval,
-    write_self_calibration,
-)
+from discrepancy.self_calibration import SelfCalibration, outcome_of, self_calibrate, wilson_interval
+from discrepancy.self_calibration_file import self_calibration_schema, write_self_calibration
 from discrepancy.simulation import Simulator
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
@@ -454,4 +450,5 @@ def test_a_self_calibration_is_written_with_its_cases(tried, tmp_path):
     path = write_self_calibration(tmp_path / "self_calibration.json", tried.result, ORIGIN)
     stored = json.loads(path.read_text(encoding="utf-8"))
     assert stored["schema"] == "uav-twin self calibration 1"
+    jsonschema.validate(stored, self_calibration_schema())
     assert len(stored["cases"]) == 6

@@ -173,7 +173,8 @@ def test_a_campaign_is_read_the_same_from_what_is_written(plain, tmp_path):
     """What the reader remarked is not said twice."""
     again = read_campaign(write_campaign(plain, tmp_path / "b"))
     assert same(plain, again, 1e-9)
-    assert len(again.remarks) == 1
+    assert sum("is empty and left out" in remark for remark in again.remarks) == 1
+    assert len(set(again.remarks)) == len(again.remarks)
 
 
 def test_the_hash_of_a_campaign_follows_every_file(plain, plain_folder, tmp_path):
@@ -214,10 +215,30 @@ def test_columns_of_no_channel_are_one_remark(tmp_path):
     assert remark.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
+def test_a_channel_that_some_tables_lack_is_one_remark_with_its_trials(tmp_path):
+    tip_up = ("tip_up.csv", "", "force,g17\n0,0.5\n5,120.25\n")
+    campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, tip_up))
+    (remark,) = (remark for remark in campaign.remarks if "the channel 'tip'" in remark)
+    assert remark.startswith("The trials 'tip load up', 'turn' have no column of the channel 'tip'")
+
+
+def test_a_trial_that_states_its_channels_lacks_none(tmp_path):
+    tip_up = ("tip_up.csv", "", "force,g17\n0,0.5\n5,120.25\n")
+    stated = (TOML, 'file = "tip_up.csv"', 'file = "tip_up.csv"\nchannels = ["g17"]')
+    campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, tip_up, stated))
+    (remark,) = (remark for remark in campaign.remarks if "the channel 'tip'" in remark)
+    assert remark.startswith("The trial 'turn' has no column")
+
+
 @pytest.fixture(scope="module")
 def heated(tmp_path_factory):
     """A campaign with three inputs: a heater, a table and a fan."""
     return read_campaign(campaign_folder(tmp_path_factory.mktemp("heated") / "a", HEATED))
+
+
+def test_an_input_that_one_driven_trial_lacks_is_a_remark(heated):
+    (remark,) = (remark for remark in heated.remarks if "the input 'table'" in remark)
+    assert remark.startswith("The trial 'second' has no column of the input 'table'")
 
 
 def test_inputs_have_their_quantity_and_hold(heated):

@@ -10,12 +10,19 @@ from scipy.signal import lfilter
 from benchmarks.cantilever import Cantilever
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.checks.fault import FaultKind
+from discrepancy.checks.frequency import dominant_frequency
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
 from discrepancy.checks.quality import check_data, clipped_run
 from discrepancy.checks.rest import _effective_sample_count
 from discrepancy.errors import ModelError
-from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_from_scales, write_example
+from discrepancy.sources.examples import (
+    ExamplePlan,
+    example_campaign,
+    plan_from_scales,
+    usual_plan,
+    write_example,
+)
 from discrepancy.system.lumped_model import LumpedModel
 from fe.runtime import patch as patches
 from fe.runtime.patch import ModelPatch, SensorGain
@@ -369,6 +376,40 @@ def test_times_in_milliseconds_are_recognised(campaign):
     assert "sample faster" not in sentence
 
 
+def single_mass_releases():
+    """Return releases of a mass of 2 kg on a spring of 800 N/m, which is 3.18 Hz."""
+    rig = model_of(Inputs(__file__).text("mass_on_a_spring.toml"))
+    return example_campaign(rig, "ringdown", 3, usual_plan(rig))
+
+
+@pytest.mark.parametrize(("stiffness", "model_frequency"), [("800e-3", "0.101 Hz"), ("800e3", "101 Hz")])
+def test_a_stiffness_in_another_unit_is_told_by_both_frequencies(stiffness, model_frequency):
+    rig = Inputs(__file__).text("mass_on_a_spring.toml", ("800.0", stiffness))
+    fault, *others = check_against_model(single_mass_releases(), model_of(rig))
+    assert (fault.kind, others) == (FaultKind.FREQUENCY, [])
+    assert "oscillate at 3.1" in fault.sentence
+    assert f"is {model_frequency}" in fault.sentence
+
+
+def test_a_frequency_that_the_campaign_accepts_leaves_the_other_checks():
+    rig = model_of(Inputs(__file__).text("mass_on_a_spring.toml", ("800.0", "800e-3")))
+    accepting = replace(single_mass_releases(), accept=("frequency",))
+    kinds = {(fault.kind, fault.accepted) for fault in check_against_model(accepting, rig)}
+    assert {(FaultKind.FREQUENCY, True), (FaultKind.TOO_SHORT, False)} <= kinds
+
+
+def test_the_frequency_of_a_decaying_record_with_a_drift_is_that_of_its_oscillation():
+    time = 0.004 * np.arange(700)
+    record = np.exp(-time) * np.cos(2.0 * np.pi * 5.0 * time) + 0.05 * time
+    assert dominant_frequency(time, record) == pytest.approx(5.0, rel=0.02)
+
+
+def test_noise_has_no_frequency():
+    time = 0.004 * np.arange(700)
+    noise = np.random.default_rng(1).standard_normal(700)
+    assert dominant_frequency(time, noise) is None
+
+
 @pytest.mark.parametrize(
     ("output", "quantity", "kinds"),
     [
@@ -527,7 +568,9 @@ def test_few_outliers_are_found_and_left_out(spoilt_readings):
 
 def test_few_outliers_are_no_fault_and_remarked_on(spoilt_readings):
     count = len(spoilt_readings.campaign.trials[3].time)
-    remark = f"of {count} readings of 'g0' in the trial 'release 1' are outliers"
+    marked_trial = spoilt_readings.marked.trials[3]
+    first_row = 1 + int(np.flatnonzero(~marked_trial.used[:, marked_trial.channels.index("g0")])[0])
+    remark = f"of {count} readings of 'g0' in the trial 'release 1' (rows {first_row}"
     assert check_data(spoilt_readings.spoilt) == ()
     assert remark in " ".join(spoilt_readings.marked.remarks)
 

@@ -137,6 +137,22 @@ def test_all_entries_that_do_not_fit_the_fmu_are_told_at_once_with_the_file(fore
         assert message.count(f". {entry}") == 1 or message.count(f"? {entry}") == 1
 
 
+def test_all_quantities_of_ports_that_do_not_fit_the_fmu_are_told_at_once(foreign_fmu, tmp_path):
+    port = """
+[port.wall]
+force = { variables = "pull", unit = "N" }
+displacement = { variables = "shift", unit = "mm" }
+"""
+    path = tmp_path / "room.toml"
+    path.write_text(UNFIT + port, encoding="utf-8")
+
+    with refused(BindingError, "5 entries of the binding room") as caught:
+        FmiAsset(foreign_fmu("room2"), path)
+
+    assert "port.wall.force names 'pull'" in str(caught.value)
+    assert "port.wall.displacement names 'shift'" in str(caught.value)
+
+
 def test_inputs_that_nobody_sets_are_named_with_their_start_values(room):
     draft = parse_draft(room)
     assert unset_inputs_sentence(room, draft) == ""

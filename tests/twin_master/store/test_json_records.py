@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from calibration.result.file import plain_record, run_record
+from tests.conftest import synthetic_calibration
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import JOURNAL_NAME, encode_line, records
 from twin_master.mission.preparation import load_knowledge
@@ -42,6 +44,12 @@ def check(record, name):
 @pytest.mark.parametrize("name", ["summary", "config", "timing"])
 def test_a_file_of_a_run_has_the_keys_of_its_format(run, name):
     check(json.loads((run / f"{name}.json").read_text(encoding="utf-8")), name)
+
+
+def test_the_figures_of_a_calibration_have_the_keys_of_their_format():
+    synthetic = synthetic_calibration()
+    check(plain_record(synthetic), "calibration")
+    check(run_record(synthetic, "young_modulus_factor"), "calibration")
 
 
 def test_lines_of_a_journal_have_the_keys_of_their_format(run):

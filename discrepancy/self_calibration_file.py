@@ -1,0 +1,167 @@
+"""The file `self_calibration.json`: its records, its JSON Schema, and how it is written."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from discrepancy.document import Origin, document_schema, write_document
+from discrepancy.self_calibration import (
+    CalibrationCase,
+    Proportion,
+    SelfCalibration,
+    ordered_outcomes,
+)
+from reporting.format_schema import JsonSchema
+
+SELF_CALIBRATION_NAME = "self_calibration.json"
+SCHEMA = "uav-twin self calibration 1"
+
+
+@dataclass(frozen=True)
+class StoredProportion:
+    """A fraction of cases, as it is stored.
+
+    Attributes
+    ----------
+    count, total : int
+        The number of these cases, and of all cases.
+    low, high : float
+        Limits of the 90 % Wilson interval of the fraction [1].
+    share : float
+        The fraction; null without cases [1].
+    """
+
+    count: int
+    total: int
+    low: float
+    high: float
+    share: float
+
+
+@dataclass(frozen=True)
+class StoredOutcomes:
+    """The fractions of all outcomes, by their names.
+
+    Attributes
+    ----------
+    with_an_effect, with_nothing : mapping of str to StoredProportion
+        Of the campaigns in which an effect was hidden, and of those in which nothing was.
+    """
+
+    with_an_effect: Mapping[str, StoredProportion]
+    with_nothing: Mapping[str, StoredProportion]
+
+
+@dataclass(frozen=True)
+class StoredConfusion:
+    """How often each verdict was reached for each hidden effect.
+
+    Attributes
+    ----------
+    hidden : tuple of str
+        Names of the rows: the hidden effects.
+    verdict : tuple of str
+        Names of the columns: the named effects, and the other verdicts.
+    counts : tuple of tuple of int
+        The numbers of campaigns by row and column.
+    """
+
+    hidden: tuple[str, ...]
+    verdict: tuple[str, ...]
+    counts: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class StoredSelfCalibration:
+    """The content of `self_calibration.json`.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the simulated campaigns.
+    not_detectable : tuple of str
+        Identifiers of the effects that no draw of their priors made detectable, so that none was
+        hidden.
+    outcomes : StoredOutcomes
+        The fractions of the outcomes.
+    coverage_90 : StoredProportion
+        The fraction of the 90 % intervals of rightly named effects that hold the true value.
+    confusion : StoredConfusion
+        How often each verdict was reached for each hidden effect.
+    cases : tuple of CalibrationCase
+        All simulated campaigns.
+    origin : Origin
+        What the verdict was reached from.
+    """
+
+    seed: int
+    not_detectable: tuple[str, ...]
+    outcomes: StoredOutcomes
+    coverage_90: StoredProportion
+    confusion: StoredConfusion
+    cases: tuple[CalibrationCase, ...]
+    origin: Origin
+
+
+def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin: Origin) -> Path:
+    """Write `self_calibration.json`: every case, the proportions and the confusion matrix.
+
+    The file is written completely or not at all.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    rows, columns, counts = self_calibration.confusion()
+    content = StoredSelfCalibration(
+        seed=self_calibration.seed,
+        not_detectable=self_calibration.not_detectable,
+        outcomes=StoredOutcomes(
+            with_an_effect=_stored_outcomes(self_calibration, null=False),
+            with_nothing=_stored_outcomes(self_calibration, null=True),
+        ),
+        coverage_90=_stored_proportion(self_calibration.coverage()),
+        confusion=StoredConfusion(
+            hidden=tuple(rows),
+            verdict=tuple(columns),
+            counts=tuple(tuple(row) for row in counts.tolist()),
+        ),
+        cases=self_calibration.cases,
+        origin=origin,
+    )
+    return write_document(path, SCHEMA, content)
+
+
+def self_calibration_schema() -> JsonSchema:
+    """Return the JSON Schema of `self_calibration.json`; a null number is not known."""
+    return document_schema(StoredSelfCalibration, SCHEMA)
+
+
+def _stored_outcomes(
+    self_calibration: SelfCalibration, *, null: bool
+) -> dict[str, StoredProportion]:
+    """Return the proportions of all outcomes, by outcome.
+
+    Parameters
+    ----------
+    self_calibration : SelfCalibration
+        The cases.
+    null : bool
+        True for campaigns without an effect, False for those with one.
+    """
+    proportions = {}
+    for outcome in ordered_outcomes(self_calibration, null=null):
+        proportions[outcome] = _stored_proportion(self_calibration.share(outcome, null=null))
+    return proportions
+
+
+def _stored_proportion(proportion: Proportion) -> StoredProportion:
+    """Return a proportion as it is stored."""
+    return StoredProportion(
+        count=proportion.count,
+        total=proportion.total,
+        low=proportion.low,
+        high=proportion.high,
+        share=proportion.value,
+    )
