@@ -66,9 +66,9 @@ def correct_beliefs(
         np.empty(gauges),
     )
     precision = np.empty(gauges)
+    model_squares = np.empty(gauges)
     log_density = np.empty(pairs)
     for twin in range(twins):
-        model_squares = priors.degrees + beliefs.model_squares[twin]
         # Each hypothesis has learnt noise scales of its own. They enter the constant of Student's
         # density: 1 / sqrt(degrees + squares) for each gauge.
         log_scale_ratio = 0.0
@@ -76,6 +76,7 @@ def correct_beliefs(
             observation.present[g] = not np.isnan(observations.readings[twin, g])
             degrees = priors.degrees + observation_count[twin, g]
             observation.degrees_after[g] = degrees + 1.0
+            model_squares[g] = priors.degrees + beliefs.model_squares[twin, g]
             precision[g] = min(degrees / model_squares[g], 1.0)
             if observation.present[g]:
                 recovered_squares = priors.degrees + beliefs.recovered_squares[twin, g]

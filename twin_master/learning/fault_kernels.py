@@ -392,7 +392,9 @@ def _fit_within_intervals(
     """
     factors, gauges, pairs = interval.shape
     point = np.zeros((factors, pairs))
-    weight = np.where(observation.present, precision, 0.0)
+    weight = np.empty(gauges)
+    for g in range(gauges):
+        weight[g] = precision[g] if observation.present[g] else 0.0
     for f in range(factors):
         for g in range(gauges):
             for i in range(pairs):
@@ -538,7 +540,10 @@ def update_sound_gauges(
     pairs = len(log_density)
     for i in range(pairs):
         log_density[i] = observation.log_density[i]
-    _add_log_density_of_residuals(observation, degrees + squares, log_density)
+    scale_squares = np.empty(len(squares))
+    for g in range(len(squares)):
+        scale_squares[g] = degrees + squares[g]
+    _add_log_density_of_residuals(observation, scale_squares, log_density)
 
     # Exponents are taken relative to the largest one of the pairs that count. Those of other pairs
     # may be larger: they are not used.

@@ -64,7 +64,10 @@ class SumsOfFaults(NamedTuple):
 def multiply_by_powers(base: Float, exponents: Float, product: Float) -> None:
     """Do the same for each gauge: powers of numbers (G K,) by exponents (G,) of the gauges."""
     gains = len(base) // len(exponents)
-    if np.min(exponents) == np.max(exponents):
+    are_equal = True
+    for g in range(len(exponents)):
+        are_equal &= exponents[g] == exponents[0]
+    if are_equal:
         multiply_by_power(base, exponents[0], product)
         return
     for g in range(len(exponents)):
@@ -121,7 +124,9 @@ def weigh_gauge_faults(
     sum_squares = np.zeros(count)
     sum_cc = np.zeros(count)
     sum_cx = np.zeros(count)
-    inverse_reference = 1.0 / model.kernel[model.reference]
+    inverse_reference = np.empty(gauges)
+    for g in range(gauges):
+        inverse_reference[g] = 1.0 / model.kernel[model.reference, g]
     for j in range(len(model.pair)):
         prior = belief[model.pair[j]]
         density = model.density[j]

@@ -54,17 +54,20 @@ class ModelLikelihood(NamedTuple):
 def considered_pairs(beliefs: Beliefs, twin: int) -> Index:
     """Return the indices (n,) of the pairs that some fault of a twin considers."""
     _, pairs, faults = beliefs.gauge.shape
-    is_considered = np.empty(pairs, np.bool_)
+    considered = np.empty(pairs, np.int64)
+    count = 0
     for i in range(pairs):
         belief = beliefs.gauge[twin, i]
         largest = beliefs.free_gains[twin, i]
         for r in range(faults):
             largest = max(largest, belief[r])
-        is_considered[i] = largest >= NEGLIGIBLE_UNDER_FAULT
-        if not is_considered[i]:
+        if largest >= NEGLIGIBLE_UNDER_FAULT:
+            considered[count] = i
+            count += 1
+        else:
             for r in range(faults):
                 belief[r] = 0.0
-    return np.flatnonzero(is_considered)
+    return considered[:count]
 
 
 @_compiled
