@@ -96,6 +96,7 @@ def seconds_with_notices() -> tuple[float, float]:
     knowledge, asset = prepare_knowledge(scenario, source, 0), source.open()
     truths = [knowledge.truth(seed) for seed in range(TWINS)]
     fly_side_by_side(knowledge, truths[:2], [asset] * 2)  # compiles
+    fly_one_by_one(knowledge, truths[:1], lambda *_: asset)  # compiles
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS))
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     to_fifty_steps = 50 / scenario.mission.steps

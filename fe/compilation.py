@@ -37,11 +37,6 @@ _Function = TypeVar("_Function", bound=NumericalFunction)
 # error.
 OPTIONS: dict[str, bool | str] = {"nogil": True, "error_model": "numpy"}
 """Options of numba."""
-SUMS_IN_ANY_ORDER: dict[str, set[str]] = {"fastmath": {"reassoc", "contract", "nsz"}}
-"""Further options, with which numba may reorder the terms of a sum, so that it vectorises sums.
-
-The order does not depend on the data, so that the results of one machine stay the same to the last
-bit. NaN and infinity keep their meaning."""
 
 WITHOUT_NUMBA = (
     "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, "
@@ -50,10 +45,7 @@ WITHOUT_NUMBA = (
 
 
 def compiled(
-    function: Callable[Parameters, Result],
-    calls: Iterable[NumericalFunction] = (),
-    *,
-    sums_in_any_order: bool = False,
+    function: Callable[Parameters, Result], calls: Iterable[NumericalFunction] = ()
 ) -> Callable[Parameters, Result]:
     """Return a function that numba compiles at the first call, and that runs without Python's lock.
 
@@ -71,8 +63,6 @@ def compiled(
     calls : iterable of callable
         Plain functions of other files that it calls: numba by itself sees changes of its own file
         only. The files of compiled functions that its module names are found without them.
-    sums_in_any_order : bool
-        Whether numba may reorder the terms of sums, which makes long sums several times as fast.
     """
     if numba is None:
         return _plain_with_note(function)
@@ -80,12 +70,11 @@ def compiled(
         value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")
     ]
     source_files = [inspect.getfile(source) for source in (function, *calls, *compiled_callees)]
-    options = OPTIONS | SUMS_IN_ANY_ORDER if sums_in_any_order else OPTIONS
     with _cache_named_by_sources(source_files):
         try:
-            compiled_function = numba.njit(cache=True, **options)(function)
+            compiled_function = numba.njit(cache=True, **OPTIONS)(function)
         except RuntimeError:  # raised by numba if it finds no folder that it can write to
-            compiled_function = numba.njit(**options)(function)
+            compiled_function = numba.njit(**OPTIONS)(function)
     return cast("Callable[Parameters, Result]", compiled_function)
 
 

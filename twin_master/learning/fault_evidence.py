@@ -3,8 +3,6 @@
 Notation and method are those of `fault_kernels`.
 """
 
-from functools import partial
-
 import numpy as np
 
 from fe.compilation import compiled
@@ -24,10 +22,8 @@ from twin_master.learning.free_gains import update_free_gains
 from twin_master.learning.gauge_faults import update_gauge_faults
 from twin_master.learning.model_likelihood import considered_pairs, model_likelihood
 
-_compiled = partial(compiled, sums_in_any_order=True)
 
-
-@_compiled
+@compiled
 def correct_beliefs(
     predictions: Predictions,
     observations: Observations,

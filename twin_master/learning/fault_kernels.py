@@ -14,7 +14,6 @@ So it is computed by multiplications and one square root, relative to a referenc
 a fifth of the time of logarithms. If that underflows or overflows, logarithms are taken.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +31,6 @@ LARGEST_DISTANCE = 1e140
 """Distances are cut to this in the fit within an interval; its square is still a number."""
 _GAUGES_OF_A_PRODUCT = 8
 """Kernels of so many gauges are multiplied before a logarithm is taken."""
-
-_compiled = partial(compiled, sums_in_any_order=True)
 
 
 class Predictions(NamedTuple):
@@ -190,7 +187,7 @@ class StandardizedObservation(NamedTuple):
 # ----------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiled
 def advance_belief(
     lists: PredecessorLists,
     control: int,
@@ -243,7 +240,7 @@ def advance_belief(
         outer *= level_count
 
 
-@_compiled
+@compiled
 def advance_beliefs(lists: PredecessorLists, control: Index, draws: int, beliefs: Beliefs) -> None:
     """Advance all beliefs of B twins by one transition, in place.
 
@@ -270,7 +267,7 @@ def advance_beliefs(lists: PredecessorLists, control: Index, draws: int, beliefs
         advance_belief(lists, now, draws * faults, gauge, single_work)
 
 
-@_compiled
+@compiled
 def mix_in_model(model_belief: Float, earlier_weight: Float, fault_belief: Single) -> None:
     """Let faults begin: mix the belief of the model into the beliefs of faults, in place.
 
@@ -300,7 +297,7 @@ def mix_in_model(model_belief: Float, earlier_weight: Float, fault_belief: Singl
                 belief[r] = earlier[r] * belief[r] + new[r] * model
 
 
-@_compiled
+@compiled
 def weighted_belief(weight: Float, fault_belief: Single) -> Float:
     """Return the sum of weights (B, R) times beliefs (B, N, R) over the faults: (B, N)."""
     twins, pairs, faults = fault_belief.shape
@@ -320,7 +317,7 @@ def weighted_belief(weight: Float, fault_belief: Single) -> Float:
 # ----------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiled
 def _normal_root(design: Float, weight: Float, root: Float) -> float:
     """Fill `root` with Cholesky's factor of the normal matrix of a ridge regression.
 
@@ -351,7 +348,7 @@ def _normal_root(design: Float, weight: Float, root: Float) -> float:
     return half_log_determinant
 
 
-@_compiled
+@compiled
 def _solve(root: Float, first: int, end: int, point: Float) -> None:
     """Solve root root' x = b in place for the columns `first` to `end` of `point` (F, N)."""
     factors = len(root)
@@ -369,7 +366,7 @@ def _solve(root: Float, first: int, end: int, point: Float) -> None:
             point[f, i] /= root[f, f]
 
 
-@_compiled
+@compiled
 def _fit_within_intervals(
     interval: Float, precision: Float, draws: int, observation: StandardizedObservation
 ) -> None:
@@ -418,7 +415,7 @@ def _fit_within_intervals(
                     observation.prediction[g, i] += change
 
 
-@_compiled
+@compiled
 def standardize(
     predictions: Predictions,
     observations: Observations,
@@ -475,7 +472,7 @@ def standardize(
 # ----------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiled
 def _add_log_density_of_residuals(
     observation: StandardizedObservation, scale_squares: Float, log_density: Float
 ) -> None:
@@ -514,7 +511,7 @@ def _add_log_density_of_residuals(
         log_density[i] -= 0.5 * degrees_of_product * np.log(product[i])
 
 
-@_compiled
+@compiled
 def update_sound_gauges(
     observation: StandardizedObservation,
     degrees: float,

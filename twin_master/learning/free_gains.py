@@ -3,7 +3,6 @@
 Notation and method are those of `fault_kernels`.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ _LEAST_RATIO = 1e-60
 """Densities of a gauge over that of the model are multiplied if they lie between this and 1e60."""
 _GAUGES_OF_A_PRODUCT = 4
 """So many are multiplied before a logarithm is taken."""
-_compiled = partial(compiled, sums_in_any_order=True)
 
 
 class PairsOfFreeGains(NamedTuple):
@@ -71,7 +69,7 @@ class GaugeWithFreeGain(NamedTuple):
     free_squares: float
 
 
-@_compiled
+@compiled
 def _take_pairs(
     model: ModelLikelihood, deviation: float, belief: Single, weight: Float
 ) -> PairsOfFreeGains:
@@ -113,7 +111,7 @@ def _take_pairs(
     return PairsOfFreeGains(pair, x, c, kernel)
 
 
-@_compiled
+@compiled
 def mix_densities(
     pairs: PairsOfFreeGains, gauge: GaugeWithFreeGain, mixture: Float, free_part: Float
 ) -> bool:
@@ -172,7 +170,7 @@ def mix_densities(
     return bool(smallest > _LEAST_RATIO and largest < 1.0 / _LEAST_RATIO)
 
 
-@_compiled
+@compiled
 def mix_densities_in_logs(
     pairs: PairsOfFreeGains, gauge: GaugeWithFreeGain, log_mixture: Float, free_part: Float
 ) -> None:
@@ -196,7 +194,7 @@ def mix_densities_in_logs(
         free_part[j] = np.exp(log_free - log_mixture[j])
 
 
-@_compiled
+@compiled
 def update_free_gains(
     observation: StandardizedObservation,
     model: ModelLikelihood,
@@ -274,7 +272,7 @@ def update_free_gains(
     return float(largest + np.log(total))
 
 
-@_compiled
+@compiled
 def _gauge_with_free_gain(
     observation: StandardizedObservation,
     model: ModelLikelihood,
@@ -297,7 +295,7 @@ def _gauge_with_free_gain(
     )
 
 
-@_compiled
+@compiled
 def _update_statistics(
     observation: StandardizedObservation,
     pairs: PairsOfFreeGains,

@@ -3,7 +3,6 @@
 Notation and method are those of `fault_kernels`.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from twin_master.learning.model_likelihood import ModelLikelihood, multiply_by_p
 
 _LEAST_TOTAL = 1e-200
 """A sum of relative densities that is smaller may have lost terms by underflow."""
-_compiled = partial(compiled, sums_in_any_order=True)
 
 
 class GaugeFaults(NamedTuple):
@@ -60,7 +58,7 @@ class SumsOfFaults(NamedTuple):
     cx: Float
 
 
-@_compiled
+@compiled
 def multiply_by_powers(base: Float, exponents: Float, product: Float) -> None:
     """Do the same for each gauge: powers of numbers (G K,) by exponents (G,) of the gauges."""
     gains = len(base) // len(exponents)
@@ -75,7 +73,7 @@ def multiply_by_powers(base: Float, exponents: Float, product: Float) -> None:
         multiply_by_power(base[faults], exponents[g], product[faults])
 
 
-@_compiled
+@compiled
 def weigh_gauge_faults(
     observation: StandardizedObservation,
     model: ModelLikelihood,
@@ -160,7 +158,7 @@ def weigh_gauge_faults(
     return weight, SumsOfFaults(sum_weight, sum_squares, sum_cc, sum_cx)
 
 
-@_compiled
+@compiled
 def weigh_gauge_fault_in_logs(
     observation: StandardizedObservation,
     model: ModelLikelihood,
@@ -214,7 +212,7 @@ def weigh_gauge_fault_in_logs(
     return largest
 
 
-@_compiled
+@compiled
 def _gauge_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeFaults:
     """Return the faults of single gauges of a twin before an observation."""
     count = beliefs.gauge.shape[2]
@@ -232,7 +230,7 @@ def _gauge_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeFaul
     return faults
 
 
-@_compiled
+@compiled
 def update_gauge_faults(
     observation: StandardizedObservation,
     model: ModelLikelihood,

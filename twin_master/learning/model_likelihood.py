@@ -3,7 +3,6 @@
 Notation and method are those of `fault_kernels`.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,6 @@ from twin_master.learning.fault_kernels import (
     Beliefs,
     StandardizedObservation,
 )
-
-_compiled = partial(compiled, sums_in_any_order=True)
 
 
 class ModelLikelihood(NamedTuple):
@@ -50,7 +47,7 @@ class ModelLikelihood(NamedTuple):
     reference: int
 
 
-@_compiled
+@compiled
 def considered_pairs(beliefs: Beliefs, twin: int) -> Index:
     """Return the indices (n,) of the pairs that some fault of a twin considers."""
     _, pairs, faults = beliefs.gauge.shape
@@ -70,7 +67,7 @@ def considered_pairs(beliefs: Beliefs, twin: int) -> Index:
     return considered[:count]
 
 
-@_compiled
+@compiled
 def model_likelihood(
     observation: StandardizedObservation, pair: Index, scale_squares: Float, log_density: Float
 ) -> ModelLikelihood:
@@ -111,7 +108,7 @@ def model_likelihood(
     )
 
 
-@_compiled
+@compiled
 def multiply_by_power(base: Float, exponent: float, product: Float) -> None:
     """Multiply numbers (n,) by a power of others (n,) in place; the base is overwritten.
 
