@@ -54,7 +54,16 @@ def run() -> list[Measurement]:
         fleet = ensemble(quiet, range(4 * TWINS))
         stored_seconds = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
     to_ten_thousand = 10_000 / (4 * TWINS)
+    together_with_notices, alone_with_notices = seconds_with_notices()
     return [
+        Measurement(
+            "twin of 50 steps with notices, side by side",
+            1e3 * together_with_notices,
+            "ms",
+            2.0,
+            "alone",
+            1e3 * alone_with_notices,
+        ),
         Measurement(
             "step of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone
         ),
@@ -78,6 +87,20 @@ def run() -> list[Measurement]:
             1e6 * likelihood,
         ),
     ]
+
+
+def seconds_with_notices() -> tuple[float, float]:
+    """Return the processor time of a twin of 50 steps with notices: side by side, and alone."""
+    scenario = load_scenario(SCENARIO).scenario
+    source = ReducedModelSource(scenario, reduced_model())
+    knowledge, asset = prepare_knowledge(scenario, source, 0), source.open()
+    truths = [knowledge.truth(seed) for seed in range(TWINS)]
+    fly_side_by_side(knowledge, truths[:2], [asset] * 2)  # compiles
+    fly_one_by_one(knowledge, truths[:1], lambda *_: asset)  # compiles
+    together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS))
+    alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
+    to_fifty_steps = 50 / scenario.mission.steps
+    return to_fifty_steps * together / TWINS, to_fifty_steps * alone / ALONE
 
 
 def cpu_seconds(function: Callable[[], object]) -> float:

@@ -117,8 +117,7 @@ def run(
         bool,
         typer.Option(
             "--no-notices",
-            help="Give no notices and alarms. Many seeds then fly side by side, in a small "
-            "fraction of the time.",
+            help="Give no notices and alarms; many seeds then take a small fraction of the time.",
         ),
     ] = False,
     view: ViewOption = False,

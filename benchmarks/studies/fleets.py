@@ -41,7 +41,7 @@ def knowledge(true: dict[str, float], believed: dict[str, float], *, fixed: bool
     table = load_scenario("growing_damage").scenario.to_dict()
     table["transition"]["probability"] = believed
     table["truth"]["probability"] = true
-    table.pop("notice")  # with it no twins are flown side by side
+    table.pop("notice")  # with it a twin takes thirty times as long
     if fixed:
         table["observation"]["standard_deviation"] = table["truth"]["noise"]["standard_deviation"]
         mean = table["asset"]["parameters"]["young_modulus_factor"]

@@ -49,11 +49,7 @@ def fly_seeds(
         return asset
 
     try:
-        if (
-            isinstance(asset, StatelessAsset)
-            and scenario.learning is None
-            and scenario.notice is None
-        ):
+        if isinstance(asset, StatelessAsset) and scenario.learning is None:
             return outcomes(knowledge, fly_side_by_side(knowledge, truths, [asset] * len(truths)))
         return outcomes(knowledge, fly_one_by_one(knowledge, truths, again))
     finally:

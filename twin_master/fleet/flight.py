@@ -206,22 +206,16 @@ def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
 
 
 def _note_slow_flights(fleet: Fleet, progress: Progress) -> None:
-    """Tell the user which groups fly one twin after the other, why, and what would be faster."""
+    """Tell the user which groups fly one twin after the other, and why."""
     for group in fleet.groups:
         if group.observations or len(group.members) < 2:
             continue
         reason = reason_flown_one_by_one(group.scenarios[0], fleet.parts)
         if not reason:
             continue
-        advice = ""
-        if group.scenarios[0].notice is not None:
-            advice = (
-                " If nobody reads the notices, leave them out: `--no-notices` of `uav-twin run`, "
-                "or `notice = false` in the scenario."
-            )
         progress.note(
             f"{group.name}: the {len(group.members)} twins fly one after the other because "
-            f"{reason}, which takes many times as long as side by side.{advice}"
+            f"{reason}, which takes many times as long as side by side."
         )
 
 

@@ -3,8 +3,9 @@
 The results are a record for the report, and `learnt.toml`, which replaces values of a scenario.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -47,6 +48,8 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
+BLOCK_TWINS = 256
+"""Number of twins whose observations are read and weighed together."""
 NOISE_TWINS = 100
 """Largest number of twins of a group from which the noise is learnt.
 
@@ -250,33 +253,73 @@ def _records_with_shared_distribution(
     return {"groups": records, "shared": shared_distribution}
 
 
-class _Observations(NamedTuple):
-    """The observations of B twins of one scenario in T steps.
+class _Piece(NamedTuple):
+    """The observations of some twins of one scenario in T steps.
 
     Attributes
     ----------
-    knowledge : Knowledge
-        The knowledge that the twins share: model, policy and calibration draws.
     observed : (B, T, G + I) array
         The readings of sensors and inspections in SI units; NaN where there is none.
     control : (B, T) array
         The control in force in each step.
     """
 
-    knowledge: Knowledge
     observed: Float
     control: Index
 
+
+class _StoredObservations:
+    """The observations of a group in the store, read by blocks of twins.
+
+    A fleet may have more observations than fit in memory. The last block is kept, because the twins
+    of a block may have scenarios of their own.
+    """
+
+    def __init__(self, group: "xr.DataTree", scenario: Scenario) -> None:
+        self._group = group
+        self._scenario = scenario
+        self._block = lru_cache(maxsize=1)(self._read_block)
+
+    def pieces(self, rows: Index) -> Iterator[_Piece]:
+        """Yield the observations of the twins in the rows of the store (B,), in ascending order."""
+        for number in np.unique(rows // BLOCK_TWINS).tolist():
+            rows_of_block = rows[rows // BLOCK_TWINS == number] - number * BLOCK_TWINS
+            observed, control = self._block(number)
+            yield _Piece(observed[rows_of_block], control[rows_of_block])
+
+    def _read_block(self, number: int) -> _Piece:
+        """Return the observations of all twins of a block."""
+        rows = slice(number * BLOCK_TWINS, (number + 1) * BLOCK_TWINS)
+        control = stored_values(self._group, "observed/control_index", rows).astype(np.int64)
+        # Steps that were not flown have the control -1. They have no observations, so that the
+        # evidence does not depend on their control: the first control takes its place.
+        return _Piece(observation_rows(self._group, self._scenario, rows), np.maximum(control, 0))
+
+
+class _Observations(NamedTuple):
+    """The observations of B twins of one scenario.
+
+    Attributes
+    ----------
+    knowledge : Knowledge
+        The knowledge that the twins share: model, policy and calibration draws.
+    store : _StoredObservations
+        The observations of their group.
+    rows : (B,) array
+        The rows of the twins in the store, in ascending order.
+    """
+
+    knowledge: Knowledge
+    store: _StoredObservations
+    rows: Index
+
     def first_twins(self, count: int) -> "_Observations":
         """Return the observations of the first twins."""
-        return _Observations(self.knowledge, self.observed[:count], self.control[:count])
+        return self._replace(rows=self.rows[:count])
 
-
-class _WeighedSteps(NamedTuple):
-    """The scaled likelihood (B, T, S) of the states of B twins, and their controls (B, T)."""
-
-    likelihood: Float
-    control: Index
+    def pieces(self) -> Iterator[_Piece]:
+        """Yield the observations of the twins, some twins at a time."""
+        return self.store.pieces(self.rows)
 
 
 def _learn_group(
@@ -305,14 +348,14 @@ def _learn_group(
     if len(twins_by_scenario) == 1:
         nodes = _parameter_nodes(twins_by_scenario[0], is_real="recordings" in record)
     noise = _noise_factor(observations, family, nodes)
-    steps = _explained_steps(observations, family, noise.mean)
-    twin_count = sum(len(part.control) for part in steps)
+    explained = _explained_observations(observations, family, noise.mean)
+    twin_count = sum(len(part.rows) for part in explained)
     if not twin_count:
         raise FleetError(
             f"no state of the twins explains what was observed in group {record['name']}: nothing "
             "can be learnt from it; check its model and its noise."
         )
-    grid = _probability_grid(family, steps) if family.names else None
+    grid = _probability_grid(family, explained, noise.mean) if family.names else None
     rows = np.concatenate([twins.rows for twins in twins_by_scenario])
     lessons: JsonObject = {
         "twins": twin_count,
@@ -340,40 +383,35 @@ def _observations(
     group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
 ) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
-    observed_rows = observation_rows(group, twins_by_scenario[0].knowledge.scenario)
-    control = stored_values(group, "observed/control_index").astype(np.int64)
-    # Steps that were not flown have the control -1. They have no observations, so that the
-    # evidence does not depend on their control: the first control takes its place.
-    control = np.maximum(control, 0)
-    return [
-        _Observations(twins.knowledge, observed_rows[twins.rows], control[twins.rows])
-        for twins in twins_by_scenario
-    ]
+    store = _StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
+    return [_Observations(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
 
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
     """Return the controls under which a twin in the rows has flown a step before its last one."""
-    control = stored_values(group, "observed/control_index").astype(np.int64)[rows]
+    control = stored_values(group, "observed/control_index")[rows]
     is_followed = control[:, 1:] >= 0
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
 
 
-def _explained_steps(
+def _explained_observations(
     observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
-) -> list[_WeighedSteps]:
-    """Return the likelihoods of the twins whose observations are possible under the model.
+) -> list[_Observations]:
+    """Return the observations of the twins that are possible under the model.
 
     The likelihoods are computed with a factor on the assumed noise.
     """
     point = _with_all_transitions_possible(family.assumed)[None]
-    parts = []
-    for knowledge, observed_rows, control in observations:
-        sensor_model = with_noise_factor(knowledge.sensor_model, noise_factor)
-        likelihood = scaled_likelihood(sensor_model, observed_rows, control).values
-        evidence = transition_evidence(family, point, likelihood, control)
-        is_explained = np.isfinite(evidence[:, 0])
-        parts.append(_WeighedSteps(likelihood[is_explained], control[is_explained]))
-    return parts
+    explained = []
+    for part in observations:
+        sensor_model = with_noise_factor(part.knowledge.sensor_model, noise_factor)
+        is_explained = []
+        for observed, control in part.pieces():
+            likelihood = scaled_likelihood(sensor_model, observed, control).values
+            evidence = transition_evidence(family, point, likelihood, control)
+            is_explained.append(np.isfinite(evidence[:, 0]))
+        explained.append(part._replace(rows=part.rows[np.concatenate(is_explained)]))
+    return explained
 
 
 def _with_all_transitions_possible(probability: Float) -> Float:
@@ -385,15 +423,25 @@ def _with_all_transitions_possible(probability: Float) -> Float:
     return probability.clip(_LEAST_PROBABILITY, _LARGEST_PROBABILITY)
 
 
-def _probability_grid(family: TransitionFamily, steps: Sequence[_WeighedSteps]) -> LikelihoodGrid:
-    """Return the likelihood of the probabilities to worsen on a grid, given a group's twins."""
+def _probability_grid(
+    family: TransitionFamily, observations: Sequence[_Observations], noise_factor: float
+) -> LikelihoodGrid:
+    """Return the likelihood of the probabilities to worsen on a grid, given a group's twins.
+
+    The likelihoods of the states are computed anew for each grid: those of many twins would not fit
+    in memory.
+    """
+    sensor_models = [
+        with_noise_factor(part.knowledge.sensor_model, noise_factor) for part in observations
+    ]
 
     def log_likelihood(points: Float) -> Float:
-        evidence = [
-            transition_evidence(family, points, part.likelihood, part.control).sum(axis=0)
-            for part in steps
-        ]
-        return np.asarray(sum(evidence))
+        total = np.zeros(len(points))
+        for part, sensor_model in zip(observations, sensor_models, strict=True):
+            for observed, control in part.pieces():
+                likelihood = scaled_likelihood(sensor_model, observed, control).values
+                total += transition_evidence(family, points, likelihood, control).sum(axis=0)
+        return total
 
     return likelihood_grid(log_likelihood, len(family.names))
 
@@ -503,17 +551,20 @@ def _evidence_of_noise(
     """
     probability = _with_all_transitions_possible(family.assumed)
     total_log_evidence = 0.0
-    for knowledge, observed_rows, control in observations:
-        if nodes is None:
-            model = with_noise_factor(knowledge.sensor_model, factor)
-            likelihood = scaled_likelihood(model, observed_rows, control)
-            evidence = transition_evidence(family, probability[None], likelihood.values, control)
-            log_evidence = evidence[:, 0] + likelihood.log_scale
-        else:
-            model = with_noise_factor(knowledge.sensor_model, factor, nodes.predicted)
-            at_nodes = parameter_evidence(family, probability, model, observed_rows, control)
-            log_evidence = _average_over_nodes(at_nodes, nodes.prior)
-        total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
+    for part in observations:
+        value_per_draw = None if nodes is None else nodes.predicted
+        model = with_noise_factor(part.knowledge.sensor_model, factor, value_per_draw)
+        for observed, control in part.pieces():
+            if nodes is None:
+                likelihood = scaled_likelihood(model, observed, control)
+                at_point = transition_evidence(
+                    family, probability[None], likelihood.values, control
+                )
+                log_evidence = at_point[:, 0] + likelihood.log_scale
+            else:
+                at_nodes = parameter_evidence(family, probability, model, observed, control)
+                log_evidence = _average_over_nodes(at_nodes, nodes.prior)
+            total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
     return total_log_evidence
 
 
@@ -549,10 +600,14 @@ def _population(
     probability = family.assumed
     if grid is not None:
         probability = np.array([marginal.mean for marginal in grid.marginals])
-    knowledge, observed_rows, control = observations
-    model = with_noise_factor(knowledge.sensor_model, noise_factor, nodes.predicted)
-    log_evidence = parameter_evidence(family, probability, model, observed_rows, control)
-    draws = knowledge.draws
+    draws = observations.knowledge.draws
+    model = with_noise_factor(observations.knowledge.sensor_model, noise_factor, nodes.predicted)
+    log_evidence = np.concatenate(
+        [
+            parameter_evidence(family, probability, model, observed, control)
+            for observed, control in observations.pieces()
+        ]
+    )
     population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
     return {
         "parameter": draws.name,

@@ -51,6 +51,8 @@ POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
+_MEMBERS_TOGETHER = 4096
+"""Number of members of a population whose likelihoods are in memory at the same time."""
 _TINY = 1e-300
 """Smallest number whose logarithm is taken."""
 
@@ -508,19 +510,23 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
     count = POINTS_BETWEEN_NODES * (len(nodes) - 1) + 1
     values = np.linspace(nodes[0], nodes[-1], count)
     step = values[1] - values[0]
-    likelihood = _member_likelihood(nodes, log_evidence, values)
     # Each value stands for the interval between two edges half a step away.
     edges = np.append(values, values[-1] + step) - 0.5 * step
 
     def log_density(axes: Axes) -> Float:
         """Return the log posterior (means, deviations) of the population, up to a constant."""
         means, deviations = axes
-        log_evidence_of_all = np.empty((POPULATION_POINTS, POPULATION_POINTS))
-        for column, deviation in enumerate(deviations):
-            # The probability of each value in populations of all means, (values, means).
-            probability = np.diff(ndtr((edges[:, None] - means) / deviation), axis=0)
-            evidence_of_members = np.maximum(likelihood @ probability, _TINY)
-            log_evidence_of_all[:, column] = np.log(evidence_of_members).sum(axis=0)
+        # The probability of each value in populations of all means, (values, means).
+        probabilities = [
+            np.diff(ndtr((edges[:, None] - means) / deviation), axis=0) for deviation in deviations
+        ]
+        log_evidence_of_all = np.zeros((POPULATION_POINTS, POPULATION_POINTS))
+        for first in range(0, len(log_evidence), _MEMBERS_TOGETHER):
+            members = log_evidence[first : first + _MEMBERS_TOGETHER]
+            likelihood = _member_likelihood(nodes, members, values)
+            for column, probability in enumerate(probabilities):
+                evidence_of_members = np.maximum(likelihood @ probability, _TINY)
+                log_evidence_of_all[:, column] += np.log(evidence_of_members).sum(axis=0)
         # The density of Student's t is (1 + (x / scale)^2 / freedom)^(-(freedom + 1) / 2).
         minus_log_prior = (
             0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)

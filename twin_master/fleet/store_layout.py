@@ -7,7 +7,7 @@ under other names, are read in the present layout.
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from math import prod
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -250,21 +250,25 @@ def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
     return columns
 
 
-def stored_values(group: "xr.DataTree", path: str) -> AnyArray:
-    """Return the values of a variable in a group of a store, given its path."""
-    values: AnyArray = np.asarray(group[path].values)
+_ALL_ROWS = slice(None)
+
+
+def stored_values(group: "xr.DataTree", path: str, rows: slice = _ALL_ROWS) -> AnyArray:
+    """Return the values of a variable in some rows of a group of a store, given its path."""
+    variable = cast("xr.DataArray", group[path])
+    values: AnyArray = np.asarray(variable[rows].values)
     return values
 
 
-def observation_rows(group: "xr.DataTree", scenario: Scenario) -> Float:
-    """Return the rows of observations of the twins of a group, a (B, T, W) array.
+def observation_rows(group: "xr.DataTree", scenario: Scenario, twins: slice = _ALL_ROWS) -> Float:
+    """Return the rows of observations of some twins of a group, a (B, T, W) array.
 
     A row has the values of the sensors, the covariance of modes, and the readings of inspections.
     """
-    twin_count = group.sizes["twin"]
+    twin_count = len(range(group.sizes["twin"])[twins])
     rows = np.empty((twin_count, scenario.mission.steps, scenario.row_width))
     for path, columns in observed_columns(scenario).items():
-        rows[..., columns] = stored_values(group, path)
+        rows[..., columns] = stored_values(group, path, twins)
     return rows
 
 

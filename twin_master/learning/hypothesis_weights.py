@@ -17,11 +17,13 @@ control in force when the fault begins and `SHOWS_ELSEWHERE` under the others, a
 from the readings under that control.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from reporting.arrays import Float, Single
+from reporting.arrays import Float, Index, Single
+from twin_master.learning.fault_kernels import weighted_belief
 from twin_master.network.estimator import Hypothesis
 
 MODEL = 0
@@ -53,14 +55,16 @@ _LEAST_REPORTED = 0.01
 class HypothesisWeights:
     """Log weights of the hypotheses before or after an observation, for G gauges and K gain errors.
 
+    All arrays may have a leading axis of twins.
+
     Attributes
     ----------
-    current : (3 + G K,) array
+    current : (..., 3 + G K) array
         The log weights of the model, of "recovered", and of the faults that show under the control
         in force.
-    hidden : (1 + G K,) array
+    hidden : (..., 1 + G K) array
         The log weights of the faults that do not show under it: free gains, then single gauges.
-    showing : (1 + G K, U) array
+    showing : (..., 1 + G K, U) array
         The probability that a fault shows under each control. That of the control in force is
         contained in `current` and `hidden`.
     """
@@ -93,6 +97,32 @@ class HypothesisWeights:
         showing[:, control_index] = 1.0
         return cls(current, np.full(fault_count, -np.inf), showing)
 
+    @classmethod
+    def stack(cls, weights: Sequence["HypothesisWeights"]) -> "HypothesisWeights":
+        """Return the weights of several twins, with a leading axis."""
+        return cls(
+            current=np.stack([twin.current for twin in weights]),
+            hidden=np.stack([twin.hidden for twin in weights]),
+            showing=np.stack([twin.showing for twin in weights]),
+        )
+
+    def change_controls(self, previous_control: Index, control: Index) -> Float:
+        """Do the same as `change_control` for B twins with controls (B,) of their own, in place."""
+        newly_hidden = np.zeros_like(self.hidden)
+        pairs = np.stack([previous_control, control], axis=1)
+        for previous, present in np.unique(pairs, axis=0).tolist():
+            if previous == present:
+                continue
+            twins = np.flatnonzero(np.all(pairs == [previous, present], axis=1))
+            weights = HypothesisWeights(
+                self.current[twins], self.hidden[twins], self.showing[twins]
+            )
+            newly_hidden[twins] = weights.change_control(previous, present)
+            self.current[twins] = weights.current
+            self.hidden[twins] = weights.hidden
+            self.showing[twins] = weights.showing
+        return newly_hidden
+
     def change_control(self, previous_control: int, control: int) -> Float:
         """Divide each fault into a showing and a hidden part under the next control, in place.
 
@@ -103,96 +133,107 @@ class HypothesisWeights:
 
         Returns
         -------
-        (1 + G K,) array
+        (..., 1 + G K) array
             The probability of each fault that it showed before and is hidden now.
         """
         # Keep what was learnt under the previous control: p(showing | fault).
-        log_showing_before = self.current[FAULTS]
+        log_showing_before = self.current[..., FAULTS]
         hidden_before = np.exp(self.hidden)
         log_fault = np.logaddexp(log_showing_before, self.hidden)
         showing_probability = np.exp(log_showing_before - log_fault)
-        self.showing[:, previous_control] = np.clip(showing_probability, LEAST_SHOWING, 1.0)
-        self.current[FAULTS] = log_fault + np.log(self.showing[:, control])
-        self.hidden = log_fault + np.log1p(-self.showing[:, control])
+        self.showing[..., previous_control] = np.clip(showing_probability, LEAST_SHOWING, 1.0)
+        self.current[..., FAULTS] = log_fault + np.log(self.showing[..., control])
+        self.hidden = log_fault + np.log1p(-self.showing[..., control])
         return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
 
-    def advance(self, log_hazard: float, log_begin: Float) -> Float:
+    def advance(self, log_hazard: float | Float, log_begin: Float) -> Float:
         """Let faults begin and end in a step: one transition of the weights, in place.
 
         Parameters
         ----------
-        log_hazard : float
+        log_hazard : float or (...) array
             The log probability that a fault begins in the step.
         log_begin : (3 + G K,) array
             The log probability of each fault, given that one begins.
 
         Returns
         -------
-        (1 + G K,) array
+        (..., 1 + G K) array
             The probability of each fault that it has ended in the step.
         """
         before = self.current
+        log_hazard = np.asarray(log_hazard)
         log_ended = np.log(END_PROBABILITY) + before
 
         # A new fault begins from the model. If the gauges are right again after a fault, only free
         # gains may begin: the beliefs of single gauges have not followed what happened since.
         log_free_gains_begin = log_hazard + log_begin[FREE_GAINS]
-        log_right_after_fault = np.logaddexp(before[RECOVERED], np.logaddexp.reduce(self.hidden))
-        log_begun = before[MODEL] + log_hazard + log_begin[FAULTS]
-        log_begun[FREE_GAINS_OF_FAULTS] = np.logaddexp(
-            log_begun[FREE_GAINS_OF_FAULTS], log_right_after_fault + log_free_gains_begin
+        log_right_after_fault = self._log_right_after_fault()
+        log_begun = (before[..., MODEL] + log_hazard)[..., None] + log_begin[FAULTS]
+        log_begun[..., FREE_GAINS_OF_FAULTS] = np.logaddexp(
+            log_begun[..., FREE_GAINS_OF_FAULTS], log_right_after_fault + log_free_gains_begin
         )
 
         # Each hypothesis keeps the probability that it does not pass on to others.
         log_stay = np.full_like(before, np.log1p(-END_PROBABILITY))
-        log_stay[MODEL] = np.log1p(-np.exp(log_hazard))
-        log_stay[RECOVERED] = np.log1p(-END_PROBABILITY - np.exp(log_free_gains_begin))
-        log_to_model = log_ended[RECOVERED]
-        log_to_recovered = np.logaddexp.reduce(log_ended[FAULTS])
-        log_incoming = np.append([log_to_model, log_to_recovered], log_begun)
+        log_stay[..., MODEL] = np.log1p(-np.exp(log_hazard))
+        log_stay[..., RECOVERED] = np.log1p(-END_PROBABILITY - np.exp(log_free_gains_begin))
+        log_incoming = np.empty_like(before)
+        log_incoming[..., MODEL] = log_ended[..., RECOVERED]
+        log_incoming[..., RECOVERED] = np.logaddexp.reduce(log_ended[..., FAULTS], axis=-1)
+        log_incoming[..., FAULTS] = log_begun
         self.current = np.logaddexp(before + log_stay, log_incoming)
-        self.hidden = self.hidden + np.log1p(-np.exp(log_free_gains_begin))
+        self.hidden = self.hidden + np.log1p(-np.exp(log_free_gains_begin))[..., None]
 
         # For a fault that began in this step nothing is known about the other controls: it has the
         # prior probability to show there.
-        log_fault = np.logaddexp(self.current[FAULTS], self.hidden)
+        log_fault = np.logaddexp(self.current[..., FAULTS], self.hidden)
         begun_fraction = np.exp(log_begun - log_fault)
-        self.showing += begun_fraction[:, None] * (SHOWS_ELSEWHERE - self.showing)
-        return np.asarray(np.exp(log_ended[FAULTS]))
+        self.showing += begun_fraction[..., None] * (SHOWS_ELSEWHERE - self.showing)
+        return np.asarray(np.exp(log_ended[..., FAULTS]))
 
     def update(self, log_ratio: Float) -> None:
         """Correct the weights by an observation, in place, and normalise them.
 
         Parameters
         ----------
-        log_ratio : (3 + G K,) array
+        log_ratio : (..., 3 + G K) array
             The log evidence of each hypothesis minus that of the model. A hidden fault predicts the
             same as "recovered".
         """
         self.current = self.current + log_ratio
-        self.hidden = self.hidden + log_ratio[RECOVERED]
+        self.hidden = self.hidden + log_ratio[..., RECOVERED, None]
         log_total_weight = np.logaddexp(
-            np.logaddexp.reduce(self.current), np.logaddexp.reduce(self.hidden)
+            np.logaddexp.reduce(self.current, axis=-1), np.logaddexp.reduce(self.hidden, axis=-1)
         )
-        self.current -= log_total_weight
-        self.hidden -= log_total_weight
+        self.current -= log_total_weight[..., None]
+        self.hidden -= log_total_weight[..., None]
+
+    def _log_right_after_fault(self) -> Float:
+        """Return the log probability (...) of a fault that ended or is hidden.
+
+        The gauges are right then.
+        """
+        return np.asarray(
+            np.logaddexp(self.current[..., RECOVERED], np.logaddexp.reduce(self.hidden, axis=-1))
+        )
 
     @property
-    def log_right_after_fault(self) -> float:
-        """Log probability of a fault that ended or is hidden, so that the gauges are right now."""
-        return float(np.logaddexp(self.current[RECOVERED], np.logaddexp.reduce(self.hidden)))
+    def right_after_fault(self) -> Float:
+        """Probability (...) of a fault that ended or is hidden, so that the gauges are right."""
+        return np.asarray(np.exp(self._log_right_after_fault()))
 
     @property
-    def free_gains_probability(self) -> float:
-        """Probability that several gauges have unknown gains, whether this shows or not."""
-        log_hidden = self.hidden[FREE_GAINS_OF_FAULTS]
-        return float(np.exp(np.logaddexp(self.current[FREE_GAINS], log_hidden)))
+    def free_gains_probability(self) -> Float:
+        """Probability (...) that several gauges have unknown gains, whether this shows or not."""
+        log_hidden = self.hidden[..., FREE_GAINS_OF_FAULTS]
+        return np.asarray(np.exp(np.logaddexp(self.current[..., FREE_GAINS], log_hidden)))
 
     @property
     def gauge_fault_probability(self) -> Float:
-        """Probability of each of K gain errors of G gauges (G K,), whether it shows or not."""
-        log_hidden = self.hidden[GAUGES_OF_FAULTS]
-        return np.asarray(np.exp(np.logaddexp(self.current[GAUGE_FAULTS], log_hidden)))
+        """Probability (..., G K) of K gain errors of G gauges, whether it shows or not."""
+        log_hidden = self.hidden[..., GAUGES_OF_FAULTS]
+        return np.asarray(np.exp(np.logaddexp(self.current[..., GAUGE_FAULTS], log_hidden)))
 
 
 @dataclass(frozen=True)
@@ -201,12 +242,12 @@ class HypothesisBeliefs:
 
     Attributes
     ----------
-    model : (S,) array
-        The belief about the state under the model.
-    recovered : (E, S) array
-        The belief over draws and states under "recovered", and under a gauge fault that is hidden.
-    gauge : (G, K, E, S) array
-        The same under each fault of a gauge that shows.
+    model : (B, S) array
+        The belief of each twin about the state under the model.
+    recovered : (B, S E) array
+        The belief over states and draws under "recovered", and under a gauge fault that is hidden.
+    gauge : (B, S E, G K) array
+        The same under each fault of a gauge that shows, gauge by gauge.
     """
 
     model: Float
@@ -216,52 +257,64 @@ class HypothesisBeliefs:
 
 @dataclass(frozen=True)
 class MixedBelief:
-    """The belief about the state, averaged over all hypotheses but free gains.
+    """The beliefs of B twins about the state, averaged over all hypotheses but free gains.
 
     Attributes
     ----------
-    belief : (S,) array
+    belief : (B, S) array
         The average over the model and its competitors.
-    competing : (S,) array
+    competing : (B, S) array
         The average over the competitors of the model.
-    model_weight : float
+    model_weight : (B,) array
         The weight of the model.
     """
 
     belief: Float
     competing: Float
-    model_weight: float
+    model_weight: Float
 
 
 def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> MixedBelief:
-    """Return the belief about the state, averaged over all hypotheses but free gains.
+    """Return the beliefs about the state, averaged over all hypotheses but free gains.
 
     Under free gains no state explains the sensors, so that they add nothing to the belief.
+
+    Parameters
+    ----------
+    weights : HypothesisWeights
+        The log weights of B twins.
+    beliefs : HypothesisBeliefs
+        Their beliefs under each hypothesis.
     """
     # Normalise the weights without free gains, under which no state is believed.
-    log_believing = np.append(
-        np.delete(weights.current, FREE_GAINS), weights.hidden[GAUGES_OF_FAULTS]
+    log_hidden = weights.hidden[:, GAUGES_OF_FAULTS]
+    log_believing = np.concatenate(
+        [np.delete(weights.current, FREE_GAINS, axis=1), log_hidden], axis=1
     )
-    log_total = np.logaddexp.reduce(log_believing)
+    log_total = np.logaddexp.reduce(log_believing, axis=1)[:, None]
     current_weight = np.exp(weights.current - log_total)
-    hidden_weight = np.exp(weights.hidden[GAUGES_OF_FAULTS] - log_total)
+    hidden_weight = np.exp(log_hidden - log_total)
 
-    model_weight = float(current_weight[MODEL])
-    right_after_fault = current_weight[RECOVERED] + hidden_weight.sum()
-    gauge_weight = current_weight[GAUGE_FAULTS].astype(np.float32)
-    gauge_competitors = gauge_weight @ beliefs.gauge.reshape(len(gauge_weight), -1)
-    competing = gauge_competitors.reshape(beliefs.recovered.shape).sum(axis=0)
-    competing = competing + right_after_fault * beliefs.recovered.sum(axis=0)
-    competing_sum = competing.sum()
-    competing = beliefs.model if competing_sum == 0.0 else competing / competing_sum
-    belief = model_weight * beliefs.model + (1.0 - model_weight) * competing
+    model_weight = current_weight[:, MODEL]
+    right_after_fault = current_weight[:, RECOVERED] + hidden_weight.sum(axis=1)
+    gauge_weight = np.ascontiguousarray(current_weight[:, GAUGE_FAULTS])
+    by_pair = weighted_belief(gauge_weight, beliefs.gauge)
+    by_pair += right_after_fault[:, None] * beliefs.recovered
+    twins, states = beliefs.model.shape
+    competing = by_pair.reshape(twins, states, -1).sum(axis=2)
+    competing_sum = competing.sum(axis=1)[:, None]
+    is_any_competing = competing_sum > 0.0
+    competing = np.where(
+        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), beliefs.model
+    )
+    belief = model_weight[:, None] * beliefs.model + (1.0 - model_weight)[:, None] * competing
     return MixedBelief(belief, competing, model_weight)
 
 
 def list_hypotheses(
     weights: HypothesisWeights, beliefs: HypothesisBeliefs, gauge_names: tuple[str, ...]
 ) -> tuple[Hypothesis, ...]:
-    """Return the competing hypotheses, each with its probability and its belief about the state.
+    """Return the competing hypotheses of one twin, with their probabilities and beliefs.
 
     These are the model, each gauge whose fault has a probability of at least 1 %, and "none of
     these" (free gains).
@@ -269,36 +322,65 @@ def list_hypotheses(
     Parameters
     ----------
     weights : HypothesisWeights
-        The log weights.
+        The log weights, with a leading axis of length one.
     beliefs : HypothesisBeliefs
-        The belief of each hypothesis about the state.
+        The belief of each hypothesis about the state, of one twin.
     gauge_names : tuple of str
-        The names of the faults of the gauges, such as "gauge 5 off".
+        The names of the G faults of the gauges, such as "gauge 5 off".
     """
-    probability = np.exp(weights.current)
-    gauges_and_gains = beliefs.gauge.shape[:2]
-    showing_probability = probability[GAUGE_FAULTS].reshape(gauges_and_gains)
-    hidden_probability = np.exp(weights.hidden[GAUGES_OF_FAULTS]).reshape(gauges_and_gains)
+    gauges = len(gauge_names)
+    (probability,) = np.exp(weights.current)
+    (log_hidden,) = weights.hidden
+    showing_probability = probability[GAUGE_FAULTS].reshape(gauges, -1)
+    hidden_probability = np.exp(log_hidden[GAUGES_OF_FAULTS]).reshape(gauges, -1)
     gauge_probability = (showing_probability + hidden_probability).sum(axis=1)
+    states = beliefs.model.shape[1]
+    recovered_belief = beliefs.recovered.reshape(states, -1).sum(axis=1)
 
     # The gauges are right: under the model, or after a fault has ended.
     sound_probability = probability[: RECOVERED + 1].sum()
-    belief = beliefs.model
+    belief = beliefs.model[0]
     if probability[RECOVERED] > 0.0:
-        recovered_belief = beliefs.recovered.sum(axis=0)
         belief = (
-            probability[MODEL] * beliefs.model + probability[RECOVERED] * recovered_belief
+            probability[MODEL] * belief + probability[RECOVERED] * recovered_belief
         ) / sound_probability
     hypotheses = [Hypothesis("model", float(sound_probability), belief)]
 
+    draws = beliefs.recovered.shape[1] // states
+    belief_of_gauge = beliefs.gauge.reshape(states, draws, gauges, -1)
     for g in np.flatnonzero(gauge_probability >= _LEAST_REPORTED).tolist():
         showing_belief = np.einsum(
-            "k,kes->s", showing_probability[g], beliefs.gauge[g]
+            "k,sek->s", showing_probability[g], belief_of_gauge[:, :, g]
         )  # over gains, draws
-        hidden_belief = hidden_probability[g].sum() * beliefs.recovered.sum(axis=0)
-        belief = showing_belief + hidden_belief
+        belief = showing_belief + hidden_probability[g].sum() * recovered_belief
         hypotheses.append(
             Hypothesis(gauge_names[g], float(gauge_probability[g]), belief / belief.sum())
         )
-    hypotheses.append(Hypothesis("none of these", weights.free_gains_probability, None))
+    none_of_these = float(weights.free_gains_probability[0])
+    hypotheses.append(Hypothesis("none of these", none_of_these, None))
     return tuple(hypotheses)
+
+
+def most_probable_hypothesis(weights: HypothesisWeights, gauges: int) -> tuple[Index, Float]:
+    """Return the most probable hypothesis of each of B twins, and its probability.
+
+    Parameters
+    ----------
+    weights : HypothesisWeights
+        The log weights of B twins.
+    gauges : int
+        The number G of gauges.
+
+    Returns
+    -------
+    hypothesis : (B,) array
+        0 is the model, -1 free gains, and g > 0 is gauge g, counted from 1.
+    probability : (B,) array
+        Its probability.
+    """
+    sound = np.exp(weights.current[:, : RECOVERED + 1]).sum(axis=1)
+    gauge = weights.gauge_fault_probability.reshape(len(sound), gauges, -1).sum(axis=2)
+    probability = np.column_stack([sound, gauge, weights.free_gains_probability])
+    hypothesis = np.argmax(probability, axis=1)
+    largest = np.take_along_axis(probability, hypothesis[:, None], axis=1)[:, 0]
+    return np.where(hypothesis > gauges, -1, hypothesis), largest

@@ -22,22 +22,9 @@ import numpy as np
 
 from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
-from twin_master.learning import hypothesis_weights
-from twin_master.learning.fault_filter import FaultFilter
-from twin_master.learning.hypothesis_weights import HypothesisBeliefs
-from twin_master.learning.notices import NoticeWriter
-from twin_master.learning.watch_state import (
-    MODEL_KEY,
-    StoredBelief,
-    WatchState,
-)
-from twin_master.network.estimator import (
-    Carried,
-    Estimate,
-    Estimator,
-    NoticeWording,
-    Suspicion,
-)
+from twin_master.learning.gauge_watch import GaugeWatch
+from twin_master.learning.watch_state import MODEL_KEY, StoredBelief
+from twin_master.network.estimator import Carried, Estimate, Estimator, NoticeWording
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import Noticing
@@ -63,6 +50,11 @@ class WatchfulEstimator:
     words : NoticeWording, optional
         How notices speak of steps and sensors.
 
+    Attributes
+    ----------
+    watch : GaugeWatch
+        The watch over the gauges.
+
     Raises
     ------
     InvalidModelError
@@ -84,29 +76,13 @@ class WatchfulEstimator:
                 "inside, each sensor has a parameter of its own"
             )
         self._inner = inner_estimator
-        self._sensor_model = sensor_model
         self.model = inner_estimator.model
-        settings = settings or Noticing()
-        self._faults = FaultFilter(inner_estimator.model, sensor_model, draws, settings)
-        self._notices = self._notice_writer(words or NoticeWording(), settings)
-
-    def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
-        """Return the writer of notices.
-
-        A reading is plausible if it is within a margin of the prediction of some draw and state.
-        """
-        value = self._sensor_model.value_per_draw
-        deviation = self._sensor_model.total_standard_deviation
-        margin = settings.absurd_deviations * deviation  # (S, U, G)
-        sensors = range(self._sensor_model.sensor_count)
-        return NoticeWriter(
-            wording=wording,
-            threshold=settings.threshold,
-            gains=self._faults.gains,
-            log_gauge_prior=self._faults.log_gauge_prior,
-            lowest_plausible=(value.min(axis=0) - margin).min(axis=0),
-            highest_plausible=(value.max(axis=0) + margin).max(axis=0),
-            hypothesis_names=tuple(f"{wording.name_sensors([g])} off" for g in sensors),
+        self.watch = GaugeWatch(
+            inner_estimator.model,
+            sensor_model,
+            draws,
+            settings or Noticing(),
+            words or NoticeWording(),
         )
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
@@ -134,47 +110,29 @@ class WatchfulEstimator:
         self, before: Carried | None, observation: Float, control_index: int, step: int
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
-        # Leave out absurd readings.
-        readings, other_log_density = self._sensor_model.split_observation(observation)
-        is_absurd = self._notices.is_absurd(readings, control_index)
-        used_readings = np.where(is_absurd, np.nan, readings)
-        # The rest of the observation, such as readings of inspections, is kept.
-        used_observation = np.append(used_readings, observation[len(used_readings) :])
-        estimate = self._inner.step(before, used_observation, control_index, step)
+        controls = np.array([control_index])
+        checked = self.watch.check_readings(np.asarray(observation)[None], controls)
+        estimate = self._inner.step(before, checked.rows[0], control_index, step)
 
         # Advance and correct the hypotheses about the gauges.
+        faults = self.watch.faults
         if before is not None and self._continues(before):
-            state = self._faults.advance(before, control_index)
+            state = faults.restore(before)
+            faults.advance(state, np.array([before.control_index]), controls)
         else:
-            state = self._faults.start(estimate.forecast, control_index)
-        self._faults.assimilate(state, used_readings, other_log_density, control_index)
-
-        # Write the notices of this step.
-        notices = self._notices.report_absurd_readings(
-            state.left_out, is_absurd, readings, control_index, step
-        )
+            state = faults.start(estimate.forecast[None], controls)
+        model_belief = estimate.filtered[None]
+        (notices,) = self.watch.assimilate(state, checked, model_belief, step)
         if before is None:
-            notices += self._notices.report_own_likelihood(self._sensor_model)
-        # A gauge that was left out and sends no reading now counts as left out still.
-        state.left_out = is_absurd | (state.left_out & np.isnan(readings))
-        suspicion = self._suspicion(state)
-        notices += self._notices.raise_alarms(state, suspicion, step)
-        beliefs = HypothesisBeliefs(estimate.filtered, state.recovered_belief, state.gauge_belief)
-        hypotheses = hypothesis_weights.list_hypotheses(
-            state.weights, beliefs, self._notices.hypothesis_names
-        )
-        notices += self._notices.report_followed_hypothesis(state, hypotheses, step)
+            notices = self.watch.report_own_likelihood() + notices
 
-        # Mix the beliefs of the hypotheses by their weights.
-        mixed_belief = hypothesis_weights.mix_beliefs(state.weights, beliefs)
-        state.belief = mixed_belief.belief
-        state.competing_belief = mixed_belief.competing
-        state.model_weight = mixed_belief.model_weight
-        arrays = {**estimate.carried.arrays, **state.as_arrays(self._faults.model_key)}
+        hypotheses = self.watch.hypotheses(state, model_belief)
         probabilities = {hypothesis.name: hypothesis.probability for hypothesis in hypotheses}
+        suspicion = self.watch.suspicion(state)
+        arrays = {**estimate.carried.arrays, **state.as_arrays(faults.model_key)}
         return replace(
             estimate,
-            filtered=mixed_belief.belief,
+            filtered=state.mixed.belief[0],
             carried=Carried(control_index, arrays),
             notices=(*estimate.notices, *notices),
             suspicion=replace(suspicion, hypotheses=probabilities),
@@ -183,25 +141,9 @@ class WatchfulEstimator:
 
     def _continues(self, before: Carried) -> bool:
         """Return whether the state of the previous step holds for the predictions of this model."""
-        return bool(before.arrays.get(MODEL_KEY) == self._faults.model_key)
+        return bool(before.arrays.get(MODEL_KEY) == self.watch.faults.model_key)
 
-    def _suspicion(self, state: WatchState) -> Suspicion:
-        """Return how well the model explains the sensors so far.
 
-        The evidence for a fault, relative to that for the model, is a sum over the steps in which
-        it may begin. If it begins later, it predicts so far what the model predicts: this term is
-        the prior probability that it begins later, times one.
-        """
-        log_begins_later = np.log(self._faults.probability_to_begin_after(state.step_count - 1.0))
-        log_fault_has_begun = np.logaddexp.reduce(state.log_gauge_evidence, axis=1)
-        log_each_gauge = np.logaddexp(log_fault_has_begun, log_begins_later)
-        log_free_gains = float(state.log_free_gains_evidence[0])
-        log_any_gauge = np.logaddexp.reduce(log_each_gauge + self._faults.log_gauge_prior)
-        return Suspicion(
-            none_of_these=state.weights.free_gains_probability,
-            gauge_off=float(state.weights.gauge_fault_probability.sum()),
-            log_evidence_none=float(np.logaddexp(log_free_gains, log_begins_later)),
-            log_evidence_any_gauge=float(log_any_gauge),
-            log_evidence_gauge=log_each_gauge,
-            left_out=state.left_out,
-        )
+def gauge_watch_of(estimator: Estimator) -> GaugeWatch | None:
+    """Return the watch over the gauges of an estimator; None if it gives no notices."""
+    return estimator.watch if isinstance(estimator, WatchfulEstimator) else None

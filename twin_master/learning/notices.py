@@ -1,14 +1,13 @@
 """The notices of the watch over the gauges, as sentences for an operator."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.arrays import Float
+from reporting.arrays import Float, Index
 from twin_master.learning.watch_state import WatchState
-from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.sensor_model import GaussianSensorModel
 
 CLEARLY_BETTER = float(np.log(10.0))
@@ -53,8 +52,8 @@ class NoticeWriter:
     highest_plausible: Float
     hypothesis_names: tuple[str, ...]
 
-    def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
-        """Return for each of G gauges whether its reading is implausible in every state.
+    def is_absurd(self, readings: Float, control_index: Index) -> NDArray[np.bool_]:
+        """Return for readings (B, G) under controls (B,) whether no state can show them.
 
         A missing reading (NaN) is not absurd.
         """
@@ -124,71 +123,87 @@ class NoticeWriter:
         return [Notice("gaussian", sentence)]
 
     def report_followed_hypothesis(
-        self, state: WatchState, hypotheses: Sequence[Hypothesis], step: int
+        self, followed_hypothesis: int, probability: float, step: int
     ) -> list[Notice]:
-        """Return a notice if belief and decision follow another hypothesis than before.
+        """Return the notice that belief and decision follow another hypothesis than before.
 
-        The state of the watch remembers which one is followed.
+        Parameters
+        ----------
+        followed_hypothesis : int
+            The hypothesis: 0 is the model, -1 free gains, and g > 0 is gauge g, counted from 1.
+        probability : float
+            Its probability.
+        step : int
+            The number of this step.
         """
-        most_probable = max(hypotheses, key=lambda hypothesis: hypothesis.probability)
-        if most_probable is hypotheses[0]:
-            followed_hypothesis = 0
-        elif most_probable.belief is None:
-            followed_hypothesis = -1
-        else:
-            followed_hypothesis = self.hypothesis_names.index(most_probable.name) + 1
-        if most_probable.probability <= 0.5 or followed_hypothesis == state.followed_hypothesis:
-            return []
-        state.followed_hypothesis = followed_hypothesis
-
         sensors = f"{self.wording.sensor}s"
-        probability = f"(probability {most_probable.probability:.3g})"
+        in_brackets = f"(probability {probability:.3g})"
         if followed_hypothesis == 0:
-            sentence = f"the model explains the {sensors} again {probability}."
+            sentence = f"the model explains the {sensors} again {in_brackets}."
         elif followed_hypothesis < 0:
             sentence = (
                 f"no state explains the {sensors}: no state is believed, and the twin proposes the "
-                f"safest control {probability}."
+                f"safest control {in_brackets}."
             )
         else:
             or_the_asset = f"{_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}"
             sentence = (
-                f"{most_probable.name}: belief and decision follow the other {sensors} "
-                f"{probability}. {or_the_asset}: these data cannot tell."
+                f"{self.hypothesis_names[followed_hypothesis - 1]}: belief and decision follow the "
+                f"other {sensors} {in_brackets}. {or_the_asset}: these data cannot tell."
             )
         numbers = (followed_hypothesis,) if followed_hypothesis > 0 else ()
         sentence = f"{self._step_text(step)}: {sentence}"
-        return [Notice("hypothesis", sentence, numbers, most_probable.probability)]
+        return [Notice("hypothesis", sentence, numbers, probability)]
 
-    def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
-        """Return the alarms that are raised in this step, and mark them as raised in `state`.
+    def may_raise_alarm(
+        self, state: WatchState, log_gauge: Float, log_free_gains: Float
+    ) -> NDArray[np.bool_]:
+        """Return for B twins whether an alarm that was not raised yet has reached its threshold.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch.
+        log_gauge, log_free_gains : (B,) array
+            The log evidence of the two kinds of fault.
+        """
+        log_threshold = np.log(self.threshold)
+        may_name_gauge = (log_gauge >= log_threshold) & ~state.gauge_alarm_raised
+        may_doubt_states = (log_free_gains >= log_threshold) & ~state.free_gains_alarm_raised
+        return np.asarray(may_name_gauge | may_doubt_states)
+
+    def raise_alarms(
+        self, state: WatchState, twin: int, log_gauge: float, log_free_gains: float, step: int
+    ) -> list[Notice]:
+        """Return the alarms that a twin raises in this step, and mark them as raised in `state`.
 
         Each kind of fault raises its alarm once: a single gauge, or free gains of several. A faulty
         gauge also raises the evidence for free gains, and a region that softens raises that for its
         gauges. So the kind with less evidence raises no alarm in the meantime; free gains must be
         clearly better than a single gauge, the simpler explanation.
         """
-        log_gauge = suspicion.log_evidence_any_gauge
-        log_free_gains = suspicion.log_evidence_none
         log_threshold = np.log(self.threshold)
         notices = []
         is_gauge_alarm = log_gauge >= max(log_threshold, log_free_gains - CLEARLY_BETTER)
-        if is_gauge_alarm and not state.gauge_alarm_raised:
-            state.gauge_alarm_raised = True
-            notices.append(self._gauge_alarm(state, log_gauge, step))
+        if is_gauge_alarm and not state.gauge_alarm_raised[twin]:
+            state.gauge_alarm_raised[twin] = True
+            notices.append(self._gauge_alarm(state, twin, log_gauge, step))
         is_free_gains_alarm = log_free_gains >= max(log_threshold, log_gauge + CLEARLY_BETTER)
-        if is_free_gains_alarm and not state.free_gains_alarm_raised:
-            state.free_gains_alarm_raised = True
-            notices.append(self._free_gains_alarm(state, log_free_gains, step))
+        if is_free_gains_alarm and not state.free_gains_alarm_raised[twin]:
+            state.free_gains_alarm_raised[twin] = True
+            notices.append(self._free_gains_alarm(state, twin, log_free_gains, step))
         return notices
 
-    def _gauge_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
+    def _gauge_alarm(self, state: WatchState, twin: int, log_evidence: float, step: int) -> Notice:
         """Return the alarm that a single gauge is faulty, with the gauges that it may be."""
-        log_weight = state.log_gauge_evidence + self.log_gauge_prior[:, None]
+        by_gauge = (len(self.log_gauge_prior), -1)
+        log_weight = (
+            state.log_gauge_evidence[twin].reshape(by_gauge) + self.log_gauge_prior[:, None]
+        )
         weight = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))  # (G, K)
         probability = weight.sum(axis=1)
         named_gauges = _largest(probability, _LEAST_NAMED_PROBABILITY)
-        onset = float(np.sum(weight * state.gauge_onset))
+        onset = float(np.sum(weight * state.gauge_onset[twin].reshape(by_gauge)))
         if len(named_gauges) > 1:
             sensors = self.wording.name_sensors(named_gauges)
             finding = f"one of {sensors} does not show what the model predicts"
@@ -197,23 +212,28 @@ class NoticeWriter:
             amount = "much" if expected_sign[named_gauges[0]] > 0.0 else "little"
             finding = f"{self.wording.name_sensors(named_gauges)} shows too {amount}"
         finding = f"{finding}, {_OR_THE_ASSET}"
-        return self._alarm(state, step, finding, named_gauges, log_evidence, onset)
+        # The step counts from the first one of this model, which may have replaced another.
+        onset += step + 1.0 - float(state.step_count[twin])
+        return self._alarm(step, finding, named_gauges, log_evidence, onset)
 
-    def _free_gains_alarm(self, state: WatchState, log_evidence: float, step: int) -> Notice:
+    def _free_gains_alarm(
+        self, state: WatchState, twin: int, log_evidence: float, step: int
+    ) -> Notice:
         """Return the alarm that no state explains all gauges, with the gauges of largest gain."""
         statistics = state.free_gain_statistics
-        gain_deviations = np.abs(statistics.sum_cx) / np.sqrt(1.0 + statistics.sum_cc)
+        gain_deviations = np.abs(statistics.sum_cx[twin]) / np.sqrt(1.0 + statistics.sum_cc[twin])
         named_gauges = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
         finding = (
             "no state of the model explains all gauges together, least "
             f"{self.wording.name_sensors(named_gauges)}"
         )
-        onset = float(state.free_gains_onset[0])
-        return self._alarm(state, step, finding, named_gauges, log_evidence, onset)
+        onset = float(state.free_gains_onset[twin])
+        # The step counts from the first one of this model, which may have replaced another.
+        onset += step + 1.0 - float(state.step_count[twin])
+        return self._alarm(step, finding, named_gauges, log_evidence, onset)
 
     def _alarm(
         self,
-        state: WatchState,
         step: int,
         finding: str,
         gauges: list[int],
@@ -224,8 +244,6 @@ class NoticeWriter:
 
         Parameters
         ----------
-        state : WatchState
-            The state of the watch.
         step : int
             The number of this step.
         finding : str
@@ -235,11 +253,10 @@ class NoticeWriter:
         log_evidence : float
             The log evidence against the model.
         onset : float
-            The expected first step of the fault. It counts from the first step of this model, which
-            may have taken the place of another.
+            The expected first step of the fault.
         """
         evidence = float(np.exp(min(log_evidence, _LARGEST_LOG)))
-        first_step = round(step + 1.0 - state.step_count + onset)
+        first_step = round(onset)
         since = f"since about {self.wording.step} {first_step}" if first_step else "from the start"
         evidence_text = f"{evidence:,.0f}" if 1e3 <= evidence < 1e6 else f"{evidence:.3g}"
         search = ""

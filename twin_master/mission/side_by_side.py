@@ -6,6 +6,7 @@ draws of one twin, never over twins.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -17,15 +18,21 @@ from fmu_asset.errors import FmuError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
+from twin_master.learning.gauge_watch import CheckedReadings, GaugeWatch
+from twin_master.learning.monitor import gauge_watch_of
+from twin_master.learning.watch_state import WatchState
 from twin_master.mission.loop import early_end_sentence, fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import Filtered, filter_many
 from twin_master.network.planner import decision_probability, ration_controls
+from twin_master.network.twin import LARGEST_CARRIED, unbelievable_observation
 
 FLIGHT_ERRORS = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
 """Errors that end the flight of one asset, but not the flights of the others."""
+_MOST_NUMBERS_TOGETHER = 10_000_000
+"""Numbers of four bytes in the beliefs about gauges of the twins that fly together."""
 
 
 @dataclass
@@ -82,6 +89,23 @@ class Flights:
             failure=[""] * count,
             ended=[""] * count,
             notices=[[] for _ in range(count)],
+        )
+
+    @classmethod
+    def concatenate(cls, flights: Sequence["Flights"]) -> "Flights":
+        """Return the flights of several formations as those of one."""
+        if len(flights) == 1:
+            return flights[0]
+        return cls(
+            observation_rows=np.concatenate([part.observation_rows for part in flights]),
+            control_index=np.concatenate([part.control_index for part in flights]),
+            state=np.concatenate([part.state for part in flights]),
+            filtered=np.concatenate([part.filtered for part in flights]),
+            log_evidence=np.concatenate([part.log_evidence for part in flights]),
+            unexplained=np.concatenate([part.unexplained for part in flights]),
+            failure=list(chain.from_iterable(part.failure for part in flights)),
+            ended=list(chain.from_iterable(part.ended for part in flights)),
+            notices=list(chain.from_iterable(part.notices for part in flights)),
         )
 
     def store_history(self, twin: int, history: History) -> None:
@@ -214,18 +238,55 @@ def fly_side_by_side(
     Parameters
     ----------
     knowledge : Knowledge
-        The knowledge of all twins; the scenario neither learns nor gives notices.
+        The knowledge of all twins; the scenario does not learn.
     truths : sequence of Truth
         The truth of each twin.
     assets : sequence of Asset
         The asset of each twin, at its start; twins may share one without memory.
+
+    Raises
+    ------
+    InvalidObservationError
+        If an observation is infinite, or so improbable that no belief can be computed. Flown one by
+        one, only its own twin fails.
     """
     if not all(isinstance(asset, StatelessAsset) for asset in assets):
         return fly_one_by_one(knowledge, truths, lambda twin, _previous_ended_well: assets[twin])
-    formation = _Formation(knowledge, truths, assets)
-    for step in range(knowledge.scenario.mission.steps):
-        formation.fly_step(step)
-    return formation.flights
+    size = len(truths)
+    watch = gauge_watch_of(knowledge.estimator)
+    if watch is not None:
+        size = max(1, _MOST_NUMBERS_TOGETHER // watch.faults.belief_size)
+    flights = []
+    for first in range(0, len(truths), size):
+        formation = _Formation(
+            knowledge, truths[first : first + size], assets[first : first + size]
+        )
+        for step in range(knowledge.scenario.mission.steps):
+            formation.fly_step(step)
+        flights.append(formation.flights)
+    return Flights.concatenate(flights)
+
+
+class _StepOfTwins(NamedTuple):
+    """What B twins have seen and concluded in a step.
+
+    Attributes
+    ----------
+    observed_rows : (B, G + I) array
+        The observed values, SI.
+    state : (B, F) array
+        The true states, SI.
+    filtered : (B, S) array
+        The beliefs about the state.
+    log_evidence, unexplained : (B,) array
+        As in `Flights`.
+    """
+
+    observed_rows: Float
+    state: Float
+    filtered: Float
+    log_evidence: Float
+    unexplained: Float
 
 
 class _Formation:
@@ -255,6 +316,8 @@ class _Formation:
         )
         inspecting_controls = {control for control, _state, _name, _deviation in scenario.readings}
         self._inspecting_controls = sorted(inspecting_controls)
+        self._watch = gauge_watch_of(knowledge.estimator)
+        self._watch_state: WatchState | None = None
 
     def fly_step(self, step: int) -> None:
         """Fly one step of all twins, filter its observations, and decide on the next control.
@@ -268,11 +331,23 @@ class _Formation:
         )
         self._is_flying &= np.array(self.flights.failure) == ""
         observed_rows[~self._is_flying] = np.nan
-        filtered_beliefs = self._filter(step, observed_rows)
-        self._store(step, observed_rows, state, filtered_beliefs)
+        if self._watch is None:
+            filtered_beliefs = self._filter(step, observed_rows)
+            beliefs = filtered_beliefs.filtered
+            unexplained = np.zeros(len(beliefs))
+        else:
+            checked = self._watch.check_readings(observed_rows, self._control)
+            filtered_beliefs = self._filter(step, checked.rows)
+            watch_state = self._watch_gauges(self._watch, step, checked, filtered_beliefs)
+            beliefs = watch_state.mixed.belief
+            unexplained = watch_state.weights.free_gains_probability
+        self._store(
+            step,
+            _StepOfTwins(observed_rows, state, beliefs, filtered_beliefs.log_evidence, unexplained),
+        )
         self._log_belief = filtered_beliefs.log_filtered
         self._previous_control = self._control
-        self._control = self._decide(filtered_beliefs.filtered)
+        self._control = self._decide(beliefs, unexplained)
 
     def _end_missions(self, step: int) -> None:
         """End the missions whose last control was an action that ends them."""
@@ -312,21 +387,45 @@ class _Formation:
         only_step.log_filtered[is_impossible] = knowledge.model.log_prior
         return only_step
 
-    def _store(
-        self, step: int, observed_rows: Float, state: Float, filtered_beliefs: Filtered
-    ) -> None:
+    def _watch_gauges(
+        self, watch: GaugeWatch, step: int, checked: CheckedReadings, filtered_beliefs: Filtered
+    ) -> WatchState:
+        """Return the state of the watch after a step, and store its notices in `flights.notices`.
+
+        Raises
+        ------
+        InvalidObservationError
+            If the belief of a twin is not finite.
+        """
+        if self._watch_state is None:
+            state = watch.faults.start(filtered_beliefs.forecast, self._control)
+        else:
+            state = self._watch_state
+            watch.faults.advance(state, self._previous_control, self._control)
+        notices = watch.assimilate(state, checked, filtered_beliefs.filtered, step)
+        if np.any(self._is_flying & ~state.is_finite(LARGEST_CARRIED)):
+            raise unbelievable_observation(self._knowledge.scenario.mission.name, step)
+        for twin in np.flatnonzero(self._is_flying).tolist():
+            self.flights.notices[twin] += [(step, notice) for notice in notices[twin]]
+        self._watch_state = state
+        return state
+
+    def _store(self, step: int, step_of_twins: _StepOfTwins) -> None:
         """Store a step of the twins that are still flying."""
         is_flying = self._is_flying
         flights = self.flights
-        flights.observation_rows[is_flying, step] = observed_rows[is_flying]
+        flights.observation_rows[is_flying, step] = step_of_twins.observed_rows[is_flying]
         flights.control_index[is_flying, step] = self._control[is_flying]
-        flights.state[is_flying, step] = state[is_flying]
-        flights.filtered[is_flying, step] = filtered_beliefs.filtered[is_flying]
-        flights.log_evidence[is_flying, step] = filtered_beliefs.log_evidence[is_flying]
-        flights.unexplained[is_flying, step] = 0.0  # none of these twins gives notices
+        flights.state[is_flying, step] = step_of_twins.state[is_flying]
+        flights.filtered[is_flying, step] = step_of_twins.filtered[is_flying]
+        flights.log_evidence[is_flying, step] = step_of_twins.log_evidence[is_flying]
+        flights.unexplained[is_flying, step] = step_of_twins.unexplained[is_flying]
 
-    def _decide(self, filtered_belief: Float) -> Index:
-        """Return the next control of each of B twins, within the budget of inspections."""
+    def _decide(self, filtered_belief: Float, unexplained: Float) -> Index:
+        """Return the next control of each of B twins, within the budget of inspections.
+
+        With the probability (B,) that no state explains the sensors, the safest control is taken.
+        """
         knowledge = self._knowledge
         planner = knowledge.scenario.planner
         policy_on_belief = knowledge.plan.on_belief
@@ -338,6 +437,10 @@ class _Formation:
             policy_on_belief,
             ahead=planner.decide_on == "predicted",
         )
+        if self._watch is not None:
+            safest = np.eye(len(knowledge.model.controls))[knowledge.safest_control]
+            doubt = unexplained[:, None]
+            probability = (1.0 - doubt) * probability + doubt * safest
         control = np.argmax(probability, axis=1)
         if planner.inspections_per_step is not None and policy_on_belief is not None:
             flying = np.flatnonzero(self._is_flying)
@@ -358,7 +461,7 @@ def fly_one_by_one(
 ) -> Flights:
     """Fly B missions one after the other with `fly`.
 
-    This is needed for assets with a memory, and for twins that learn or give notices.
+    This is needed for assets with a memory, and for twins that learn.
 
     Parameters
     ----------

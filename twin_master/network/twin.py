@@ -41,7 +41,7 @@ from twin_master.network.transition import check_controls
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
-_LARGEST_CARRIED = np.float64(1e150)
+LARGEST_CARRIED = np.float64(1e150)
 """Upper bound of carried numbers: their squares are still finite."""
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
@@ -456,15 +456,11 @@ class Twin:
                 *estimate.carried.arrays.values(),
             )
             # False for NaN as well.
-            is_finite = all(np.all(np.asarray(part) < _LARGEST_CARRIED) for part in numbers)
+            is_finite = all(np.all(np.asarray(part) < LARGEST_CARRIED) for part in numbers)
         except (ArithmeticError, np.linalg.LinAlgError):
             is_finite = False
         if not is_finite:
-            raise InvalidObservationError(
-                f"twin {self.name!r}, step {step}: the observation is so improbable after the "
-                "earlier ones that no belief can be computed; check the sensors and the control "
-                "in force"
-            )
+            raise unbelievable_observation(self.name, step)
         return estimate
 
     def _index_of(self, control: int | str) -> int:
@@ -542,6 +538,14 @@ class Twin:
             ahead=self.decide_on == "predicted",
         )
         return np.asarray(probability[0])
+
+
+def unbelievable_observation(twin: str, step: int) -> InvalidObservationError:
+    """Return the error that no belief can be computed after an observation of a twin."""
+    return InvalidObservationError(
+        f"twin {twin!r}, step {step}: the observation is so improbable after the earlier ones that "
+        "no belief can be computed; check the sensors and the control in force"
+    )
 
 
 def _kept_step_from_arrays(arrays: Mapping[str, AnyArray], index: int) -> _KeptStep:

@@ -25,7 +25,7 @@ from twin_master.fleet.evidence import (
     scaled_likelihood,
     transition_evidence,
 )
-from twin_master.fleet.learn import with_noise_factor
+from twin_master.fleet.learn import learn_fleet, with_noise_factor
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import (
     HIGHEST,
@@ -245,6 +245,30 @@ def test_the_noise_that_a_fleet_has_learnt_is_believed(grown, learnt_by_fleet):
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation
     expected = np.multiply(assumed, record["noise_factor"]["mean"])
     assert scenario.observation.standard_deviation == pytest.approx(expected)
+
+
+def numbers_of(record: Any) -> list[float]:
+    """Return all numbers of a record in their order."""
+    if isinstance(record, dict):
+        return [number for value in record.values() for number in numbers_of(value)]
+    return [float(record)] if isinstance(record, int | float) else []
+
+
+def test_a_fleet_that_is_read_by_blocks_teaches_what_the_whole_teaches(grown, learnt_by_fleet, monkeypatch):
+    monkeypatch.setattr("twin_master.fleet.learn.BLOCK_TWINS", 7)
+    record = learn_fleet(grown[1])["groups"]["growing_damage"]
+    np.testing.assert_allclose(numbers_of(record), numbers_of(learnt_by_fleet[0]), rtol=1e-9)
+
+
+def test_a_population_is_the_same_for_members_taken_a_few_at_a_time(monkeypatch):
+    nodes = np.linspace(-1.0, 1.0, 31)
+    log_evidence = -0.5 * ((nodes - np.random.default_rng(4).normal(0.0, 0.2, (23, 1))) / 0.1) ** 2
+    whole = population_posterior(nodes, log_evidence, 0.2)
+    monkeypatch.setattr("twin_master.fleet.posterior._MEMBERS_TOGETHER", 4)
+    parts = population_posterior(nodes, log_evidence, 0.2)
+    for name in ("mean", "deviation"):
+        expected = numbers_of(getattr(whole, name).summary)
+        np.testing.assert_allclose(numbers_of(getattr(parts, name).summary), expected, rtol=1e-9)
 
 
 TRUE_MODULUS = {"soft": 0.99, "stiff": 1.02}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from tests.command_line import command, refused, said
+from tests.command_line import refused, said
 from tests.twin_master.runs import changed_scenario
 from twin_master.errors import FleetError, MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME
@@ -224,15 +224,26 @@ def test_a_run_says_once_that_alarms_do_not_use_the_likelihood_of_a_sensor_model
     assert sentence not in told
 
 
-def test_an_ensemble_says_that_notices_make_it_slow_and_flies_without_them(library_file, tmp_path):
+def test_an_ensemble_flies_side_by_side_with_and_without_notices(library_file, tmp_path):
     words = ["run", "level_turns", "--strain-library", library_file, "--seeds", "0:2", "--workers", 0]
     words.append("--no-report")
-    slow = command(*words, "--out", tmp_path / "slow")
-    assert slow.returncode == 0, slow.stderr
-    assert slow.stderr.count("the 2 twins fly one after the other because they give notices") == 1
-    assert "`--no-notices`" in slow.stderr
-    fast = command(*words, "--no-notices", "--out", tmp_path / "fast")
-    assert fast.returncode == 0, fast.stderr
-    assert "one after the other" not in fast.stderr
-    groups = [uav_twin.open_fleet(tmp_path / name)["level_turns"] for name in ("slow", "fast")]
+    told = said(*words, "--out", tmp_path / "watched")
+    told += said(*words, "--no-notices", "--out", tmp_path / "unwatched")
+    assert "one after the other" not in told
+    groups = [uav_twin.open_fleet(tmp_path / name)["level_turns"] for name in ("watched", "unwatched")]
     assert [group.attrs["gives_notice"] for group in groups] == [1, 0]
+
+
+def test_an_ensemble_of_learning_twins_says_that_they_fly_one_after_the_other(library_file, tmp_path):
+    words = [
+        "run",
+        "level_turns_learning",
+        "--strain-library",
+        library_file,
+        "--seeds",
+        "0:2",
+        "--workers",
+        0,
+    ]
+    told = said(*words, "--no-report", "--no-notices", "--out", tmp_path / "learning")
+    assert told.count("the 2 twins fly one after the other because they learn") == 1

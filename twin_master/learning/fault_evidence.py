@@ -1,0 +1,101 @@
+"""The compiled loop that corrects all hypotheses about gauges by an observation, for many twins.
+
+Notation and method are those of `fault_kernels`.
+"""
+
+import numpy as np
+
+from fe.compilation import compiled
+from reporting.arrays import Float
+from twin_master.learning.fault_kernels import (
+    Beliefs,
+    FaultPriors,
+    FreeGainStatistics,
+    LogEvidence,
+    Observations,
+    Predictions,
+    StandardizedObservation,
+    standardize,
+    update_sound_gauges,
+)
+from twin_master.learning.free_gains import update_free_gains
+from twin_master.learning.gauge_faults import update_gauge_faults
+from twin_master.learning.model_likelihood import considered_pairs, model_likelihood
+
+
+@compiled
+def correct_beliefs(
+    predictions: Predictions,
+    observations: Observations,
+    priors: FaultPriors,
+    observation_count: Float,
+    beliefs: Beliefs,
+    statistics: FreeGainStatistics,
+    log_evidence: LogEvidence,
+) -> None:
+    """Correct the beliefs of all hypotheses of B twins by an observation of each.
+
+    Parameters
+    ----------
+    predictions : Predictions
+        What all controls and states predict.
+    observations : Observations
+        The observations of the twins.
+    priors : FaultPriors
+        The priors of the faults.
+    observation_count : (B, G) array
+        The number of earlier observations of each gauge.
+    beliefs : Beliefs
+        The beliefs and sums of squares; updated in place.
+    statistics : FreeGainStatistics
+        What is learnt of free gains; updated in place.
+    log_evidence : LogEvidence
+        To be filled.
+    """
+    twins, gauges = observations.readings.shape
+    pairs = beliefs.model.shape[1]
+    observation = StandardizedObservation(
+        np.empty(gauges, np.bool_),
+        np.empty((gauges, pairs)),
+        np.empty((gauges, pairs)),
+        np.empty(pairs),
+        np.empty(gauges),
+    )
+    precision = np.empty(gauges)
+    model_squares = np.empty(gauges)
+    log_density = np.empty(pairs)
+    for twin in range(twins):
+        # Each hypothesis has learnt noise scales of its own. They enter the constant of Student's
+        # density: 1 / sqrt(degrees + squares) for each gauge.
+        log_scale_ratio = 0.0
+        for g in range(gauges):
+            observation.present[g] = not np.isnan(observations.readings[twin, g])
+            degrees = priors.degrees + observation_count[twin, g]
+            observation.degrees_after[g] = degrees + 1.0
+            model_squares[g] = priors.degrees + beliefs.model_squares[twin, g]
+            precision[g] = min(degrees / model_squares[g], 1.0)
+            if observation.present[g]:
+                recovered_squares = priors.degrees + beliefs.recovered_squares[twin, g]
+                log_scale_ratio += np.log(model_squares[g] / recovered_squares)
+        standardize(predictions, observations, twin, precision, observation)
+
+        log_evidence.recovered[twin] = 0.5 * log_scale_ratio + update_sound_gauges(
+            observation,
+            priors.degrees,
+            beliefs.recovered[twin],
+            beliefs.recovered_squares[twin],
+            log_density,
+        )
+        log_evidence.model[twin] = update_sound_gauges(
+            observation,
+            priors.degrees,
+            beliefs.model[twin],
+            beliefs.model_squares[twin],
+            log_density,
+        )
+        pair = considered_pairs(beliefs, twin)
+        model = model_likelihood(observation, pair, model_squares, log_density)
+        update_gauge_faults(observation, model, priors, beliefs, twin, log_evidence.gauge[twin])
+        log_evidence.free_gains[twin] = update_free_gains(
+            observation, model, priors, beliefs.free_gains[twin], statistics, twin
+        )

@@ -1,0 +1,276 @@
+"""The watch over the gauges of many twins: absurd readings, faults as hypotheses, notices.
+
+A single twin is watched in the same way, as one of one, so that its results are the same to the
+last bit.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reporting.arrays import Float, Index
+from twin_master.learning import hypothesis_weights
+from twin_master.learning.fault_filter import FaultFilter
+from twin_master.learning.fault_kernels import Observations
+from twin_master.learning.hypothesis_weights import HypothesisBeliefs
+from twin_master.learning.notices import NoticeWriter
+from twin_master.learning.watch_state import WatchState
+from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.scenario.tables import Noticing
+
+
+@dataclass(frozen=True)
+class CheckedReadings:
+    """The observations of B twins in a step, without absurd readings.
+
+    Attributes
+    ----------
+    rows : (B, G + I) array
+        All observed values, SI; NaN where nothing was received or a reading is absurd.
+    readings : (B, G) array
+        The values of the gauges as they were received.
+    is_absurd : (B, G) array of bool
+        Whether no state can show a reading.
+    observations : Observations
+        The values that are used.
+    """
+
+    rows: Float
+    readings: Float
+    is_absurd: NDArray[np.bool_]
+    observations: Observations
+
+
+class AlarmEvidence(NamedTuple):
+    """The log evidence of the kinds of fault over the model, for B twins.
+
+    Attributes
+    ----------
+    free_gains, any_gauge : (B,) array
+        That several gauges have unknown gains, and that a single one is off.
+    each_gauge : (B, G) array
+        That of each gauge.
+    """
+
+    free_gains: Float
+    any_gauge: Float
+    each_gauge: Float
+
+
+class GaugeWatch:
+    """The watch over the gauges of B twins with the same model.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        S states, and their transitions.
+    sensor_model : GaussianSensorModel
+        Predictions (E, S, U, G) and assumed noise.
+    draws : (E,) array
+        The value of the parameter in each draw.
+    settings : Noticing
+        When alarms are raised.
+    wording : NoticeWording
+        How notices speak of steps and sensors.
+
+    Attributes
+    ----------
+    faults : FaultFilter
+        The filters of the hypotheses.
+
+    Raises
+    ------
+    InvalidModelError
+        If there are too many states.
+    """
+
+    def __init__(
+        self,
+        model: GraphicalModel,
+        sensor_model: GaussianSensorModel,
+        draws: Float,
+        settings: Noticing,
+        wording: NoticeWording,
+    ) -> None:
+        self._sensor_model = sensor_model
+        self.faults = FaultFilter(model, sensor_model, draws, settings)
+        self._notices = self._notice_writer(wording, settings)
+
+    def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
+        """Return the writer of notices.
+
+        A reading is plausible if it is within a margin of the prediction of some draw and state.
+        """
+        value = self._sensor_model.value_per_draw
+        deviation = self._sensor_model.total_standard_deviation
+        margin = settings.absurd_deviations * deviation  # (S, U, G)
+        sensors = range(self._sensor_model.sensor_count)
+        return NoticeWriter(
+            wording=wording,
+            threshold=settings.threshold,
+            gains=self.faults.gains,
+            log_gauge_prior=self.faults.log_gauge_prior,
+            lowest_plausible=(value.min(axis=0) - margin).min(axis=0),
+            highest_plausible=(value.max(axis=0) + margin).max(axis=0),
+            hypothesis_names=tuple(f"{wording.name_sensors([g])} off" for g in sensors),
+        )
+
+    def check_readings(self, rows: Float, control_index: Index) -> CheckedReadings:
+        """Return observations without absurd readings.
+
+        Parameters
+        ----------
+        rows : (B, G + I) array
+            The observed values, SI; NaN where nothing was received.
+        control_index : (B,) array
+            The controls in force.
+        """
+        readings, other_log_density = self._sensor_model.split_observation(rows)
+        is_absurd = self._notices.is_absurd(readings, control_index)
+        used_readings = np.where(is_absurd, np.nan, readings)
+        # The rest of the observation, such as readings of inspections, is kept.
+        used_rows = np.concatenate([used_readings, rows[:, readings.shape[1] :]], axis=1)
+        beside = np.broadcast_to(other_log_density, (len(rows), self._sensor_model.state_count))
+        observations = Observations(
+            used_readings, np.ascontiguousarray(beside), control_index.astype(np.int64)
+        )
+        return CheckedReadings(used_rows, readings, is_absurd, observations)
+
+    def assimilate(
+        self, state: WatchState, checked: CheckedReadings, model_belief: Float, step: int
+    ) -> list[list[Notice]]:
+        """Correct the hypotheses by observations, mix their beliefs, and return the notices.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch of B twins in this step, before its observation; updated in
+            place.
+        checked : CheckedReadings
+            The observations.
+        model_belief : (B, S) array
+            The filtered belief under the model.
+        step : int
+            The number of the step.
+
+        Returns
+        -------
+        list of list of Notice
+            The notices of each twin.
+        """
+        self.faults.assimilate(state, checked.observations)
+        notices = self._report_absurd_readings(state, checked, step)
+        self._raise_alarms(state, notices, step)
+        beliefs = self.beliefs(state, model_belief)
+        self._report_followed_hypothesis(state, beliefs, notices, step)
+        state.mixed = hypothesis_weights.mix_beliefs(state.weights, beliefs)
+        return notices
+
+    def beliefs(self, state: WatchState, model_belief: Float) -> HypothesisBeliefs:
+        """Return the beliefs about the state under all hypotheses that believe in one."""
+        return HypothesisBeliefs(model_belief, state.beliefs.recovered, state.beliefs.gauge)
+
+    def _report_absurd_readings(
+        self, state: WatchState, checked: CheckedReadings, step: int
+    ) -> list[list[Notice]]:
+        """Return the notices of each twin about readings that begin or cease to be absurd."""
+        is_absurd = checked.is_absurd
+        is_missing = np.isnan(checked.readings)
+        was_left_out = state.left_out
+        # A gauge that was left out and sends no reading now counts as left out still.
+        state.left_out = is_absurd | (was_left_out & is_missing)
+        notices: list[list[Notice]] = [[] for _ in is_absurd]
+        for twin in np.flatnonzero(np.any(state.left_out != was_left_out, axis=1)).tolist():
+            notices[twin] = self._notices.report_absurd_readings(
+                was_left_out[twin],
+                is_absurd[twin],
+                checked.readings[twin],
+                int(checked.observations.control[twin]),
+                step,
+            )
+        return notices
+
+    def _raise_alarms(self, state: WatchState, notices: Sequence[list[Notice]], step: int) -> None:
+        """Append the alarms of a step to the notices of each twin."""
+        evidence = self.alarm_evidence(state)
+        may_alarm = self._notices.may_raise_alarm(state, evidence.any_gauge, evidence.free_gains)
+        for twin in np.flatnonzero(may_alarm).tolist():
+            notices[twin] += self._notices.raise_alarms(
+                state,
+                twin,
+                float(evidence.any_gauge[twin]),
+                float(evidence.free_gains[twin]),
+                step,
+            )
+
+    def _report_followed_hypothesis(
+        self,
+        state: WatchState,
+        beliefs: HypothesisBeliefs,
+        notices: Sequence[list[Notice]],
+        step: int,
+    ) -> None:
+        """Append a notice for each twin that follows another hypothesis than before."""
+        hypothesis, probability = hypothesis_weights.most_probable_hypothesis(
+            state.weights, gauges=state.left_out.shape[1]
+        )
+        has_changed = (probability > 0.5) & (hypothesis != state.followed_hypothesis)
+        for twin in np.flatnonzero(has_changed).tolist():
+            state.followed_hypothesis[twin] = hypothesis[twin]
+            notices[twin] += self._notices.report_followed_hypothesis(
+                int(hypothesis[twin]), float(probability[twin]), step
+            )
+
+    def report_own_likelihood(self) -> list[Notice]:
+        """Return the notice that a user's sensor model has a likelihood that alarms do not use."""
+        return self._notices.report_own_likelihood(self._sensor_model)
+
+    def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
+        """Return the evidence for the kinds of fault, relative to that for the model.
+
+        It is a sum over the steps in which the fault may begin. If it begins later, it predicts so
+        far what the model predicts: this term is the prior probability that it begins later, times
+        one.
+        """
+        log_begins_later = np.log(self.faults.probability_to_begin_after(state.step_count - 1.0))
+        twins, gauges = state.left_out.shape
+        by_gauge = state.log_gauge_evidence.reshape(twins, gauges, -1)
+        log_fault_has_begun = np.logaddexp.reduce(by_gauge, axis=2)
+        each_gauge = np.logaddexp(log_fault_has_begun, log_begins_later[:, None])
+        return AlarmEvidence(
+            free_gains=np.logaddexp(state.log_free_gains_evidence, log_begins_later),
+            any_gauge=np.logaddexp.reduce(each_gauge + self.faults.log_gauge_prior, axis=1),
+            each_gauge=each_gauge,
+        )
+
+    def suspicion(self, state: WatchState) -> Suspicion:
+        """Return how well the model explains the sensors of one twin so far."""
+        evidence = self.alarm_evidence(state)
+        return Suspicion(
+            none_of_these=float(state.weights.free_gains_probability[0]),
+            gauge_off=float(state.weights.gauge_fault_probability.sum()),
+            log_evidence_none=float(evidence.free_gains[0]),
+            log_evidence_any_gauge=float(evidence.any_gauge[0]),
+            log_evidence_gauge=evidence.each_gauge[0],
+            left_out=state.left_out[0],
+        )
+
+    def hypotheses(self, state: WatchState, model_belief: Float) -> tuple[Hypothesis, ...]:
+        """Return the hypotheses of one twin that are not very improbable.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch of the twin.
+        model_belief : (1, S) array
+            Its filtered belief under the model.
+        """
+        beliefs = self.beliefs(state, model_belief)
+        return hypothesis_weights.list_hypotheses(
+            state.weights, beliefs, self._notices.hypothesis_names
+        )
