@@ -477,9 +477,9 @@ _REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
 _ATTRIBUTE = re.compile(r'([\w:-]+)="([^"]*)"')
 _ATTRIBUTES_OF_FILES = {"viewBox", "width", "height", "version", "data-tiles"}
 """Attributes of an SVG that its element in a page does not have or has anew."""
-_READABLE = 1.15
+_READABLE_PIXELS_PER_POINT = 1.15
 """Pixels for each point of a drawing, at which letters of 8 points can be read."""
-_LARGEST = 1.6
+_MOST_PIXELS_PER_POINT = 1.6
 """The most pixels for each point of a drawing."""
 _DRAWING = "drawing"
 """Identifier of a whole drawing in a page, after its prefix."""
@@ -561,22 +561,23 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> InlineDrawing:
 
 
 def _tile_element(view_box: str, width: float, drawing: str) -> str:
-    """Return the element that shows a rectangle of a drawing.
+    """Return the HTML element of a tile: a rectangle that is cut out of a drawing.
 
     Parameters
     ----------
     view_box : str
-        The rectangle.
+        The rectangle as an SVG attribute: left edge, top edge, width and height [pt].
     width : float
-        Its width [pt], in which letters have their usual size.
+        The width of the rectangle [pt].
     drawing : str
         The identifier of the drawing.
     """
-    # A tile that is wider than the screen keeps the size at which its letters can be read, and a
-    # small one is not blown up.
-    style = f"max-width:{_LARGEST * width:.0f}px"
     if width > NARROW:
-        style = f"width:{_READABLE * width:.0f}px"
+        # wider than a small screen: the tile keeps the width at which its letters can be read
+        style = f"width:{_READABLE_PIXELS_PER_POINT * width:.0f}px"
+    else:
+        # the tile fits the screen, and is not magnified beyond the limit on a wide one
+        style = f"max-width:{_MOST_PIXELS_PER_POINT * width:.0f}px"
     return (
         f'<div class="tile"><svg viewBox="{view_box}" style="{style}" aria-hidden="true" '
         f'data-drawing="{drawing}"><use href="#{drawing}"/></svg></div>'

@@ -143,7 +143,7 @@ class _Console:
     live_display : context manager
         While it is open, people see the table.
     metrics_server : MetricsServer or None
-        Serves the figures of the assets whose decisions are told, if that is wanted.
+        Serves the metrics of the assets; None without such a server.
     """
 
     metrics_server: "MetricsServer | None" = None
@@ -332,14 +332,20 @@ def learn(
 
 
 def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
-    """Return the processes that fly a fleet.
+    """Return the engine that runs the missions of a fleet, in local processes or on a cluster.
 
     Parameters
     ----------
     workers : int or None
-        The number of processes on this machine; None is one for each processor.
+        The number of processes on this machine. None means one for each processor that this process
+        may use.
     cluster : str or None
-        The address of the scheduler of a Dask cluster.
+        The address of the scheduler of a Dask cluster; None runs the fleet on this machine.
+
+    Raises
+    ------
+    typer.BadParameter
+        If both are given.
     """
     from twin_master.fleet.engine import Engine
 

@@ -82,20 +82,20 @@ def fit_masses(
     limits = servo_range(validity, total_mass)
     samples = []
     fitted_frequencies = []
-    for factor in young_modulus_factor.tolist():
-        servo_mass = _nearest_servo_mass(frequencies, factor, total_mass, target, limits)
+    for modulus_factor in young_modulus_factor.tolist():
+        servo_mass = _nearest_servo_mass(frequencies, modulus_factor, total_mass, target, limits)
         pitot_mass = total_mass - 2.0 * servo_mass
-        fitted_pair = frequencies(np.array([[factor, servo_mass, pitot_mass]]))[0]
+        fitted_pair = frequencies(np.array([[modulus_factor, servo_mass, pitot_mass]]))[0]
         frequency_1, frequency_2 = fitted_pair.tolist()
         alpha, beta = damping_coefficients((frequency_1, frequency_2), ratios)
-        samples.append((factor, servo_mass, pitot_mass, alpha, beta))
+        samples.append((modulus_factor, servo_mass, pitot_mass, alpha, beta))
         fitted_frequencies.append(fitted_pair)
     return PaperSamples(np.array(samples), np.array(fitted_frequencies))
 
 
 def _nearest_servo_mass(
     frequencies: FrequencyModel,
-    factor: float,
+    modulus_factor: float,
     total_mass: float,
     target: Float,
     limits: tuple[float, float],
@@ -105,9 +105,9 @@ def _nearest_servo_mass(
     Parameters
     ----------
     frequencies : callable
-        The flapwise frequencies of the model.
-    factor : float
-        The value of e [1].
+        The flapwise frequencies of the model, for rows of e, servo mass and pitot mass.
+    modulus_factor : float
+        The paper's e: the factor of the wing's Young's modulus [1].
     total_mass : float
         The weighed mass of two servos and the pitot tube [kg].
     target : (2,) array
@@ -122,8 +122,8 @@ def _nearest_servo_mass(
     """
 
     def mean_error(servo_mass: float) -> float:
-        state = [factor, servo_mass, total_mass - 2.0 * servo_mass]
-        ratio = frequencies(np.array([state]))[0] / target
+        pitot_mass = total_mass - 2.0 * servo_mass
+        ratio = frequencies(np.array([[modulus_factor, servo_mass, pitot_mass]]))[0] / target
         return 0.5 * float(np.abs(ratio - 1.0).sum())
 
     search = minimize_scalar(mean_error, bounds=limits, method="bounded", options={"xatol": 1e-9})
@@ -131,9 +131,9 @@ def _nearest_servo_mass(
     lower, upper = limits
     if min(servo_mass - lower, upper - servo_mass) < _AT_LIMIT:
         raise ExperimentDataError(
-            f"at e = {factor:g} the masses nearest to {target[0]:.4g} and {target[1]:.4g} Hz "
-            f"lie at the limit of the model, {servo_mass:.4g} kg for a servo under a total of "
-            f"{total_mass:g} kg; check the measured frequencies and the total."
+            f"at e = {modulus_factor:g} the masses nearest to {target[0]:.4g} and "
+            f"{target[1]:.4g} Hz lie at the limit of the model, {servo_mass:.4g} kg for a servo "
+            f"under a total of {total_mass:g} kg; check the measured frequencies and the total."
         )
     return servo_mass
 

@@ -26,7 +26,11 @@ CLOCK = re.compile(
     r"(?: ?([AaPp])\.?[Mm]\.?)?(Z|[+-]\d\d:?\d\d)?",
     re.ASCII,
 )
-"""Date, clock, fraction of a second, half of the day, and offset from UTC."""
+"""Date, clock, fraction of a second, A or P of "am" and "pm", and offset from UTC."""
+_DAY_LAYOUTS = ("%Y-%m-%d", "%d.%m.%Y")
+"""The dates that are read; other layouts, as 3/4/2026, leave open which number is the month."""
+_DAY_OF_CLOCK_TIMES = "2000-01-01"
+"""The day on which cells without a date are placed; only differences of such times are used."""
 _HALF_DAY = 43_200
 _DAY = 86_400
 LOGICAL = {"true": "1", "false": "0"}
@@ -72,7 +76,10 @@ def _has_date(cell: str) -> bool:
 
 
 def _seconds_of_cell(cell: str, place: str) -> Decimal:
-    """Return the time in a cell, with or without a date, in seconds; in UTC if it has an offset.
+    """Return the time in a cell in seconds since 0001-01-01; in UTC if the cell has an offset.
+
+    A cell without a date is placed on `_DAY_OF_CLOCK_TIMES`, so that its time can be compared with
+    other cells without a date only.
 
     Parameters
     ----------
@@ -88,23 +95,38 @@ def _seconds_of_cell(cell: str, place: str) -> Decimal:
     """
     match = CLOCK.fullmatch(cell)
     if match is not None:
-        day, clock, fraction, half_of_day, offset = match.groups(default="")
-        clock_layout = "%H:%M:%S"
-        if half_of_day:
-            clock = f"{clock} {half_of_day}M"
-            clock_layout = "%I:%M:%S %p"
-        for day_layout in ("%Y-%m-%d", "%d.%m.%Y"):
-            with suppress(ValueError):
-                moment = datetime.strptime(
-                    f"{day or '1.1.2000'} {clock}", f"{day_layout} {clock_layout}"
-                )
-                whole_seconds = (moment - datetime.min) // timedelta(seconds=1)
-                fraction_of_second = Decimal(f"0{fraction.replace(',', '.')}")
-                return whole_seconds - _offset_seconds(offset) + fraction_of_second
+        day, clock, fraction, letter_of_am_or_pm, offset = match.groups(default="")
+        moment = _moment(day or _DAY_OF_CLOCK_TIMES, clock, letter_of_am_or_pm)
+        if moment is not None:
+            whole_seconds = (moment - datetime.min) // timedelta(seconds=1)
+            fraction_of_second = Decimal(f"0{fraction.replace(',', '.')}")
+            return whole_seconds - _offset_seconds(offset) + fraction_of_second
     raise CampaignFileError(
         f"{place}: {cell!r} is not a time, or has a date that can be read in two ways: write it as "
         "10:15:02.5, 2026-03-31 10:15:02.5 or 31.3.2026 10:15:02.5."
     )
+
+
+def _moment(day: str, clock: str, letter_of_am_or_pm: str) -> datetime | None:
+    """Return the date and time of a cell; None if there is no such time or date.
+
+    Parameters
+    ----------
+    day : str
+        The date, in one of `_DAY_LAYOUTS`.
+    clock : str
+        Hours, minutes and seconds, as 10:15:02.
+    letter_of_am_or_pm : str
+        "A" or "P" on a clock of 12 hours; empty on a clock of 24 hours.
+    """
+    clock_layout = "%H:%M:%S"
+    if letter_of_am_or_pm:
+        clock = f"{clock} {letter_of_am_or_pm}M"
+        clock_layout = "%I:%M:%S %p"
+    for day_layout in _DAY_LAYOUTS:
+        with suppress(ValueError):
+            return datetime.strptime(f"{day} {clock}", f"{day_layout} {clock_layout}")
+    return None
 
 
 def seconds_of_clock_times(

@@ -270,15 +270,24 @@ def check_shape(canonical_fit: CandidateFit, free_fit: CandidateFit | None) -> G
 
 
 def time_step_error(problem: Problem, fit: CandidateFit) -> float:
-    """Return the error of the time integration in a fit, in noise deviations.
+    """Return the error of the time integration in a fit, in standard deviations of the noise.
 
-    The time steps are halved, and the rms change of each channel in each trial in motion is divided
-    by the noise deviation of the channel. The largest of these ratios is returned.
+    Every dynamic trial, which is one recorded experiment with motion, is simulated again with time
+    steps of half the length. The rms change of each channel is divided by the standard deviation of
+    its noise. The largest of these ratios is returned; it is 0 if no trial is dynamic.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model.
+    fit : CandidateFit
+        The fit, with the responses that were simulated with the usual time steps.
     """
     largest_error = 0.0
     for trial_index, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
+        # refinement=2 makes two time steps of each
         finer_response = problem.response_of_candidate(
             trial_index, fit.point, fit.candidate, refinement=2
         )

@@ -353,6 +353,9 @@ class FmuModel(DescribedModel):
     ) -> PortedSystem:
         """Return the linear system from missing forces at the ports to the outputs.
 
+        A missing force is an unknown force in time. It acts at a port: a place of the structure
+        where a force may act.
+
         The system is identified from simulated responses of the FMU to a force at each port. The
         coordinates of an identified state are arbitrary. So the state is returned in the
         coordinates of the system at the prior mean of the parameters, and systems at different

@@ -312,8 +312,8 @@ def _ported_system(
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
 
-    A derivative is None if it is zero. The last unknowns are gains of channels, which do not change
-    the system.
+    A port is a place of the structure where a force may act. A derivative is None if it is zero.
+    The last unknowns are gains of channels, which do not change the system.
 
     Parameters
     ----------

@@ -145,6 +145,18 @@ def draw_heat_map(
     return image
 
 
+_ROW_HEIGHT = 0.22
+"""Height of a row of a heat map [in]."""
+_LEAST_MAP_HEIGHT = 0.9
+"""Least height of a heat map without its names [in]."""
+_TITLE_HEIGHT = 0.35
+"""Height of the title above a heat map [in]."""
+_NAME_SLANT = 40.0
+"""Rotation of the names of trials below a heat map [deg]."""
+_LETTER_HEIGHT = 0.042
+"""Height that each letter of a slanted name takes [in]."""
+_MOST_NAME_HEIGHT = 1.5
+"""The most height that is left for the names of trials [in]."""
 MOST_CELLS = 12
 """Most rows and columns of a heat map whose cells show their numbers."""
 GAUGE: dict[str, Any] = {
@@ -302,29 +314,43 @@ def _draw_panel(
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
-    """Draw the rms residuals by channel and trial as maps, without and with the effect.
+    """Draw the rms residuals by channel and trial as heat maps that share one colour scale.
 
-    Both maps share one colour scale.
+    Parameters
+    ----------
+    before : ResidualSet
+        The residuals of the unchanged model.
+    after : ResidualSet or None
+        The residuals of the model with the effect that a verdict adds to it. They are drawn in a
+        second map, which is absent for None.
     """
     drawn_models = models_to_draw(before, after)
-    tables = []
+    rms_of_models = []
     for drawn in drawn_models:
-        _, _, sizes = rms_table(drawn.residuals)
-        tables.append(sizes)
+        _, _, rms = rms_table(drawn.residuals)
+        rms_of_models.append(rms)
     channels, trials, _ = rms_table(before)
-    norm = size_colour_scale(np.concatenate([sizes.ravel() for sizes in tables]))
-    longest_name = max(len(name) for name in trials)
-    below = min(0.22 + 0.042 * longest_name, 1.5)
-    height = max(0.22 * len(channels), 0.9) + below + 0.35
-    figure, (row,) = new_panels(1, len(tables), height)
+    colour_scale = size_colour_scale(np.concatenate([rms.ravel() for rms in rms_of_models]))
+    figure, (panels,) = new_panels(1, len(drawn_models), _height_of_heat_map(channels, trials))
     has_texts = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
-    for panel, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
-        row_names = channels if panel == 0 else [""] * len(channels)
-        texts = _cell_texts(sizes) if has_texts else None
-        draw_heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
+    for number, (axes, rms, drawn) in enumerate(
+        zip(panels, rms_of_models, drawn_models, strict=True)
+    ):
+        # the channels are named beside the first map only
+        row_names = channels if number == 0 else [""] * len(channels)
+        texts = _cell_texts(rms) if has_texts else None
+        draw_heat_map(axes, rms, (row_names, trials), colour_scale, _NAME_SLANT, texts)
         axes.set_title(drawn.title)
-    add_size_bar(figure, norm, row)
+    add_size_bar(figure, colour_scale, panels)
     return figure
+
+
+def _height_of_heat_map(channels: Sequence[str], trials: Sequence[str]) -> float:
+    """Return the height of a heat map with title and names, by its rows and longest name [in]."""
+    longest_name = max(len(name) for name in trials)
+    name_height = min(_ROW_HEIGHT + _LETTER_HEIGHT * longest_name, _MOST_NAME_HEIGHT)
+    map_height = max(_ROW_HEIGHT * len(channels), _LEAST_MAP_HEIGHT)
+    return map_height + name_height + _TITLE_HEIGHT
 
 
 @np.vectorize

@@ -163,7 +163,11 @@ class Model(ABC):
     def _ported_system(
         self, trial: Trial, outputs: Outputs, parameters: FloatArray
     ) -> PortedSystem:
-        """Return the linear system from missing forces at ports to outputs, which are checked."""
+        """Return the linear system from missing forces to outputs.
+
+        The caller, `ported_system`, has checked the outputs. A missing force is an unknown force in
+        time. It acts at a port: a place of the structure where a force may act.
+        """
         raise NotImplementedError
 
     def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:

@@ -188,21 +188,22 @@ class LinearSystem:
         return Modes(np.concatenate((frequency, np.zeros(state_mode_count))), shapes, count)
 
     def _state_shapes(self) -> FloatArray:
-        """Return the shapes of the states that no drive prescribes, one in each column.
+        """Return the shapes (state_count, K) of the K independent states that no drive prescribes.
 
-        They are unit shapes along the principal axes of the capacity matrix, with a modal capacity
-        of 1.
+        A state s of first order, such as a temperature, obeys T s' + R s = G u' + H u, with the
+        capacity matrix T as the lower right block of `mass`. A drive prescribes a displacement or a
+        state. The shapes are along the principal axes of T, and each has a modal capacity of 1.
         """
         n = self.displacement_count
         if not self.state_count:
             return np.zeros((0, 0))
         capacity = self.mass[n:, n:]
-        drives = self.drives[self.prescribes_state, n:]
-        if not len(drives):
+        state_drives = self.drives[self.prescribes_state, n:]
+        if not len(state_drives):
             capacities, principal_axes = np.linalg.eigh(capacity)
             return np.asarray(principal_axes / np.sqrt(capacities))
         # an orthonormal basis of the states that leave all prescribed ones at zero
-        undriven_states = null_space(drives)
+        undriven_states = null_space(state_drives)
         capacities, principal_axes = np.linalg.eigh(undriven_states.T @ capacity @ undriven_states)
         return np.asarray(undriven_states @ principal_axes / np.sqrt(capacities))
 

@@ -324,18 +324,30 @@ class SystemModel(Model):
     ) -> PortedSystem:
         """Return the linear system from missing forces to outputs, in the modes at the prior mean.
 
-        These modes are the same for all parameters, so that systems at several parameters have the
-        same coordinates.
+        A missing force is an unknown force in time. It acts at a port: a place of the structure
+        where a force may act. The modes at the prior mean of the parameters are the same for all
+        parameters, so that systems at several parameters have the same coordinates.
+
+        Parameters
+        ----------
+        trial : Trial
+            The dynamic trial: one recorded experiment with its inputs and sample times.
+        outputs : tuple of (str, Quantity)
+            The outputs that channels measure, and the quantity wanted of each.
+        parameters : (P,) array
+            Values of the calibrated parameters.
         """
-        patch = self.patch.in_trial(trial.name)
+        patch = self.patch.in_trial(trial.name)  # the change of the model that holds in the trial
+        # A dynamic trial is simulated with the matrices at its start: the stiffness losses of its
+        # first row are enough.
         health = trial.health[:1]
         mean_conditions = Conditions(self.prior_mean(), health=health)
-        mean_case = self.patched_trial(trial, mean_conditions, patch)
+        case_at_mean = self.patched_trial(trial, mean_conditions, patch)
+        modes_at_mean = self.excited_system(case_at_mean).system.shapes
         case = self.patched_trial(trial, Conditions(parameters, health=health), patch)
-        mean_system = self.excited_system(mean_case)
         system, excitation = self.excited_system(case)
         equations = self.output_equations(case, outputs, excitation)
-        return ported_system(system, equations, mean_system.system.shapes)
+        return ported_system(system, equations, modes_at_mean)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1

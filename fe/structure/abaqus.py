@@ -22,10 +22,13 @@ from .deck_text import FLAT, fail, lines_of, real, whole, words_of
 _COMMENT = re.compile(r"^\s*\*\*.*")
 _INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _TYPES_OF_MESHIO = {"C3D8RH": "C3D8", "C3D10MH": "C3D10", "C3D20RH": "C3D20"}
-"""Types under which meshio writes plain hexahedra and tetrahedra."""
+"""Types under which meshio writes plain hexahedra and tetrahedra, and their plain types."""
 
-_SAME_STIFFNESS = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
-"""Hybrid elements, and those with a temperature: plain ones where the material is compressible."""
+_HYBRID_OR_THERMAL_TYPE = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
+"""Hybrid elements (H) and those with a temperature (T), with the plain type as the group.
+
+They have the stiffness of the plain type where the material is compressible.
+"""
 
 _VARIANT = re.compile(r"(C3D\d+)[A-Z]+")
 _OTHER_STIFFNESS = {
@@ -259,29 +262,37 @@ def _add_elements(deck: Deck, block: KeywordBlock) -> None:
 
 
 def _plain_type(name: str, where: str) -> str:
-    """Return the type of elements that is built for a type of a deck.
+    """Return the plain element type, a key of `_ELEMENT_TYPES`, with the stiffness of a given type.
 
     Parameters
     ----------
     name : str
-        The type in the deck.
+        The element type in the deck, such as C3D8H.
     where : str
-        The file and the line that name the type.
+        The file and the line that name the type, for messages.
+
+    Raises
+    ------
+    MeshError
+        If elements of this type cannot be read.
     """
-    same_stiffness = _SAME_STIFFNESS.fullmatch(name)
+    variant = _HYBRID_OR_THERMAL_TYPE.fullmatch(name)
     if name in _TYPES_OF_MESHIO:
-        built_type = _TYPES_OF_MESHIO[name]
-    elif same_stiffness:
-        built_type = same_stiffness[1]
+        plain_type = _TYPES_OF_MESHIO[name]
+    elif variant is not None:
+        plain_type = variant[1]
     else:
-        built_type = name
-    if built_type not in _ELEMENT_TYPES:
-        _refuse_type(name, where)
-    return built_type
+        plain_type = name
+    if plain_type not in _ELEMENT_TYPES:
+        _refuse_type(name, where)  # never returns
+    return plain_type
 
 
 def _refuse_type(name: str, where: str) -> NoReturn:
-    """Refuse a type of elements; for a variant of a known type, the message says how it differs."""
+    """Raise the error of an element type that cannot be read.
+
+    For a variant of a known type, the message says how the variant differs.
+    """
     readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
     variant = _VARIANT.fullmatch(name)
     if variant is None or variant[1] not in _ELEMENT_TYPES:

@@ -82,7 +82,7 @@ class BindingHeader(Section):
     start_time : float
         Start of the FMU [s].
     stop_time : float, optional
-        End of the experiment that the FMU is told at its start [s]; some do not start without one.
+        End of the experiment, which is passed to the FMU at its start [s]; some FMUs need one.
         The asset itself does not stop there.
     fmi_version : {"1.0", "2.0", "3.0"}, optional
         Version of FMI that the FMU must have; without this key any version is allowed.

@@ -16,7 +16,7 @@ Target = Literal[
 """Processors and systems that a library can be compiled for, by their names in FMI 3."""
 
 Platform = Literal["linux64", "win64", "darwin64", Target, "all"]
-"""Names of platforms that may be asked for: those of FMI 2 and 3, and "all"."""
+"""Names of platforms that a user can request: those of FMI 2 and 3, and "all"."""
 
 HOST_TARGET: Target = "x86_64-linux"
 """The only target that the C compiler of the host is used for."""

@@ -356,14 +356,14 @@ class Wiring:
         return settings
 
     def start_value(self, end: Endpoint, setting: ComponentSetting) -> float | str:
-        """Return a parameter or start value, as a number in the FMU's unit or as a text.
+        """Return a checked parameter or start value: a string, or a number in the FMU's unit.
 
         Parameters
         ----------
         end : Endpoint
-            The component and its variable.
+            The component and the variable whose value it is.
         setting : ComponentSetting
-            The value that a user gives.
+            The user's value, with its unit.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """An instance of an FMU in this process, the same for all versions of FMI and both interfaces.
 
 A step is one batch of prepared set calls, the step itself, and one batch of get calls. The worker
-process runs this; `FmiAsset` runs it directly when it is told not to isolate.
+process runs this; `FmiAsset` runs it directly if isolation is switched off.
 """
 
 import ctypes

@@ -41,7 +41,7 @@ class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
     def setupExperiment(
         self, *, startTime: float, stopTime: float | None, tolerance: float | None
     ) -> None:
-        """Set the time, and keep the tolerance; this interface is told no end."""
+        """Set the time, and keep the tolerance; this interface takes no end time."""
         self._tolerance = tolerance
         self.setTime(startTime)
 

@@ -120,11 +120,11 @@ class Plan:
     substeps : int
         Communication steps of the FMU between two observations.
     tolerance : float or None
-        Relative tolerance that the FMU is told.
+        Relative tolerance that is passed to the FMU.
     solver_tolerance : float
         Relative tolerance of our solver (model exchange).
     stop_time : float or None
-        End of the experiment that the FMU is told [s].
+        End of the experiment that is passed to the FMU [s].
     configuration : list of InitialValue
         Structural parameters (FMI 3), set before everything else.
     """

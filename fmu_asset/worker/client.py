@@ -182,9 +182,9 @@ class WorkerInstance(Instance):
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
         """Make N steps of the FMU in one call of its worker process.
 
-        The worker sends the replies in parts, each of one or more whole steps. So the progress can
-        be reported, and the time limit of a step holds for each wait between two parts, not for
-        the whole call.
+        The worker sends the replies in parts of one or more whole steps each. So progress can be
+        reported between two parts, and the time limit of a step applies to the wait for each part,
+        not to the whole call.
 
         Parameters
         ----------
@@ -199,18 +199,19 @@ class WorkerInstance(Instance):
         reply_bytes = replies.data.cast("B")
         bytes_per_step = replies[0].nbytes
         filled_bytes = 0
-        has_more = True
-        while has_more:
+        is_complete = False
+        while not is_complete:
             header = self._wait_for_answer(len(reply_bytes) - filled_bytes, may_be_part=True)
-            # A worker sends whole steps only; otherwise it has failed, and is given up.
+            # A worker that works sends whole steps only.
             if header.length % bytes_per_step:
                 raise self._death_error()
             self._read_into(reply_bytes[filled_bytes : filled_bytes + header.length])
             filled_bytes += header.length
-            has_more = header.kind == Answer.PART
-            # The instance counts as lost until the last part has arrived: an exception in between,
-            # such as an interruption, leaves parts unread, so no other question may be asked.
-            self.lost = has_more
+            is_complete = header.kind != Answer.PART
+            # An exception between two parts, such as an interruption, leaves parts of this reply
+            # unread in the pipe, so that no further request can be made. So the instance counts as
+            # lost until the last part has arrived.
+            self.lost = not is_complete
             report(filled_bytes // bytes_per_step)
 
     def read(self) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _GRACE = 2.0
 """Time that a worker without a twin has to end by itself [s]."""
 _LONGEST_END = 5.0
-"""Time after which descendants of a worker that still run are given up [s]."""
+"""Time for which the supervisor waits for the end of a worker's descendants [s]."""
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
 _ALL_THREADS = 0x40000000  # __WALL of waitpid(2)

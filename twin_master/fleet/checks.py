@@ -62,18 +62,18 @@ def check_fleet(fleet: Fleet) -> None:
     FleetError
         If any asset cannot fly; the message lists all such assets and the reasons.
     """
-    objections = []
+    faults = []
     for group in fleet.groups:
-        objections += _objections_to_scenarios(group)
-        objections += _objections_to_recordings(group)
-    if objections:
-        heading = f"{len(objections)} of the assets cannot fly, so none did:"
-        raise FleetError("\n".join([heading, *objections]))
+        faults += _faults_of_scenarios(group)
+        faults += _faults_of_recordings(group)
+    if faults:
+        heading = f"{len(faults)} of the assets cannot fly, so none did:"
+        raise FleetError("\n".join([heading, *faults]))
 
 
-def _objections_to_scenarios(group: Group) -> list[str]:
-    """Return why scenarios of a group cannot be flown, a sentence for each."""
-    objections = []
+def _faults_of_scenarios(group: Group) -> list[str]:
+    """Return a sentence for each scenario of a group that cannot be simulated, with the reason."""
+    faults = []
     mean_parameters = {name: spread.mean for name, spread in group.parameter_spreads.items()}
     is_real = bool(group.observations)
     for number, scenario in enumerate(group.scenarios):
@@ -84,21 +84,21 @@ def _objections_to_scenarios(group: Group) -> list[str]:
             asset = group.name
             if len(group.scenarios) > 1:
                 asset += f" {group.members[number].name}"
-            objections.append(f"{asset}: {error}")
-    return objections
+            faults.append(f"{asset}: {error}")
+    return faults
 
 
-def _objections_to_recordings(group: Group) -> list[str]:
-    """Return why recordings of a group of real assets cannot be read, a sentence for each."""
+def _faults_of_recordings(group: Group) -> list[str]:
+    """Return a sentence for each recording of real assets that cannot be read, with the reason."""
     if not group.observations:
         return []
-    objections = []
+    faults = []
     for member in group.members:
         try:
             file_feed(member.file or Path(), group.scenarios[0])
         except FLIGHT_ERRORS as error:
-            objections.append(f"{group.name}: {error}")
-    return objections
+            faults.append(f"{group.name}: {error}")
+    return faults
 
 
 def _check_scenario(group: Group, scenario: Scenario) -> None:

@@ -104,7 +104,7 @@ class GroupSection(Section):
 
     @property
     def pattern_key(self) -> str:
-        """The override that differs from asset to asset: "fmu", "calibration" or empty."""
+        """The field of `Overrides` that differs by asset: "fmu", "calibration" or empty."""
         if self.fmus:
             return "fmu"
         return "calibration" if self.calibrations else ""
@@ -299,16 +299,16 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
     if seed is not None:
         fleet_section = fleet_section.model_copy(update={"seed": seed})
     groups = []
-    objections = []
+    faults = []
     for group_section in fleet_file.group:
         try:
             group = _group(group_section, path.resolve().parent, fleet_section.seed)
             _check_shared_inspections(group, fleet_section)
             groups.append(group)
         except TwinMasterError as error:
-            objections.append(f"group {group_section.name}: {error}")
-    if objections:
-        raise FleetError("\n".join([f"{path}: nothing was begun, for", *objections]))
+            faults.append(f"group {group_section.name}: {error}")
+    if faults:
+        raise FleetError("\n".join([f"{path}: nothing was begun, for", *faults]))
     return Fleet(fleet_section, tuple(groups))
 
 
@@ -441,7 +441,20 @@ def _scenarios(
     loaded_scenario: LoadedScenario,
     files: list[Path],
 ) -> tuple[Scenario, ...]:
-    """Return the one scenario of a group, or a scenario for each FMU or calibration of its assets.
+    """Return the scenarios of a group: one for each file, or a single one without files.
+
+    Parameters
+    ----------
+    section : GroupSection
+        The group as the fleet file describes it.
+    folder : Path
+        The folder of the fleet file.
+    seed : int
+        The seed of the fleet.
+    loaded_scenario : LoadedScenario
+        The scenario file of the group.
+    files : list of Path
+        The FMU or the calibration of each asset; empty if all assets have those of the scenario.
 
     Raises
     ------
@@ -454,19 +467,20 @@ def _scenarios(
             _with_values_of_group(section, resolve_scenario(loaded_scenario, common_overrides)),
         )
     scenarios = []
-    objections = []
+    faults = []
     for file in files:
+        # the file replaces the FMU or the calibration of the scenario
         file_override: dict[str, Any] = {section.pattern_key: file}
         try:
             resolved_scenario = resolve_scenario(
                 loaded_scenario, replace(common_overrides, **file_override)
             )
         except TwinMasterError as error:
-            objections.append(f"{file.name}: {error}")
+            faults.append(f"{file.name}: {error}")
         else:
             scenarios.append(_with_values_of_group(section, resolved_scenario))
-    if objections:
-        raise FleetError("\n".join(["assets that cannot fly:", *objections]))
+    if faults:
+        raise FleetError("\n".join(["no scenario can be made with these files:", *faults]))
     return tuple(scenarios)
 
 

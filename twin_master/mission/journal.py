@@ -406,20 +406,29 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
     line_number = 1
     undamaged_lines_before = 0
     undamaged_lines_after = 0
-    line_begin = 0
+    # A line that matches its hash is undamaged.
     with path.open("rb") as file:
+        for line in _lines_before(file, begin):
+            line_number += 1
+            if record_of_line(line, path) is not None:
+                undamaged_lines_before += 1
+        file.readline()  # the damaged line itself
         for line in file:
-            if line_begin < begin:
-                line_number += 1
-            # A line that matches its hash is undamaged; the damaged line itself is not counted.
-            if line_begin != begin and record_of_line(line, path) is not None:
-                if line_begin < begin:
-                    undamaged_lines_before += 1
-                else:
-                    undamaged_lines_after += 1
-            line_begin += len(line)
+            if record_of_line(line, path) is not None:
+                undamaged_lines_after += 1
     return NotResumableError(
         f"line {line_number} of the journal {path} was changed or is damaged ({reason}); "
         f"{undamaged_lines_before} before it and {undamaged_lines_after} after it are valid: begin "
         "again with --replace."
     )
+
+
+def _lines_before(file: BinaryIO, end: int) -> Iterator[bytes]:
+    """Yield the lines of a file that begin before a byte, and leave the file behind them."""
+    position = 0
+    while position < end:
+        line = file.readline()
+        if not line:
+            return
+        position += len(line)
+        yield line

@@ -98,28 +98,38 @@ class DrawnReadings:
     def information(self, sensors: Sequence[int]) -> float:
         """Return the expected information of a set of sensors about the state, in bits.
 
-        The standardised readings of the set have the covariance I + L Lᵀ in each state, where L
-        (sensors, F) are the loadings. Its inverse and determinant follow from the small matrix
-        C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma.
+        It is the mean over the drawn readings of log2 of posterior over prior probability of the
+        state in which the reading was drawn. The prior is uniform over the S states.
         """
-        chosen_sensors = list(sensors)
-        terms = self._terms
-        squared_distance = terms.squared_residual[chosen_sensors].sum(axis=0)  # (N, S)
-        projection = terms.loading_residual[chosen_sensors].sum(axis=0)  # (S, N, F)
-        small_matrix = terms.loading_product[chosen_sensors].sum(axis=0)  # (S, F, F)
-        small_matrix = small_matrix + np.eye(projection.shape[-1])
-
-        # Log density of each reading in each state.
-        weighted_projection = np.matmul(projection, np.linalg.inv(small_matrix))
-        squared_distance -= np.sum(weighted_projection * projection, axis=-1).T
-        log_density = -0.5 * (squared_distance + np.linalg.slogdet(small_matrix)[1])
-        log_density -= self.log_deviation[:, chosen_sensors].sum(axis=1)
-
-        # Posterior over prior of the true state; the prior is uniform.
+        log_density = self._log_density(sensors)
         states = log_density.shape[1]
         log_density_of_truth = log_density[np.arange(len(self.state)), self.state]
         log_mean_density = logsumexp(log_density, axis=1) - np.log(states)
         return float((log_density_of_truth - log_mean_density).mean() / np.log(2.0))
+
+    def _log_density(self, sensors: Sequence[int]) -> Float:
+        """Return the log density (N, S) of each drawn reading of a set of sensors, in each state.
+
+        The standardised readings of the set have the covariance I + L Lᵀ in each state, where L
+        (sensors, F) are the loadings. Its inverse and determinant follow from the small matrix
+        C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma:
+        rᵀ (I + L Lᵀ)⁻¹ r = rᵀ r - (Lᵀ r)ᵀ C⁻¹ (Lᵀ r), and det(I + L Lᵀ) = det C.
+
+        The constant -log(2 pi) / 2 of each sensor is left out: it is the same in all states, so
+        that it cancels in the ratio of posterior to prior.
+        """
+        chosen_sensors = list(sensors)
+        terms = self._terms
+        squared_distance = terms.squared_residual[chosen_sensors].sum(axis=0)  # rᵀ r, (N, S)
+        projection = terms.loading_residual[chosen_sensors].sum(axis=0)  # Lᵀ r, (S, N, F)
+        small_matrix = terms.loading_product[chosen_sensors].sum(axis=0)  # Lᵀ L, (S, F, F)
+        small_matrix = small_matrix + np.eye(projection.shape[-1])
+
+        weighted_projection = np.matmul(projection, np.linalg.inv(small_matrix))
+        squared_distance -= np.sum(weighted_projection * projection, axis=-1).T
+        log_density = -0.5 * (squared_distance + np.linalg.slogdet(small_matrix)[1])
+        log_density -= self.log_deviation[:, chosen_sensors].sum(axis=1)
+        return np.asarray(log_density)
 
 
 def draw_readings(knowledge: Knowledge) -> tuple[DrawnReadings, ...]:

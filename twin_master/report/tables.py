@@ -55,7 +55,10 @@ def _add_table(
 
 
 def add_figures_table(page: Page, run: Run) -> None:
-    """Add the table of the summary's figures, with reference values if the scenario has any."""
+    """Add the table of the run's key figures, with reference values if the scenario has any.
+
+    A `Figure` is a number of the summary with its title and unit, not a drawing.
+    """
     figures = [Figure(**record) for record in run.summary.get("figures", [])]
     has_references = any(figure.reference is not None for figure in figures)
     columns = [PageColumn("result"), number_column("this run"), PageColumn("unit")]
@@ -64,6 +67,7 @@ def add_figures_table(page: Page, run: Run) -> None:
         columns += [PageColumn("reference"), PageColumn("source of the reference")]
     rows = []
     for figure, printed_figure in zip(figures, printed_figures(figures), strict=True):
+        # Only numbers are rounded for print: title and unit are those of the summary.
         row = [figure.title, printed_figure.value, figure.unit]
         if has_references:
             row += [printed_figure.reference, figure.reference_source]

@@ -203,30 +203,32 @@ class Flight:
         return (self.number, self._end) != state_before
 
     def _take_line(self, record: StepRecord, begin: int) -> None:
-        """Update the flight with a line: a new step, a late observation, or an event.
+        """Add a new line of the journal: a new step, a late observation, or an event.
 
-        An event is a line that belongs to no step, such as a verdict. All but a new step change
-        what viewers have of earlier steps, so that `number` grows.
+        An event is a line that belongs to no step, such as a verdict. `number` counts the revisions
+        of earlier steps: a late observation or an event changes steps that viewers have loaded, and
+        increases it; a new step does not.
 
         Parameters
         ----------
         record : dict
-            The line.
+            The content of the line.
         begin : int
-            The position at which the line begins [bytes].
+            The position at which the line begins in the journal [bytes].
         """
-        is_step = "filtered" in record
-        if is_step and record["step"] == self.steps:
+        has_belief = "filtered" in record
+        if has_belief and record["step"] == self.steps:
+            # the line of a new step contains its belief and its observation
             self._lines_of_steps.append(_StepLines(belief=begin, observation=begin))
             return
-        if is_step:
+        if has_belief:
             self._take_late_observation(record, begin)
         else:
             self._take_event(record, begin)
         self.number += 1
 
     def _take_late_observation(self, record: StepRecord, begin: int) -> None:
-        """Update the flight with an observation that came late.
+        """Add the line of an observation that came late.
 
         The line has the late observation of an earlier step, and the belief of the last step, which
         the twin has filtered again with it.
@@ -248,7 +250,7 @@ class Flight:
         self._lines_of_steps[observed_step].observation = begin
 
     def _take_event(self, record: StepRecord, begin: int) -> None:
-        """Update the flight with a line that is not a step: notices, a verdict, or a patched model.
+        """Add a line that is not a step: notices, a verdict, or a changed model.
 
         Its notices are shown with the last step before it. If its verdict has a drawing of the
         missing force, the drawing is added.

@@ -139,7 +139,7 @@ class Intake:
         self._statuses: deque[StepStatus] = deque(maxlen=scenario.watch.lag + 1)
         self._row_before_revision: Float = np.empty(0)
 
-        # What the operator is told
+        # The messages to the operator
         self.notices: list[Notice] = []
         self.stream = StreamNotices(self._words)
         self.stops_at_refusals = False
