@@ -27,7 +27,7 @@ class StoredProportion:
         The number of these cases, and of all cases.
     low, high : float
         Limits of the 90 % Wilson interval of the fraction [1].
-    share : float
+    share : float or None
         The fraction; null without cases [1].
     """
 
@@ -35,7 +35,7 @@ class StoredProportion:
     total: int
     low: float
     high: float
-    share: float
+    share: float | None
 
 
 @dataclass(frozen=True)
@@ -163,5 +163,5 @@ def _stored_proportion(proportion: Proportion) -> StoredProportion:
         total=proportion.total,
         low=proportion.low,
         high=proportion.high,
-        share=proportion.value,
+        share=proportion.value if proportion.total else None,
     )

@@ -129,7 +129,7 @@ def test_noise_is_that_which_is_stated(plain):
 def test_readings_are_in_si_and_an_empty_one_is_not_used(plain, up):
     assert up.values.tolist() == [[5e-7, 1e-4], [1.2025e-4, 7.3e-3], [1.2025e-4, 1.46e-2]]
     assert up.used.tolist() == [[True, True], [True, True], [False, True]]
-    assert "1 of 3 readings of 'g17' in the trial 'tip load up' is empty" in plain.remarks[0]
+    assert "1 of 3 readings of 'g17' in the trial 'tip load up' (row 3) is empty" in plain.remarks[0]
 
 
 def test_a_static_trial_has_its_place_and_time(up):

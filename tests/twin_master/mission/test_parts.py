@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from tests.command_line import refused, said
+from tests.command_line import command, refused, said
 from tests.twin_master.runs import changed_scenario
 from twin_master.errors import FleetError, MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME
@@ -245,5 +245,6 @@ def test_an_ensemble_of_learning_twins_says_that_they_fly_one_after_the_other(li
         "--workers",
         0,
     ]
-    told = said(*words, "--no-report", "--no-notices", "--out", tmp_path / "learning")
-    assert told.count("the 2 twins fly one after the other because they learn") == 1
+    flown = command(*words, "--no-report", "--no-notices", "--out", tmp_path / "learning")
+    assert flown.returncode == 0, flown.stderr
+    assert flown.stderr.count("the 2 twins fly one after the other because they learn") == 1

@@ -147,7 +147,7 @@ def test_sensors_have_units_of_their_own(run, figures_of_other_units):
 
 def test_captions_have_the_units_of_states_and_sensors(figures_of_other_units):
     noise = "0.0002 bar (pressure), 0.0002 L/min (flow 2)"
-    assert "in m2.K/W, percent; the past" in figures_of_other_units["mission_now"].caption
+    assert "in m2.K/W, percent; lines are means" in figures_of_other_units["mission_now"].caption
     assert noise in figures_of_other_units["check"].caption
 
 
