@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fe.runtime.errors import OutsideModelError
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text, hash_record
 from reporting.json_file import JsonObject
@@ -470,6 +471,11 @@ def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNode
 
     Return None if the calibration has no uncertainty, or if the source of the readings cannot
     compute them at chosen values of the parameter.
+
+    Raises
+    ------
+    FleetError
+        If some of the values are outside the range of the model.
     """
     knowledge = twins.knowledge
     draws = knowledge.draws
@@ -481,7 +487,15 @@ def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNode
     source = source_of(knowledge.scenario, is_real=is_real)
     source.prepare(twins.folder, SilentProgress())
     nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
-    predicted_readings = source.observation_table(nodes, knowledge.model)
+    try:
+        predicted_readings = source.observation_table(nodes, knowledge.model)
+    except OutsideModelError as error:
+        raise FleetError(
+            f"{error} `fleet learn` computes the readings at values of {draws.name} up to "
+            f"{NODE_DEVIATIONS:g} standard deviations from the mean of the calibration, which is "
+            f"{draws.mean:.4g} ± {draws.standard_deviation:.2g} here: give `[calibration]` a "
+            "smaller standard deviation, or a model with a wider range, and fly the fleet again."
+        ) from error
     if len(predicted_readings) != NODES:  # a stored library of observations has fixed draws
         return None
     return _ParameterNodes(values, prior / prior.sum(), predicted_readings)

@@ -13,10 +13,11 @@ from scipy.special import expit, logit
 from scipy.stats import beta, betabinom, norm, t
 
 from reporting.progress import Progress
+from tests.refusals import refused
 from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError
+from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.configuration import group_folder
 from twin_master.fleet.evidence import (
     TransitionFamily,
@@ -285,6 +286,18 @@ def learnt_by_two_groups(tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
         text += f"parameters = {{ young_modulus_factor = {{ mean = {mean}, standard_deviation = 0.002 }} }}\n"
     flown = fly_fleet(load_fleet(written(folder, text)), folder / "fleet").folder
     return learn_from_fleet(flown, folder / "learnt.toml")
+
+
+def test_values_of_the_parameter_outside_the_range_of_the_model_are_refused(tmp_path):
+    known = ('source = "static_test"', 'source = "normal"\nmean = 1.0\nstandard_deviation = 0.02')
+    scenario = written(tmp_path, text_of("growing_damage", known))
+    text = 'format = 1\nfleet = { name = "wide", seed = 5 }\n'
+    text += f'[[group]]\nname = "north"\nscenario = "{scenario.name}"\ncount = 2\nsteps = 3\n'
+    plan = load_fleet(written(tmp_path, text, name="fleet.toml"))
+    flown = fly_fleet(plan, tmp_path / "fleet").folder
+    sentence = "up to 6 standard deviations from the mean of the calibration, .* fly the fleet again"
+    with refused(FleetError, sentence):
+        learn_fleet(flown)
 
 
 @pytest.mark.parametrize("name", TRUE_MODULUS)
