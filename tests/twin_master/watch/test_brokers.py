@@ -53,12 +53,16 @@ def publish(client: Any, *steps: int) -> None:
 
 @contextmanager
 def watching(where: Broker, watch: Watch, steps: int) -> Iterator[list[str]]:
-    """Watch so many steps in a thread, from when the twin is connected on; yields what it notes."""
+    """Watch so many steps in a thread, from when the twin is connected on; yields what it notes.
+
+    A watch that goes on may be at its end before it notes that it is connected: a broker that has
+    kept the session sends the messages it has kept before it answers the subscription.
+    """
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
     thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"step_limit": steps})
     thread.start()
-    wait_until(lambda: notes)
+    wait_until(lambda: notes or not thread.is_alive())
     yield notes
     thread.join(60)
     assert not thread.is_alive()
