@@ -6,7 +6,7 @@ one, until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIA
 Laplace's approximation.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Protocol
@@ -144,29 +144,12 @@ class Linearisation:
         local_of_trials : list of (L,) array
             The local unknowns of each trial: those that occur in this trial only.
         """
-        # normal equations of the shared and effect unknowns, summed over the trials
-        sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
-        half_log_determinant = 0.0
-        for linear_trial in self.trials:
-            products, half_determinant = linear_trial.whitened_products
-            products_without_local, half_determinant_without_local = integrate_out_last(
-                products, np.asarray(half_determinant), linear_trial.trial.local_precision
-            )
-            sum_of_products += products_without_local
-            half_log_determinant += float(half_determinant_without_local)
-        regression = Regression(sum_of_products, half_log_determinant)
-        all_unknowns = range(len(self.prior_precision))
-        solution = regression.solve(all_unknowns, self.prior_precision)
+        solution = _solve_shared_unknowns(self.trials, self.prior_precision)
         local_of_trials = [
             self._most_probable_local_unknowns(linear_trial, solution.mean)
             for linear_trial in self.trials
         ]
         return solution, local_of_trials
-
-    def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
-        """Return the same linear trials with other missing forces."""
-        trials = tuple(replace(trial, processes=processes) for trial in self.trials)
-        return Linearisation(trials, self.prior_precision)
 
     def _most_probable_local_unknowns(
         self, linear_trial: LinearisedTrial, shared_and_effect: FloatArray
@@ -196,6 +179,33 @@ class Linearisation:
         by_fixed = products[local_slice, fixed] @ shared_and_effect
         right_side = products[local_slice, residual] - by_fixed
         return np.linalg.solve(normal_matrix, right_side)
+
+
+def _solve_shared_unknowns(
+    trials: Iterable[LinearisedTrial], prior_precision: FloatArray
+) -> Solution:
+    """Return the most probable values of the K unknowns of all trials and the E of the effects.
+
+    The local unknowns of each trial are integrated out.
+
+    Parameters
+    ----------
+    trials : iterable of LinearisedTrial
+        The trials, each linear about the same estimate.
+    prior_precision : (K + E,) array
+        The prior precisions of these unknowns.
+    """
+    sum_of_products = np.zeros((1 + len(prior_precision),) * 2)
+    half_log_determinant = 0.0
+    for trial in trials:
+        products, half_determinant = trial.whitened_products
+        products_without_local, half_determinant_without_local = integrate_out_last(
+            products, np.asarray(half_determinant), trial.trial.local_precision
+        )
+        sum_of_products += products_without_local
+        half_log_determinant += float(half_determinant_without_local)
+    regression = Regression(sum_of_products, half_log_determinant)
+    return regression.solve(range(len(prior_precision)), prior_precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,7 +384,9 @@ class GaussNewton:
         processes : mapping of int to Process
             The missing forces, by the number of the port.
         """
-        solution, _ = linearisation.with_processes(processes).solve()
+        # made and filtered one after the other, as each filter needs tens of MB in a long record
+        changed_trials = (replace(trial, processes=processes) for trial in linearisation.trials)
+        solution = _solve_shared_unknowns(changed_trials, linearisation.prior_precision)
         return solution.log_evidence + self._log_prior(processes)
 
     def linearise(

@@ -150,17 +150,17 @@ class _ValuedCandidate(NamedTuple):
     """A set of effects, and the scaled parameters (E,) with which its estimate begins."""
 
     candidate: Candidate
-    effect: FloatArray
+    parameters: FloatArray
 
 
-def _simpler_forms(candidate: Candidate, effect: FloatArray) -> list[_ValuedCandidate]:
+def _simpler_forms(candidate: Candidate, parameters: FloatArray) -> list[_ValuedCandidate]:
     """Return the simpler forms of a set: without one effect, or with one law in canonical shape.
 
     Parameters
     ----------
     candidate : Candidate
-        The set of effects. A single effect is not left out.
-    effect : (E,) array
+        The set of effects. The only effect of a set is never left out.
+    parameters : (E,) array
         The scaled parameters of the set, which the forms inherit.
     """
     forms = []
@@ -168,17 +168,18 @@ def _simpler_forms(candidate: Candidate, effect: FloatArray) -> list[_ValuedCand
     if len(numbers) > 1:
         for left_out in numbers:
             kept = [number for number in numbers if number != left_out]
-            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, effect)))
+            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, parameters)))
     for number, term in enumerate(candidate.terms):
         if not term.free_shape:
             continue
         canonical_term = replace(term, free_shape=False)
         terms = list(candidate.terms)
         terms[number] = canonical_term
-        values = [values for _, values in candidate.split_by_term(effect)]
+        parameters_by_term = [of_term for _, of_term in candidate.split_by_term(parameters)]
         # the parameters of the shape follow those of the canonical law
-        values[number] = values[number][: len(canonical_term.parameters)]
-        forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(values)))
+        canonical_count = len(canonical_term.parameters)
+        parameters_by_term[number] = parameters_by_term[number][:canonical_count]
+        forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(parameters_by_term)))
     return forms
 
 
@@ -234,7 +235,7 @@ def _estimate_from_values(
     trials = hypothesis.linear_trials
     laws, estimator = laws_and_estimator(search, form.candidate, trials)
     start = EstimatorStart(
-        form.effect, hypothesis.shared, _trajectories(hypothesis), hypothesis.processes
+        form.parameters, hypothesis.shared, _trajectories(hypothesis), hypothesis.processes
     )
     estimate = estimator.polish(laws, start, hypothesis.speed_window or SPEED_WINDOWS[-1])
     if estimate is None:

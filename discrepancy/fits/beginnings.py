@@ -89,13 +89,15 @@ def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Poi
 
 
 def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
-    """Return the point with the local unknowns fitted to first readings, twice as many each time.
+    """Return a point whose local unknowns are fitted to the first readings of each record.
 
-    The shared unknowns are fixed. If a fit fails, the point of the last one is returned.
+    The number of readings is doubled from fit to fit, up to whole records, and each fit begins at
+    the point of the one before. The shared unknowns are fixed. If a fit fails, the point of the
+    last one that succeeded is returned.
     """
     longest_record = max(len(data.trial.time) for data in problem.trials)
     sample_count = FIRST_SAMPLES
-    while sample_count < 2 * longest_record:
+    while sample_count < 2 * longest_record:  # the last fit has the whole records
         shortened = problem.with_first_samples(sample_count)
         fit = try_fit(shortened, Candidate(), point, iterations=MOST_STEPS, local_only=True)
         if fit is None:

@@ -45,17 +45,21 @@ def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = T
 
     Notes
     -----
-    If the fit has a residual process, only the trials' own unknowns enter the leverage. The shared
-    unknowns then absorb few samples, and their uncertainty is already described by the residual
-    process, which a χ² against the noise is meant to show. The noise of a channel without a record
-    is estimated from the residuals of the fitted trials.
+    A fit may have a residual process, which describes by how much the model is wrong. The
+    uncertainty of the shared unknowns is part of it then, so that only the trials' own unknowns
+    enter the leverage: a χ² against the noise shall show how wrong the model is.
+
+    The noise of a channel without a record is estimated from the residuals of the fitted trials.
     """
     precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
-    predictions = _TrialPredictions(problem, fit, fit, precision)
+    predictions = _TrialPredictions(problem, fit, precision=precision)
     trials = predictions.fitted_trials(sensitivities=sensitivities)
     if problem.campaign.held_out:
-        held_out_problem, held_out = fit_held_out(problem, fit)
-        trials += _TrialPredictions(held_out_problem, fit, held_out, precision).fitted_trials()
+        held_out_problem, held_out_fit = fit_held_out(problem, fit)
+        held_out_predictions = _TrialPredictions(
+            held_out_problem, fit, local_fit=held_out_fit, precision=precision
+        )
+        trials += held_out_predictions.fitted_trials()
     by_name = {trial.trial.name: trial for trial in trials}
     in_order = [by_name[trial.name] for trial in problem.campaign.trials if trial.name in by_name]
     return ResidualSet(problem.campaign.channels, tuple(in_order))
@@ -162,11 +166,11 @@ class _TrialPredictions:
     ----------
     problem : Problem
         The trials and the model.
-    fitted : CandidateFit
+    fit : CandidateFit
         The fit to the fitted trials; its covariance is that of the shared unknowns.
-    local_fit : CandidateFit
-        The fit that gives the trials' own unknowns: `fitted` itself for the fitted trials, or the
-        fit of held-out trials.
+    local_fit : CandidateFit, optional
+        The fit of held-out trials, which gives their own unknowns. Without it the trials are those
+        of `fit`.
     precision : (channels,) array
         The noise precision of each channel in the fitted trials, relative to the recorded one.
     """
@@ -175,16 +179,17 @@ class _TrialPredictions:
         self,
         problem: Problem,
         fit: CandidateFit,
-        local_fit: CandidateFit,
+        *,
+        local_fit: CandidateFit | None = None,
         precision: FloatArray,
     ) -> None:
         self.problem = problem
         self.fitted = fit
-        self.local_fit = local_fit
+        self.local_fit = fit if local_fit is None else local_fit
         self.precision = precision
         covariance = fit.covariance
         self.covariance_root = np.linalg.cholesky(covariance + 1e-14 * np.eye(len(covariance)))
-        self.is_held_out = local_fit is not fit
+        self.is_held_out = local_fit is not None
 
     def fitted_trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
         """Return each trial with its prediction, residuals and their expected variance.

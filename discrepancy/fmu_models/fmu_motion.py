@@ -384,9 +384,9 @@ class FmuSimulator(FmuAtRest):
     def _probe_port_speeds(
         self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the speeds of the ports at both ends of the first step, and their gains.
+        """Return what the first step of a run tells of the speeds of the P ports.
 
-        The gains (P, P) are the changes of the speeds (rows) by unit forces (columns) in that step.
+        The step is run without probing forces, and once more with a force at each port.
 
         Parameters
         ----------
@@ -396,19 +396,27 @@ class FmuSimulator(FmuAtRest):
             Force input of each port.
         speed_columns : list of int
             Column of each port's speed.
+
+        Returns
+        -------
+        speeds : (2, P) array
+            The speeds of the ports without probing forces, at the start and the end of the step.
+        gains : (P, P) array
+            The changes of the speeds (rows) at its end by unit forces at the ports (columns).
         """
         first_loads = {name: values[:1] for name, values in run.offsets.items()}
         one_step = run._replace(steps=1, offsets=first_loads)
-        undisturbed = self.outputs_of_run(one_step)[:, speed_columns]
-        _, undisturbed_at_end = undisturbed
+        speeds = self.outputs_of_run(one_step)[:, speed_columns]
+        _, speeds_at_end = speeds
         amplitudes = np.array([self.probing_amplitude(name) for name in inputs])
         speed_changes = []
         for name, amplitude in zip(inputs, amplitudes, strict=True):
-            force = first_loads.get(name, 0.0) + np.full(1, amplitude)
-            pushed_run = one_step._replace(offsets={**first_loads, name: force})
-            _, pushed_at_end = self.outputs_of_run(pushed_run)[:, speed_columns]
-            speed_changes.append(pushed_at_end - undisturbed_at_end)
-        return undisturbed, np.stack(speed_changes, axis=1) / amplitudes
+            # an input has one value for each step, and here there is one step
+            probing_load = first_loads.get(name, 0.0) + np.array([amplitude])
+            probed_run = one_step._replace(offsets={**first_loads, name: probing_load})
+            _, probed_speeds_at_end = self.outputs_of_run(probed_run)[:, speed_columns]
+            speed_changes.append(probed_speeds_at_end - speeds_at_end)
+        return speeds, np.stack(speed_changes, axis=1) / amplitudes
 
     def _find_converged_parts(
         self,

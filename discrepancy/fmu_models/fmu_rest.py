@@ -46,7 +46,8 @@ class FmuAtRest(IdentifiedFmu):
 
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         super().__init__(description, folder)
-        self._rest_is_linear: dict[tuple[str, ...], bool] = {}
+        # whether the outputs at rest are linear in a set of inputs, once that was tested
+        self._linear_at_rest: dict[tuple[str, ...], bool] = {}
 
     def solve_rest(
         self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]
@@ -83,8 +84,8 @@ class FmuAtRest(IdentifiedFmu):
     ) -> FloatArray:
         """Return the outputs (C,) of the FMU at rest under constant loads on some inputs.
 
-        The first time, the sum of static gains is compared with the FMU itself, which decides
-        whether the FMU is linear for these inputs.
+        If the FMU is linear in these inputs, the loads are not stepped: what they add is computed
+        from the static gain.
 
         Parameters
         ----------
@@ -95,34 +96,62 @@ class FmuAtRest(IdentifiedFmu):
         names : tuple of str
             The names of these inputs.
         """
-        excitation = FmuExcitation(
+        if self._is_linear_at_rest(state, load_values, names):
+            gain = self._static_gain(state, names)
+            if gain is not None:
+                unloaded_outputs = self._step_to_rest(state, np.zeros_like(load_values), names)
+                return np.asarray(unloaded_outputs + gain @ load_values)
+        return self._step_to_rest(state, load_values, names)
+
+    def _is_linear_at_rest(
+        self, state: OperatingPoint, load_values: FloatArray, names: tuple[str, ...]
+    ) -> bool:
+        """Return whether the outputs at rest are linear in the loads on some inputs.
+
+        For each set of inputs this is tested once, under the loads of the first call: what the
+        static gain adds is compared with what the FMU itself does. A linear FMU is stepped over a
+        long time, so that its error is relative to the loads and to the transients they cause.
+
+        Parameters
+        ----------
+        state, load_values, names
+            The arguments of `_settled_outputs`.
+        """
+        if names in self._linear_at_rest:
+            return self._linear_at_rest[names]
+        gain = self._static_gain(state, names)
+        if gain is None:
+            return False  # not kept: there may be a gain at another operating point
+        added_by_gain = gain @ load_values
+        excitation = self._excitation_to_rest(state, names)
+        responses = [self._response_to_force(excitation, name) for name in names]
+        largest_responses = [np.max(np.abs(response), axis=0) for response in responses]
+        tolerance = LINEARITY_TOLERANCE * (
+            np.abs(added_by_gain) + np.abs(load_values) @ largest_responses
+        )
+        unloaded_outputs = self._step_to_rest(state, np.zeros_like(load_values), names)
+        added_by_fmu = self._step_to_rest(state, load_values, names) - unloaded_outputs
+        is_linear = bool(np.all(np.abs(added_by_fmu - added_by_gain) <= tolerance))
+        self._linear_at_rest[names] = is_linear
+        return is_linear
+
+    def _static_gain(self, state: OperatingPoint, names: tuple[str, ...]) -> FloatArray | None:
+        """Return the change (C, E) of the outputs at rest by unit loads; None if it is not known.
+
+        It is that of the linear system which is identified from the responses of the FMU.
+        """
+        system = self.linear_system(self._excitation_to_rest(state, names))
+        return None if system is None else system.gain
+
+    def _excitation_to_rest(self, state: OperatingPoint, names: tuple[str, ...]) -> FmuExcitation:
+        """Return the excitation by which the FMU is identified until its motion has decayed."""
+        return FmuExcitation(
             state,
             self.description.static.step,
             MOST_RECORDED_STEPS,
             inputs=names,
             decays_to_rest=True,
         )
-        if not self._rest_is_linear.get(names, True):
-            return self._step_to_rest(state, load_values, names)
-        system = self.linear_system(excitation)
-        if system is None:
-            return self._step_to_rest(state, load_values, names)
-        unloaded_outputs = self._step_to_rest(state, 0.0 * load_values, names)
-        added_outputs = system.gain @ load_values
-        if names not in self._rest_is_linear:
-            responses = [self._response_to_force(excitation, name) for name in names]
-            largest_responses = [np.max(np.abs(response), axis=0) for response in responses]
-            tolerance = LINEARITY_TOLERANCE * (
-                np.abs(added_outputs) + np.abs(load_values) @ largest_responses
-            )
-            loaded_outputs = self._step_to_rest(state, load_values, names)
-            is_linear = bool(
-                np.all(np.abs(loaded_outputs - unloaded_outputs - added_outputs) <= tolerance)
-            )
-            self._rest_is_linear[names] = is_linear
-        if self._rest_is_linear[names]:
-            return np.asarray(unloaded_outputs + added_outputs)
-        return self._step_to_rest(state, load_values, names)
 
     def _step_to_rest(
         self, state: OperatingPoint, load_values: FloatArray, names: tuple[str, ...]

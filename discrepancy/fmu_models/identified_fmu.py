@@ -392,35 +392,46 @@ class IdentifiedFmu(FmuRuns):
     # ------------------------------------------------------------ pace
 
     def choose_step(self, trial: Trial, state: OperatingPoint) -> StepChoice:
-        """Return the first mode of the FMU and the communication step of a trial.
+        """Return the angular frequency of the FMU's first mode, and the step for a trial.
 
-        The first mode is the one with the largest flexibility at the first port; without a port,
-        the one with the largest line in the spectrum. The step is an integer fraction of the
-        sampling interval.
+        Both may be given in the model's file. The first mode is otherwise the one with the largest
+        flexibility at the first port; without a port, the one with the highest peak in the
+        spectrum. The step is otherwise an integer fraction of the sampling interval.
         """
         interval = trial.interval
+        system, excitation, steps_per_sample = self._system_that_shows_all_modes(
+            self._probing_excitation(trial, state), interval
+        )
+        frequency = self.description.scales.angular_frequency
+        if not frequency:
+            mode = None
+            if system is not None and self.ports:
+                mode = system.most_flexible_mode(self.displacement_columns[0], 0)
+            if mode is not None:
+                frequency = mode.angular_frequency
+            else:
+                frequency = self._dominant_frequency(excitation)
+        step = self.description.motion.step
+        if not step:
+            phase_in_interval = frequency * interval
+            step = interval / max(steps_per_sample, ceil(phase_in_interval / LARGEST_STEP_PHASE))
+        return StepChoice(frequency, step)
+
+    def _probing_excitation(self, trial: Trial, state: OperatingPoint) -> FmuExcitation:
+        """Return the excitation that shows the modes of the FMU at the sampling of a trial.
+
+        It has a force at each port; without ports, a release; without both, a load on the first
+        input, as any input will do to see how fast the FMU moves.
+        """
+        inputs = tuple(dict.fromkeys(self.port_inputs))
         releases = {}
         if self.release_variables and not self.ports:
             releases = {self.release_variables[0]: PROBING_DISPLACEMENT}
-        inputs = tuple(dict.fromkeys(self.port_inputs))
         if not inputs and not releases:
             inputs = tuple(self.variables.binding.load)[:1]
-        excitation = FmuExcitation(
-            state, interval, recorded_step_count(trial), inputs, releases=releases
+        return FmuExcitation(
+            state, trial.interval, recorded_step_count(trial), inputs, releases=releases
         )
-        # a system without aliasing, identified from the responses to port forces or a release
-        system, excitation, parts = self._system_that_shows_all_modes(excitation, interval)
-        # the first mode
-        mode = None
-        if system is not None and self.ports:
-            mode = system.most_flexible_mode(self.displacement_columns[0], 0)
-        frequency = self.description.scales.angular_frequency
-        if not frequency:
-            frequency = (
-                self._dominant_frequency(excitation) if mode is None else mode.angular_frequency
-            )
-        least_parts = max(parts, ceil(frequency * interval / LARGEST_STEP_PHASE))
-        return StepChoice(frequency, self.description.motion.step or interval / least_parts)
 
     def _system_that_shows_all_modes(
         self, excitation: FmuExcitation, interval: float
@@ -448,7 +459,7 @@ class IdentifiedFmu(FmuRuns):
         return SampledSystem(system, excitation, parts)
 
     def _dominant_frequency(self, excitation: FmuExcitation) -> float:
-        """Return the angular frequency of the largest line in the spectrum of a record [rad/s].
+        """Return the angular frequency of the highest peak in the spectrum of a record [rad/s].
 
         Raises
         ------

@@ -18,18 +18,18 @@ def effect_parameters(
     known_parameters: Collection[str],
     model_name: str,
 ) -> dict[str, float]:
-    """Return the parameters of the effects that an FMU carries itself.
+    """Return the parameters by which an FMU that implements effects itself gets those of a patch.
 
     Parameters
     ----------
     patch : ModelPatch
-        Any primitives.
+        The primitives of the patch. Those of a kind that the FMU does not implement are left out.
     effects : mapping of str to str
-        Kinds of primitives that the FMU carries, to the ids of its effects.
+        The id of the FMU's effect, by the kind of the primitive that it implements.
     known_parameters : collection of str
-        Parameters that are set already.
+        The names of parameters that are set already.
     model_name : str
-        The model as it is called in a sentence.
+        The name of the model in the error message.
 
     Raises
     ------

@@ -71,7 +71,7 @@ class ScoreTest:
 
 
 def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
-    """Test whether the residuals of a fit depend on load, run or the sensor channel of its effect.
+    """Test whether the residuals of a fit depend on loads, runs or the channel of an effect in it.
 
     Parameters
     ----------
@@ -83,19 +83,20 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     Returns
     -------
     Gate
-        The outcome. `passed` is None if there is nothing to test: no static trial, no flight and no
-        effect of a single channel; or if there are too few readings.
+        The outcome. Its statistic is the p value of the worst test, corrected for their number
+        (Bonferroni). `passed` is None if nothing can be tested: no trial has stated loads or
+        several runs, and no effect acts on one channel alone; or there are too few readings.
     """
     tests = score_tests(problem, fit, directions_by_test(problem, fit))
     if not tests:
         reason = (
-            "No trial has a stated load, or there are too few readings: it cannot be tested "
-            "whether the residuals follow the load."
+            "No trial has a stated load, or there are too few readings, so whether the residuals "
+            "follow the load cannot be tested."
         )
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
     worst_test = min(tests, key=lambda test: test.p_value)
-    statistic = min(1.0, worst_test.p_value * len(tests))
-    passed = statistic >= CONSISTENCY_LEVEL
+    corrected_p_value = min(1.0, worst_test.p_value * len(tests))
+    passed = corrected_p_value >= CONSISTENCY_LEVEL
     if passed:
         reason = "The residuals follow neither loads, runs nor the effect's own channel."
     else:
@@ -103,7 +104,7 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
             f"The residuals follow the {worst_test.name}: χ² {worst_test.statistic:.0f} along "
             f"{counted(worst_test.count, 'direction')}, most of all {worst_test.strongest}."
         )
-    return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
+    return Gate("consistency", passed, corrected_p_value, CONSISTENCY_LEVEL, reason)
 
 
 # ---------------------------------------------------------------- score tests

@@ -131,11 +131,12 @@ class ForceComparison(Comparison[ForceHypothesis]):
         if force_of_best_port is None:
             return ""
         force = force_of_best_port.at_port
-        order = "ordered by none of displacement, velocity, amplitude and time"
+        dependence = "it follows none of displacement, velocity, amplitude and time"
         if force.ordered_by:
             variables = " and ".join(force.ordered_by)
             percent = 100.0 * max(force.orders.values())
-            order = f"ordered by {variables} ({percent:.0f} % of its variance)"
+            dependence = f"{percent:.0f} % of its variance follows {variables}"
         return (
-            f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}, {order}."
+            f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}; "
+            f"{dependence}."
         )

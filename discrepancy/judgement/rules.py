@@ -83,7 +83,7 @@ class VerdictCase:
     # ---------------------------------------------------------------- how probable
 
     @property
-    def has_leading_set(self) -> bool:
+    def is_better_than_no_effect(self) -> bool:
         """Whether a set of effects is preferred to the model without effect.
 
         That is so if the most probable set is not the empty one, and either its Bayes factor is
@@ -113,7 +113,7 @@ class VerdictCase:
         return min(total_probability, 1.0)
 
     @property
-    def is_sure(self) -> bool:
+    def is_sure_enough_to_name(self) -> bool:
         """Whether the leading set is probable enough and has enough evidence to be named."""
         return self.probability >= SEARCH.name_probability and self.has_enough_evidence
 
@@ -219,19 +219,23 @@ class VerdictCase:
     def common_effects_verdict(self) -> VerdictOutcome | None:
         """Return the verdict that names the effects which all probable sets have in common.
 
-        It does not depend on which further effects there are. None is returned if these effects are
-        not a probable set themselves, or cannot be named.
+        Such a verdict is right whichever of the probable sets is the true one. None is returned if
+        the sets have no effect in common, if the common effects are not a probable set themselves,
+        or if they cannot be named.
         """
         common_names = set.intersection(
             *(set(names_without_free_shape(names)) for names in self.probable_sets)
         )
+        if not common_names:
+            return None
+        # a set in which a shape is free has another name, and is not looked for: its law is no name
         common_set = next(
             (names for names in self.probable_sets if set(names) == common_names), None
         )
-        if not common_set:
+        if common_set is None:
             return None
         case = VerdictCase(self.search, self.probabilities, common_set)
-        if not case.is_sure:
+        if not case.is_sure_enough_to_name:
             return None
         outcome = decide_verdict(case)
         return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
@@ -390,20 +394,24 @@ def decide_verdict(case: VerdictCase) -> VerdictOutcome:
 
     The rules in words are the `[[rule]]` tables of `sentences.toml`, in the same order.
     """
-    if not case.has_leading_set:
-        if case.no_effect_gate.has_failed:
+    # no set of effects is clearly better than the model as it is
+    if not case.is_better_than_no_effect:
+        model_fails = case.no_effect_gate.has_failed
+        if model_fails:
             return case.gap_verdict()
-        if case.leading_set and case.no_effect_probability < SEARCH.inconclusive_probability:
+        is_undecided = case.no_effect_probability < SEARCH.inconclusive_probability
+        if case.leading_set and is_undecided:
             return case.undecided_verdict()
         return case.nothing_missing_verdict()
-    if not case.is_sure:
+    # several sets explain the readings about equally well
+    if not case.is_sure_enough_to_name:
         return case.common_effects_verdict() or case.undecided_verdict()
+    # one set is sure: name it, or its family if the shape of its law is free
     if case.passes_all_tests:
-        return (
-            case.family_verdict()
-            if case.leading_fit.candidate.has_free_shape
-            else case.named_verdict()
-        )
+        if case.leading_fit.candidate.has_free_shape:
+            return case.family_verdict()
+        return case.named_verdict()
+    # it fails a test as it is: the family remains if it passes
     family = case.tested_family_set
     if family is None or _any_fails((family.absolute_fit, family.consistency)):
         return case.failed_test_verdict()

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,22 @@ from discrepancy.verdict import Gate
 from .comparison import Comparison
 from .consistency_gate import check_consistency
 from .proof import check_held_out
+
+
+class _BlockSums(NamedTuple):
+    """Sums over the samples of one block of a trial.
+
+    Attributes
+    ----------
+    squares_without_effect, squares_with_effect : float
+        The squared residuals over the noise variance, without effect and with a hypothesis.
+    sample_count : float
+        The number of used samples, which is the expected sum of squares of the noise alone.
+    """
+
+    squares_without_effect: float
+    squares_with_effect: float
+    sample_count: float
 
 
 class SimulationComparison(Comparison[CandidateFit]):
@@ -70,14 +87,16 @@ class SimulationComparison(Comparison[CandidateFit]):
 
         Squared residuals are summed over blocks of the records, for the bootstrap of the share.
         """
-        without_effect = self.search.residuals(self.search.no_effect).trials
-        with_effect = self.search.residuals(hypothesis).trials
-        trials_before = _trials_in_role(without_effect, held_out=held_out)
-        trials_after = _trials_in_role(with_effect, held_out=held_out)
-        block_sums: list[list[float]] = []
+        residuals_before = self.search.residuals(self.search.no_effect)
+        residuals_after = self.search.residuals(hypothesis)
+        trials_before = _trials_in_role(residuals_before.trials, held_out=held_out)
+        trials_after = _trials_in_role(residuals_after.trials, held_out=held_out)
+        blocks: list[_BlockSums] = []
         for trial_before, trial_after in zip(trials_before, trials_after, strict=True):
-            block_sums += self._block_sums(trial_before, trial_after)
-        sums_before, sums_after, noise_sums = np.array(block_sums).T
+            blocks += self._block_sums(trial_before, trial_after)
+        sums_before = np.array([block.squares_without_effect for block in blocks])
+        sums_after = np.array([block.squares_with_effect for block in blocks])
+        noise_sums = np.array([block.sample_count for block in blocks])
         return GapShare(
             squares_before=sums_before,
             squares_after=sums_after,
@@ -90,34 +109,31 @@ class SimulationComparison(Comparison[CandidateFit]):
             is_tested=True,
         )
 
-    def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[list[float]]:
-        """Return sums over each block of a trial without and with a hypothesis.
+    def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[_BlockSums]:
+        """Return the sums over each block of a trial's samples.
 
-        Returns
-        -------
-        list of list of float
-            For each block the sums of squared residuals over the noise variance, without and with
-            the hypothesis, and the number of used samples, which is the expected sum of the noise.
+        Parameters
+        ----------
+        trial_before, trial_after : FittedTrial
+            The trial with its residuals without effect, and with those of a hypothesis.
         """
-        noise = trial_before.noise_deviation * [
-            self._noise_scales[name] for name in trial_before.trial.channels
-        ]
-        squares_before = np.where(trial_before.used, trial_before.residual / noise, 0.0) ** 2
-        squares_after = np.where(trial_after.used, trial_after.residual / noise, 0.0) ** 2
-        sample_count = len(trial_before.used)
+        is_used = trial_before.used
+        noise_scales = np.array([self._noise_scales[name] for name in trial_before.trial.channels])
+        noise_deviation = trial_before.noise_deviation * noise_scales
+        squares_before = np.where(is_used, trial_before.residual / noise_deviation, 0.0) ** 2
+        squares_after = np.where(trial_after.used, trial_after.residual / noise_deviation, 0.0) ** 2
+        sample_count = len(is_used)
         block_count = 1
         if trial_before.trial.is_dynamic:
             block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
-        sums_of_blocks = []
-        for block in np.array_split(np.arange(sample_count), block_count):
-            sums_of_blocks.append(
-                [
-                    float(squares_before[block].sum()),
-                    float(squares_after[block].sum()),
-                    float(trial_before.used[block].sum()),
-                ]
+        return [
+            _BlockSums(
+                float(squares_before[block].sum()),
+                float(squares_after[block].sum()),
+                float(is_used[block].sum()),
             )
-        return sums_of_blocks
+            for block in np.array_split(np.arange(sample_count), block_count)
+        ]
 
     def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).

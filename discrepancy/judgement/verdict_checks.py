@@ -185,13 +185,13 @@ def _value_with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
 
 
 def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
-    """Return the records of fitted trials in motion whose residuals are larger than the signal.
+    """Return the records in motion that the model does not fit, although their trials were fitted.
 
-    The size of the signal is the standard deviation of the readings about their mean. A channel may
-    show nothing but noise, so the rms residual must also exceed `VETO_NOISE_DEVIATIONS` noise
-    deviations.
+    The residuals of such a record are larger than the signal itself, whose size is the standard
+    deviation of the readings about their mean. A channel may show nothing but noise, so the rms
+    residual must also exceed `VETO_NOISE_DEVIATIONS` noise deviations.
     """
-    unfitted = []
+    unexplained_records = []
     for fitted_trial in residuals.trials:
         if fitted_trial.trial.held_out or not fitted_trial.trial.is_dynamic:
             continue
@@ -199,12 +199,15 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
             is_used = fitted_trial.used[:, column]
             if not is_used.any():
                 continue
-            rms = float(np.sqrt(np.mean(fitted_trial.residual[is_used, column] ** 2)))
-            deviation = float(np.std(fitted_trial.trial.values[is_used, column]))
-            noise = _noise_deviation(residuals, fitted_trial, column)
-            if rms > max(deviation, VETO_NOISE_DEVIATIONS * noise):
-                unfitted.append(UnfittedRecord(fitted_trial.trial.name, channel, rms, deviation))
-    return tuple(unfitted)
+            residual_rms = float(np.sqrt(np.mean(fitted_trial.residual[is_used, column] ** 2)))
+            signal_deviation = float(np.std(fitted_trial.trial.values[is_used, column]))
+            noise_deviation = _noise_deviation(residuals, fitted_trial, column)
+            if residual_rms > max(signal_deviation, VETO_NOISE_DEVIATIONS * noise_deviation):
+                record = UnfittedRecord(
+                    fitted_trial.trial.name, channel, residual_rms, signal_deviation
+                )
+                unexplained_records.append(record)
+    return tuple(unexplained_records)
 
 
 def _noise_deviation(residuals: ResidualSet, fitted_trial: FittedTrial, column: int) -> float:

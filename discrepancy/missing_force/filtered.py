@@ -359,7 +359,9 @@ class ForceFilter:
         # covariance of the state given all readings, see `smoother_corrections`
         posterior = covariances - covariances @ informations @ covariances
         # the rows are the deviations of all forces, then those of the speeds of their ports
-        force_deviations, speed_deviations = np.split(self._deviations(posterior), 2)
+        force_deviations, speed_deviations = np.split(
+            self._force_and_speed_deviations(posterior), 2
+        )
         # the filter's states are scaled: those of the structure come first, in `state_units`; a
         # force is in units of its standard deviation
         structure_states = states[:, : len(self.state_units)]
@@ -412,21 +414,23 @@ class ForceFilter:
             (np.stack(fine_states, axis=1).reshape(-1, state_count), means[-1:, :, 0])
         )
 
-    def _deviations(self, covariances: FloatArray) -> FloatArray:
+    def _force_and_speed_deviations(self, covariances: FloatArray) -> FloatArray:
         """Return the standard deviations (2 P, N) of the P forces, then of their ports' speeds.
 
         Parameters
         ----------
         covariances : (N, n, n) ndarray
-            The covariance of the state at each sample, given all readings.
+            The covariance of the scaled state at each sample, given all readings.
         """
         force_count = len(self.processes)
+        # Forces and speeds are linear in the state, which is scaled: the structure's states come
+        # first, in `state_units`; then each force, in units of its standard deviation.
+        structure = slice(0, len(self.state_units))
         output_rows = np.zeros((2 * force_count, covariances.shape[-1]))
-        for number, (port, process) in enumerate(self.processes):
-            output_rows[number, self.force_state_indices[number]] = process.standard_deviation
-            output_rows[force_count + number, : len(self.state_units)] = (
-                self.trial.system.speeds[port] * self.state_units
-            )
+        for position, (port, process) in enumerate(self.processes):
+            force_row, speed_row = output_rows[position], output_rows[force_count + position]
+            force_row[self.force_state_indices[position]] = process.standard_deviation
+            speed_row[structure] = self.trial.system.speeds[port] * self.state_units
         variances = np.sum((output_rows @ covariances) * output_rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
@@ -484,29 +488,33 @@ class Regression:
         precision : (len(unknowns),) array
             The prior precision of each of these unknowns.
         """
-        rows = np.array([0, *(1 + k for k in unknowns)])
+        # the row and column of the residual come first, then those of the chosen unknowns
+        rows = np.array([0, *(1 + unknown for unknown in unknowns)])
         products = self.products[np.ix_(rows, rows)]
+        products_of_unknowns = products[1:, 1:]
+        right_side = products[1:, 0]
         prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
-        column_scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior_precision)
+        column_scale = 1.0 / np.sqrt(np.diag(products_of_unknowns) + prior_precision)
         scale_of_pair = np.outer(column_scale, column_scale)
-        normal_matrix = (products[1:, 1:] + np.diag(prior_precision)) * scale_of_pair
-        unity = np.eye(len(prior_precision))
-        factor = cho_factor(normal_matrix + ROUNDING * unity)
-        residual = 0  # its row comes before those of the unknowns
-        right_side = products[1:, residual]
-        mean = column_scale * cho_solve(factor, column_scale * right_side)
-        covariance = scale_of_pair * cho_solve(factor, unity)
+        normal_matrix = (products_of_unknowns + np.diag(prior_precision)) * scale_of_pair
+        identity = np.eye(len(prior_precision))
+        cholesky, is_lower = cho_factor(normal_matrix + ROUNDING * identity)
+        mean = column_scale * cho_solve((cholesky, is_lower), column_scale * right_side)
+        covariance = scale_of_pair * cho_solve((cholesky, is_lower), identity)
         # Laplace's approximation of the evidence, which is exact for a linear model
         residual_weights = np.r_[1.0, -mean]
         misfit = float(
             residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
         )
-        evidence = -0.5 * misfit - self.half_log_determinant
-        # half the log determinant of the unscaled normal equations
-        log_determinant = np.sum(np.log(np.diag(factor[0]) / column_scale))
-        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior_precision)))
-        return Solution(evidence, mean, covariance)
+        half_log_det_of_normal_matrix = np.sum(np.log(np.diag(cholesky) / column_scale))
+        half_log_det_of_prior = 0.5 * np.sum(np.log(prior_precision))
+        log_evidence = (
+            -0.5 * misfit
+            - self.half_log_determinant
+            - float(half_log_det_of_normal_matrix - half_log_det_of_prior)
+        )
+        return Solution(log_evidence, mean, covariance)
 
 
 def integrate_out_last(
@@ -517,7 +525,7 @@ def integrate_out_last(
     Parameters
     ----------
     products : (..., W, W) array
-        The inner products of the whitened residual and the columns of the unknowns.
+        The inner products of the whitened residual (first) and the columns of the unknowns.
     half_log_determinants : (...) array
         Half the log determinants of the covariance of the readings [nat].
     precision : (L,) array
@@ -526,28 +534,26 @@ def integrate_out_last(
     Returns
     -------
     products : (..., W - L, W - L) array
-        The products with the last L columns projected out (Schur complement).
+        The products with the last L columns projected out.
     half_log_determinants : (...) array
         Half the log determinants, with the contribution of these unknowns [nat].
     """
     if not len(precision):
         return products, half_log_determinants
-    # Gaussian integral over the last unknowns: with A their block of the products plus their prior
-    # precisions P, the log determinant of the covariance grows by ln det A - ln det P
-    prior_precision = np.maximum(precision, LEAST_PRECISION)
-    kept_count = products.shape[-1] - len(prior_precision)
-    # Schur complement of the last columns
-    block_root = np.linalg.cholesky(
-        products[..., kept_count:, kept_count:] + np.diag(prior_precision)
-    )
-    projected = np.asarray(np.linalg.solve(block_root, products[..., kept_count:, :kept_count]))
-    half_log_det_of_block = np.log(np.diagonal(block_root, axis1=-2, axis2=-1)).sum(-1)
-    remaining_half_log_dets = (
-        half_log_determinants + half_log_det_of_block - 0.5 * np.log(prior_precision).sum()
-    )
-    return products[
-        ..., :kept_count, :kept_count
-    ] - projected.mT @ projected, remaining_half_log_dets
+    # The Gaussian integral over the last unknowns. Let A be their block of the products plus their
+    # prior precisions P, and B their block with the kept columns. The products become the Schur
+    # complement, less B^T A^-1 B, and the log determinant grows by ln det A - ln det P. A is at
+    # least P, so that P is kept from being exactly singular.
+    clipped_precision = np.maximum(precision, LEAST_PRECISION)
+    kept_count = products.shape[-1] - len(clipped_precision)
+    kept, last = slice(0, kept_count), slice(kept_count, None)
+    root_of_a = np.linalg.cholesky(products[..., last, last] + np.diag(clipped_precision))
+    whitened_b = np.asarray(np.linalg.solve(root_of_a, products[..., last, kept]))
+    schur_complement = products[..., kept, kept] - whitened_b.mT @ whitened_b
+    half_log_det_of_a = np.log(np.diagonal(root_of_a, axis1=-2, axis2=-1)).sum(-1)
+    half_log_det_of_p = 0.5 * np.log(clipped_precision).sum()
+    remaining_half_log_dets = half_log_determinants + half_log_det_of_a - half_log_det_of_p
+    return schur_complement, remaining_half_log_dets
 
 
 def sum_regressions(filters: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:

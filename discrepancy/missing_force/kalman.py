@@ -249,7 +249,7 @@ def filter_forward(
 
 
 @compiled
-def simulate_inputs(
+def state_under_inputs(
     substeps: int,
     transitions: FloatArray,
     by_input_at_begin: FloatArray,
@@ -258,7 +258,9 @@ def simulate_inputs(
     start: FloatArray,
     inputs: FloatArray,
 ) -> FloatArray:
-    """Return the state (F, n) at the fine stamps under inputs that are linear between these.
+    """Return the state (F, n) at the F fine stamps under inputs that are linear between these.
+
+    The loops over states and inputs are plain ones, as they are compiled.
 
     Parameters
     ----------
@@ -269,7 +271,7 @@ def simulate_inputs(
     by_input_at_begin, by_input_at_end : (J, n, d) ndarray
         The change of the state over a fine step for a unit of an input at its start, or at its end.
     step_of_sample : (N,) ndarray
-        The index of the length of the interval that ends at each sample.
+        For each sample the index, among the J lengths, of the interval that ends at it.
     start : (n,) ndarray
         The state at the first fine stamp.
     inputs : (F, d) ndarray
@@ -278,18 +280,18 @@ def simulate_inputs(
     n, input_count = by_input_at_begin.shape[1], inputs.shape[1]
     states = np.zeros((len(inputs), n))
     states[0] = start
-    for k in range(len(inputs) - 1):
-        step = step_of_sample[k // substeps + 1]
+    for stamp in range(len(inputs) - 1):
+        length = step_of_sample[stamp // substeps + 1]
         for i in range(n):
-            next_state = 0.0
+            next_value = 0.0
             for j in range(n):
-                next_state += transitions[step, i, j] * states[k, j]
-            for d in range(input_count):
-                next_state += (
-                    by_input_at_begin[step, i, d] * inputs[k, d]
-                    + by_input_at_end[step, i, d] * inputs[k + 1, d]
+                next_value += transitions[length, i, j] * states[stamp, j]
+            for k in range(input_count):
+                next_value += (
+                    by_input_at_begin[length, i, k] * inputs[stamp, k]
+                    + by_input_at_end[length, i, k] * inputs[stamp + 1, k]
                 )
-            states[k + 1, i] = next_state
+            states[stamp + 1, i] = next_value
     return states
 
 

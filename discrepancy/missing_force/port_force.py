@@ -354,21 +354,22 @@ def missing_force_of_verdict(
 def _hypothesis_of_fit(
     search: ForceSearch, hypotheses: Sequence[ForceHypothesis], fit: CandidateFit
 ) -> ForceHypothesis | None:
-    """Return the hypothesis on the missing force with the effects of a fit.
+    """Return the hypothesis whose effects are those of a fit, estimated from the missing force.
 
     Parameters
     ----------
     search : ForceSearch
         The search for the missing force.
     hypotheses : sequence of ForceHypothesis
-        The hypotheses that were fitted already; if none has the effects, one is fitted now.
+        The hypotheses that were estimated already; if none has these effects, one is estimated now.
     fit : CandidateFit
-        The fit of a hypothesis to all trials.
+        A fit by simulation.
 
     Returns
     -------
     ForceHypothesis or None
-        The hypothesis; None if the fit has no effects, or if they cannot act along the motion.
+        The hypothesis; None if the fit has no effects, or if their forces cannot be computed from
+        the motion that the readings show.
     """
     for hypothesis in hypotheses:
         if hypothesis.candidate.key == fit.candidate.key:

@@ -219,12 +219,14 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[Ga
     """
     layout = problem.shared
     unknowns = []
-    for index, channel_name in enumerate(layout.gain_channels):
+    for gain_index, channel_name in enumerate(layout.gain_channels):
         if channel_name in trial.channels:
-            number = layout.parameter_count + index
-            channel = trial.channels.index(channel_name)
-            scale = float(layout.scale[number]) / float(gains[channel])
-            unknowns.append(GainUnknown(number, channel, scale))
+            unknown_index = layout.parameter_count + gain_index
+            column = trial.channels.index(channel_name)
+            # the readings contain the present gain already, so that one scale of the unknown
+            # changes them by the fraction scale / gain
+            fraction = float(layout.scale[unknown_index]) / float(gains[column])
+            unknowns.append(GainUnknown(unknown_index, column, fraction))
     return unknowns
 
 

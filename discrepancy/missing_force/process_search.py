@@ -117,22 +117,22 @@ class ProcessSearch:
         high[:, _TIME] = np.clip(high[:, _TIME], log_shortest, log_longest)
         return cls(log_evidence, initial_processes, low, high)
 
-    def processes(self, logs: FloatArray) -> dict[int, Process]:
+    def processes(self, log_values: FloatArray) -> dict[int, Process]:
         """Return the processes whose sizes and times have logarithms (P, 2)."""
-        values = np.exp(logs).tolist()
+        values = np.exp(log_values).tolist()
         return {
             port: replace(process, standard_deviation=size, correlation_time=time)
             for (port, process), (size, time) in zip(self.initial.items(), values, strict=True)
         }
 
-    def log_posterior(self, logs: FloatArray) -> float:
+    def log_posterior(self, log_values: FloatArray) -> float:
         """Return the log of evidence times prior [nat] at logarithms (P, 2) of sizes and times."""
-        return self.log_evidence(self.processes(logs))
+        return self.log_evidence(self.processes(log_values))
 
     def most_probable(
         self, *, from_grid: bool, most_steps: int
     ) -> tuple[dict[int, Process], float]:
-        """Return the most probable processes, and the log of evidence times prior there [nat].
+        """Return the most probable processes, and their log of evidence times prior [nat].
 
         Parameters
         ----------
@@ -141,57 +141,61 @@ class ProcessSearch:
         most_steps : int
             The largest number of steps of Newton's method.
         """
-        logs = np.clip(logarithms(self.initial), self.low, self.high)
+        log_values = np.clip(logarithms(self.initial), self.low, self.high)
         if from_grid:
-            logs = self._best_of_grid(logs)
-        logs, value = self._climb(logs, most_steps)
-        return self.processes(logs), value
+            log_values = self._best_of_grid(log_values)
+        log_values, value = self._climb(log_values, most_steps)
+        return self.processes(log_values), value
 
-    def _best_of_grid(self, logs: FloatArray) -> FloatArray:
+    def _best_of_grid(self, log_values: FloatArray) -> FloatArray:
         """Return the logarithms (P, 2) of the highest log posterior on a grid about a given point.
 
         The grid of each port is searched in turn, with the other ports at their best values so far.
         """
-        for port in range(len(logs)):
+        for port in range(len(log_values)):
             candidates = []
             for factors in START_FACTORS:
-                candidate = logs.copy()
+                candidate = log_values.copy()
                 candidate[port] += factors
                 candidates.append(np.clip(candidate, self.low, self.high))
-            logs = max(candidates, key=self.log_posterior)
-        return logs
+            log_values = max(candidates, key=self.log_posterior)
+        return log_values
 
-    def _climb(self, logs: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
+    def _climb(self, log_values: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
         """Return the logarithms (P, 2) that Newton's method reaches, and the value there [nat].
 
         `most_steps` should be large enough to reach the maximum. The result of a search that ends
         before it depends on rounding errors; the maximum does not.
         """
-        value = self.log_posterior(logs)
-        offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
-        curvature = np.empty((logs.size, logs.size))
+        value = self.log_posterior(log_values)
+        offsets = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
+        curvature = np.empty((log_values.size, log_values.size))
         last_change = np.inf
         for _ in range(most_steps):
-            values_above = np.array([self.log_posterior(logs + offset) for offset in offsets])
-            values_below = np.array([self.log_posterior(logs - offset) for offset in offsets])
+            values_above = np.array([self.log_posterior(log_values + offset) for offset in offsets])
+            values_below = np.array([self.log_posterior(log_values - offset) for offset in offsets])
             # near the maximum the last curvature is accurate enough
             if last_change > DIFFERENCE:
-                curvature = self._curvature(logs, value, values_above, values_below)
+                curvature = self._curvature(log_values, value, values_above, values_below)
             if not np.isfinite((*curvature.flat, *values_above, *values_below)).all():
                 break
             # slope and curvature are both multiplied by DIFFERENCE ** 2, which cancels in the step
             step = self._newton_step(
-                logs, 0.5 * DIFFERENCE * (values_above - values_below), curvature
+                log_values, 0.5 * DIFFERENCE * (values_above - values_below), curvature
             )
-            next_logs, next_value = self._backtrack(logs, value, step)
+            next_log_values, next_value = self._backtrack(log_values, value, step)
             if next_value < value:
                 break
-            last_change = np.abs(next_logs - logs).max()
-            logs, value = next_logs, next_value
-        return logs, value
+            last_change = np.abs(next_log_values - log_values).max()
+            log_values, value = next_log_values, next_value
+        return log_values, value
 
     def _curvature(
-        self, logs: FloatArray, value: float, values_above: FloatArray, values_below: FloatArray
+        self,
+        log_values: FloatArray,
+        value: float,
+        values_above: FloatArray,
+        values_below: FloatArray,
     ) -> FloatArray:
         """Return the second differences (2 P, 2 P) of the value for all pairs of logarithms.
 
@@ -199,53 +203,53 @@ class ProcessSearch:
 
         Parameters
         ----------
-        logs : (P, 2) array
+        log_values : (P, 2) array
             The logarithms of the size and the correlation time of each of the P missing forces.
         value : float
             The log posterior density at these logarithms [nat].
         values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
-        logarithm_steps = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        logarithm_steps = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
         # on the diagonal: central differences; off the diagonal: forward differences in both
         curvature = np.diag(values_above + values_below - 2.0 * value)
-        for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
+        for i, k in zip(*np.triu_indices(log_values.size, 1), strict=True):
             value_with_both_larger = self.log_posterior(
-                logs + logarithm_steps[i] + logarithm_steps[k]
+                log_values + logarithm_steps[i] + logarithm_steps[k]
             )
             curvature[i, k] = value_with_both_larger - values_above[i] - values_above[k] + value
             curvature[k, i] = curvature[i, k]
         return curvature
 
     def _newton_step(
-        self, logs: FloatArray, slope: FloatArray, curvature: FloatArray
+        self, log_values: FloatArray, slope: FloatArray, curvature: FloatArray
     ) -> FloatArray:
         """Return a step (P, 2) of Newton's method towards the maximum, within the bounds.
 
         Parameters
         ----------
-        logs : (P, 2) array
+        log_values : (P, 2) array
             The logarithms of the size and the correlation time of each of the P missing forces.
         slope : (2 P,) array
             The gradient of the value, multiplied by `DIFFERENCE` squared.
         curvature : (2 P, 2 P) array
             The second derivatives of the value, multiplied by the same.
         """
-        may_rise = np.ravel(logs < self.high)
-        may_fall = np.ravel(logs > self.low)
+        may_rise = np.ravel(log_values < self.high)
+        may_fall = np.ravel(log_values > self.low)
         # a logarithm at its bound stays there if the value rises beyond the bound
         free_axes = np.flatnonzero(np.where(slope > 0.0, may_rise, may_fall))
         eigenvalues, eigenvectors = np.linalg.eigh(curvature[np.ix_(free_axes, free_axes)])
         # magnitudes of the eigenvalues: the step leads uphill where the value is convex, too
-        step = np.zeros(logs.size)
+        step = np.zeros(log_values.size)
         step[free_axes] = eigenvectors @ (
             eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), LEAST_DIVISOR)
         )
         length_ratio = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        return np.asarray(step.reshape(logs.shape) / length_ratio)
+        return np.asarray(step.reshape(log_values.shape) / length_ratio)
 
     def _backtrack(
-        self, logs: FloatArray, value: float, step: FloatArray
+        self, log_values: FloatArray, value: float, step: FloatArray
     ) -> tuple[FloatArray, float]:
         """Return logarithms (P, 2) of a larger value along a step, and the value (backtracking).
 
@@ -254,19 +258,19 @@ class ProcessSearch:
 
         Parameters
         ----------
-        logs : (P, 2) array
+        log_values : (P, 2) array
             The logarithms of the size and the correlation time of each of the P missing forces.
         value : float
             The log posterior density at these logarithms [nat].
         step : (P, 2) array
             The step of Newton's method in the logarithms.
         """
-        next_logs, next_value = logs, -np.inf
+        next_log_values, next_value = log_values, -np.inf
         while next_value < value and np.abs(step).max() > SHORTEST_STEP:
-            next_logs = np.clip(logs + step, self.low, self.high)
-            next_value = self.log_posterior(next_logs)
+            next_log_values = np.clip(log_values + step, self.low, self.high)
+            next_value = self.log_posterior(next_log_values)
             step = 0.5 * step
-        return next_logs, next_value
+        return next_log_values, next_value
 
 
 def logarithms(processes: Processes) -> FloatArray:

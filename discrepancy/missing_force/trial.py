@@ -24,7 +24,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.time_history import subdivide
 
-from .kalman import simulate_inputs
+from .kalman import state_under_inputs
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """The forces by port of a trial in which no force acts: an empty mapping."""
@@ -257,10 +257,11 @@ class PortedTrial:
 
     @cached_property
     def substep_matrices(self) -> SubstepMatrices:
-        """The matrices that advance the state over a substep.
+        """The matrices that advance the state over a substep (first-order hold).
 
-        One exponential of the system, with the input and its rate as further states, gives all of
-        them (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+        The state is extended by the input and by the rate of the input. One matrix exponential of
+        this larger system contains the transition and the response to both (Van Loan 1978, IEEE
+        Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
         lengths = self.intervals.lengths[:, None, None] / self.substeps
@@ -268,13 +269,15 @@ class PortedTrial:
         state, input_, input_rate = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
         blocks[:, state, state] = self.system.generator * lengths
         blocks[:, state, input_] = np.eye(n) * lengths
+        # time runs from 0 to 1 over the substep: a rate of one is a rise of the input by one
         blocks[:, input_, input_rate] = np.eye(n)
         exponential = expm(blocks)
         transition = np.ascontiguousarray(exponential[:, state, state])
         by_constant_input = np.ascontiguousarray(exponential[:, state, input_])
         by_rising_input = np.ascontiguousarray(exponential[:, state, input_rate])
-        # an input that rises from 0 to 1 stands for its value at the end of the step; a constant
-        # input minus a rising one falls from 1 to 0, which stands for its value at the start
+        # The weight of the input at the end of the substep is the response to a ramp from 0 to 1.
+        # The weight of the input at its start is the response to a ramp from 1 to 0, which is a
+        # constant minus a rising one.
         return SubstepMatrices(transition, by_constant_input - by_rising_input, by_rising_input)
 
     @cached_property
@@ -342,13 +345,15 @@ class PortedTrial:
     ) -> TrialColumn:
         """Return the change of the trial for a unit of a parameter that changes the system itself.
 
-        With the system s' = A s - b g of `PortedSystem` and its derivative (A', b') by the
-        parameter, the derivative d of the added state s obeys d' = A d + (A' s - b' g).
+        The added state s of `PortedSystem` obeys ds/dt = A s - b g. The derivative of this equation
+        by the parameter p is an equation for the sensitivity z = ds/dp:
+
+            dz/dt = A z + u,  u = dA/dp s - db/dp g.
 
         Parameters
         ----------
         system_derivative : PortedSystem
-            The derivative of the system by the parameter.
+            The derivative of the system by the parameter, with dA/dp and db/dp.
         added_state : (F, n) array
             The state s that missing forces and laws add, at the fine stamps.
         forces : mapping of int to (F,) array
@@ -359,17 +364,18 @@ class PortedTrial:
             inputs -= np.outer(force, system_derivative.actions[port])
         start = np.zeros(len(system_derivative.generator))
         if self.begins_at_rest:
+            # equilibrium A z + u = 0; a rigid motion makes A singular, hence least squares
             start = -np.linalg.lstsq(self.system.generator, inputs[0], rcond=1e-12)[0]
-        # all other states have no input and are left out
+        # each input acts on one state; inputs that are zero throughout are left out for speed
         driven_states = np.flatnonzero(np.any(inputs, axis=0))
-        state_derivative = self._state_under_inputs(
-            start, np.eye(len(start))[:, driven_states], inputs[:, driven_states]
+        directions = np.eye(len(start))[:, driven_states]
+        sensitivity = self._state_under_inputs(start, directions, inputs[:, driven_states])
+        # the parameter changes the readings by the state, and by the output equation itself
+        readings_by_output_equation = self.divide_by_noise(
+            self.outputs_of_state(system_derivative, added_state, forces)
         )
-        return TrialColumn(
-            self.readings_of_state(state_derivative)
-            + self.divide_by_noise(self.outputs_of_state(system_derivative, added_state, forces)),
-            state_derivative,
-        )
+        readings = self.readings_of_state(sensitivity) + readings_by_output_equation
+        return TrialColumn(readings, sensitivity)
 
     def _state_under_inputs(
         self,
@@ -398,7 +404,7 @@ class PortedTrial:
         matrices = self.substep_matrices
         if step_of_sample is None:
             step_of_sample = self.intervals.length_of_sample
-        states = simulate_inputs(
+        states = state_under_inputs(
             self.substeps,
             matrices.transitions,
             np.ascontiguousarray(matrices.by_input_at_begin @ directions),

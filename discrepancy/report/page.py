@@ -230,7 +230,7 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
         )
         cards.append((percent_with_interval(proof.closed), meaning))
     if force is not None and force.ordered_by and not tested_trials(force):
-        meaning = f"what orders it: {ordered_percent(force)} % of its variance"
+        meaning = f"what it follows: {ordered_percent(force)} % of its variance"
         cards.append((listing(force.ordered_by), meaning))
     if proof is not None and force is None:
         before, _, trials = proof_scores(proof)

@@ -116,21 +116,21 @@ def force_sentence(force: ForceAtPort) -> str:
         ahead = evidence - other_ports[nearest]
         more_or_less = "more" if ahead >= 0.0 else "less"
         comparison += f", {nats(abs(ahead))} {more_or_less} than at {nearest}"
-    sentence = f"{size} at {motion}{_order_phrase(force)} ({comparison})."
+    sentence = f"{size} at {motion}{_dependence_phrase(force)} ({comparison})."
     return f"{sentence} {_sentence_on_law(force)}".rstrip()
 
 
-def _order_phrase(force: ForceAtPort) -> str:
-    """Return by what a missing force without a law is ordered, as the end of a clause."""
+def _dependence_phrase(force: ForceAtPort) -> str:
+    """Return what a missing force without a law depends on, as the end of a clause."""
     if force.law:
         return ""
     if not force.ordered_by:
-        return ", ordered by none of displacement, velocity and time"
-    return f", ordered by {listing(force.ordered_by)} ({ordered_percent(force)} % of its variance)"
+        return "; it follows none of displacement, velocity and time"
+    return f"; {ordered_percent(force)} % of its variance follows {listing(force.ordered_by)}"
 
 
 def ordered_percent(force: ForceAtPort) -> str:
-    """Return the largest fraction of a missing force's variance that one variable orders, in %."""
+    """Return the largest fraction of a missing force's variance that follows one variable, in %."""
     return f"{100.0 * max(force.orders.values()):.0f}"
 
 

@@ -324,19 +324,25 @@ class LinearSystem:
         return np.where(is_above_rounding & is_flexible, residual_compliance, 0.0)
 
     def modal_forces(self, excitation: Excitation, time: FloatArray) -> FloatArray:
-        """Return the forces (T, M + P) on modes and drives at times (T,) [s].
+        """Return the forces (T, M + P) on M modes, then on P drives, at times (T,) [s].
 
-        Drives accelerate the modes by inertia: with u = modes + shapes of drives times a(t), the
-        mass times these shapes and the accelerations goes to the right-hand side. The force on a
-        drive is the force that gives the drive its prescribed acceleration.
+        A drive is a point with a prescribed motion d(t). With the shapes D of the drives and S of
+        the modes, the displacement is S q + D d, and the drives accelerate the modes by inertia:
+
+            q'' + ... = S^T loads - S^T M D d''.
+
+        A drive has a large mass m of its own and the coordinate sqrt(m) d. The force on it is that
+        which gives it its prescribed acceleration, so that no load changes it.
         """
         forces = excitation.loads_at(time, self.shapes_with_drives)
         if excitation.prescribed_motions:
             motions = excitation.prescribed_motions.values()
-            accelerations = np.transpose([motion.values_at(time, 2) for motion in motions])
+            accelerations = np.transpose(
+                [motion.values_at(time, derivative=2) for motion in motions]
+            )
             mode_count = len(self.angular_frequency)
-            inertia = self.drive_shapes.T @ self.mass @ self.shapes
-            forces[:, :mode_count] -= accelerations @ inertia
+            modal_inertia = self.drive_shapes.T @ self.mass @ self.shapes
+            forces[:, :mode_count] -= accelerations @ modal_inertia
             forces[:, mode_count:] = self.root_drive_mass * accelerations
         return forces
 

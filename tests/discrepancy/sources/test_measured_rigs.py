@@ -144,7 +144,7 @@ def test_the_place_of_what_a_pendulum_lacks_is_said(tmp_path):
     effects = chosen("coulomb_friction", "quadratic_damping", "clock_error")
     found = investigate(*rig("pendulum", tmp_path), effects, thorough=False)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
-    assert "is missing at 'pivot', ordered by" in found.verdict.sentence
+    assert "is missing at 'pivot'; " in found.verdict.sentence
     assert found.proof is None or found.proof.closed.value < 0.5
 
 
