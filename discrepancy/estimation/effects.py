@@ -159,9 +159,10 @@ class EffectLaws:
         return self.column_builder.trial_indices[trial_index]
 
     def _forces_of_patch(self, arguments: LawArguments, patch: ModelPatch) -> dict[int, LawForce]:
-        """Return the forces of a patch's laws along a trajectory, summed by the number of the port.
+        """Return the forces of a patch's laws along a trajectory, by the number of the port.
 
-        What is not a law at a port is left out of the patch.
+        The forces of several laws at one port are added. Other changes in the patch, such as those
+        of stiffness, are not forces at ports, and are ignored here.
         """
         trial = self.trials[arguments.trial_index]
         trajectory = arguments.trajectory
@@ -169,15 +170,17 @@ class EffectLaws:
         for law in self.column_builder.problem.model.forces_at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
-            port = trial.system.ports.index(law.port)
+            port_number = trial.system.ports.index(law.port)
             force = force_and_tangents(
                 law,
                 trial.fine_time,
-                trajectory.positions[:, port],
-                trajectory.speeds[:, port],
+                trajectory.positions[:, port_number],
+                trajectory.speeds[:, port_number],
                 arguments.speed_window,
             )
-            forces[port] = force.plus(forces[port]) if port in forces else force
+            if port_number in forces:
+                force = force.plus(forces[port_number])
+            forces[port_number] = force
         return forces
 
     # ------------------------------------------------------------ sensors

@@ -40,7 +40,7 @@ from .trial_data import TrialData, shared_unknowns, stand_in_deviation
 
 MOST_CACHED_RESPONSES = 2000
 """Number of responses that a problem keeps in memory."""
-LARGEST_CACHE = 48e6
+LARGEST_CACHE = 24e6
 """Largest memory of these responses; of long records fewer are kept [B]."""
 FEWEST_CACHED_RESPONSES = 40
 """Number of responses that are kept in any case: those of the derivatives of one fit."""

@@ -139,18 +139,18 @@ def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]
     values = layout.parameters(fit.point.shared)
     unknowns = []
     for parameter_index, parameter in enumerate(problem.model.parameters):
-        centre = float(layout.centre[parameter_index])
-        scale = float(layout.scale[parameter_index])
-        if scale <= 0.0:
+        stated_value = float(layout.centre[parameter_index])
+        prior_deviation = float(layout.scale[parameter_index])
+        if prior_deviation <= 0.0:  # no prior: nothing to be far from
             continue
         value = float(values[parameter_index])
         unknowns.append(
             MovedUnknown(
                 name=parameter.name,
-                stated=centre,
-                deviation=scale,
+                stated=stated_value,
+                deviation=prior_deviation,
                 value=value,
-                deviations=(value - centre) / scale,
+                deviations=(value - stated_value) / prior_deviation,
                 unit=parameter.unit,
             )
         )

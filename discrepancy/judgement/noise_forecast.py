@@ -25,7 +25,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import ScreenedChange
 from discrepancy.fits.trial_data import TrialData
 
-LARGEST_NOISE_FACTOR = 100.0
+LARGEST_NOISE_REDUCTION = 100.0
 """How many times smaller the noise may have to be; more is beyond any instrument."""
 LEAST_PART_IN_IMITATION = 0.2
 """Change of the readings by an unknown, over the largest one, from which the unknown is named."""
@@ -54,31 +54,33 @@ class NoiseForecast:
         self._prior_precision = equations.matrix - self._information
         self._names = _names_of_unknowns(problem)
 
-    def noise_factor(self, change: ScreenedChange, detection_distance: float) -> float:
+    def needed_noise_reduction(
+        self, change: ScreenedChange, squared_detection_distance: float
+    ) -> float:
         """Return how many times smaller the noise must be for an effect to be detected.
 
         Parameters
         ----------
         change : ScreenedChange
             The change of the readings by the effect.
-        detection_distance : float
+        squared_detection_distance : float
             The squared distance at which an effect is detected.
 
         Returns
         -------
         float
-            The factor; infinite if `LARGEST_NOISE_FACTOR` is not enough.
+            The reduction; infinite if `LARGEST_NOISE_REDUCTION` is not enough.
         """
 
-        def excess(noise_factor: float) -> float:
-            return self._squared_distance(change, noise_factor) - detection_distance
+        def excess(noise_reduction: float) -> float:
+            return self._squared_distance(change, noise_reduction) - squared_detection_distance
 
-        # the excess grows with the factor, so that it has one zero at most
-        if excess(LARGEST_NOISE_FACTOR) < 0.0:
+        # the excess grows with the reduction, so that it has one zero at most
+        if excess(LARGEST_NOISE_REDUCTION) < 0.0:
             return inf
         if excess(1.0) >= 0.0:
             return 1.0
-        return float(brentq(excess, 1.0, LARGEST_NOISE_FACTOR, rtol=1e-3))
+        return float(brentq(excess, 1.0, LARGEST_NOISE_REDUCTION, rtol=1e-3))
 
     def imitating_unknowns(self, change: ScreenedChange) -> tuple[str, ...]:
         """Return the unknowns that imitate the change by an effect at much smaller noise.
@@ -86,7 +88,7 @@ class NoiseForecast:
         Those that change the readings most come first. They are named with what is stated of them.
         """
         overlaps, _ = self._overlaps(change)
-        imitation = self._imitation(overlaps, LARGEST_NOISE_FACTOR)
+        imitation = self._imitation(overlaps, LARGEST_NOISE_REDUCTION)
         changes_of_readings = np.sqrt(np.diag(self._information)) * np.abs(imitation)
         by_name: dict[str, float] = {}
         for name, size in zip(self._names, changes_of_readings.tolist(), strict=True):
@@ -98,11 +100,11 @@ class NoiseForecast:
         ]
         return tuple(named_unknowns[:MOST_NAMED_UNKNOWNS]) if largest > 0.0 else ()
 
-    def _squared_distance(self, change: ScreenedChange, noise_factor: float) -> float:
-        """Return G(n) of the module docstring, where n is the square of the noise factor."""
+    def _squared_distance(self, change: ScreenedChange, noise_reduction: float) -> float:
+        """Return G(n) of the module docstring, where n is the square of the noise reduction."""
         overlaps, squared_change = self._overlaps(change)
-        imitation = self._imitation(overlaps, noise_factor)
-        return noise_factor**2 * (squared_change - float(overlaps @ imitation))
+        imitation = self._imitation(overlaps, noise_reduction)
+        return noise_reduction**2 * (squared_change - float(overlaps @ imitation))
 
     def _overlaps(self, change: ScreenedChange) -> tuple[FloatArray, float]:
         """Return J d (n,) and |d|^2 of a change."""
@@ -116,9 +118,9 @@ class NoiseForecast:
             squared_change += float(trial_change @ trial_change)
         return overlaps, squared_change
 
-    def _imitation(self, overlaps: FloatArray, noise_factor: float) -> FloatArray:
+    def _imitation(self, overlaps: FloatArray, noise_reduction: float) -> FloatArray:
         """Return the scaled unknowns (n,) that imitate a change with the overlaps J d (n,)."""
-        matrix = self._information + self._prior_precision / noise_factor**2
+        matrix = self._information + self._prior_precision / noise_reduction**2
         return np.asarray(np.linalg.solve(matrix, overlaps))
 
 

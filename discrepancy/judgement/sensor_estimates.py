@@ -25,9 +25,9 @@ def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimat
         The fit, with the posterior covariance of what the trials share.
     """
     estimates = _gain_estimates(problem, fit)
-    noise_precision = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
+    precision_ratios = problem.recorded_or_estimated_precisions(fit.squares_by_channel)
     for trial_index in range(len(problem.trials)):
-        estimates += _zero_estimates(problem, fit, trial_index, noise_precision)
+        estimates += _zero_offset_estimates(problem, fit, trial_index, precision_ratios)
     order = list(problem.campaign.channels)
     return tuple(sorted(estimates, key=lambda estimate: order.index(estimate.channel)))
 
@@ -53,27 +53,27 @@ def _gain_estimates(problem: Problem, fit: CandidateFit) -> list[SensorEstimate]
     return estimates
 
 
-def _zero_estimates(
-    problem: Problem, fit: CandidateFit, trial_index: int, noise_precision: FloatArray
+def _zero_offset_estimates(
+    problem: Problem, fit: CandidateFit, trial_index: int, precision_ratios: FloatArray
 ) -> list[SensorEstimate]:
-    """Return the zeros that were fitted in a trial; the stated value is zero.
+    """Return the zero offsets of the sensors that were fitted in a trial; they are stated as zero.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model.
     fit : CandidateFit
-        The fit.
+        The fit whose unknowns and covariance are read.
     trial_index : int
         The index of the trial.
-    noise_precision : (channels,) array
-        The estimated noise precision of each channel over the recorded one.
+    precision_ratios : (channels,) array
+        The ratio of the estimated to the recorded noise precision of each channel.
     """
     data = problem.trials[trial_index]
     layout = data.unknowns
     if not layout.zero_count:
         return []
-    deviations = layout.scale * _local_deviations(problem, fit, trial_index, noise_precision)
+    deviations = layout.scale * _local_deviations(problem, fit, trial_index, precision_ratios)
     values = layout.scale * fit.point.local[trial_index]
     estimates = []
     for index, column in enumerate(layout.zero_columns):
@@ -93,7 +93,7 @@ def _zero_estimates(
 
 
 def _local_deviations(
-    problem: Problem, fit: CandidateFit, trial_index: int, noise_precision: FloatArray
+    problem: Problem, fit: CandidateFit, trial_index: int, precision_ratios: FloatArray
 ) -> FloatArray:
     """Return the posterior standard deviations (L,) of the scaled unknowns of a trial.
 
@@ -101,7 +101,7 @@ def _local_deviations(
     of the normal equations. They follow a change of the shared unknowns, which adds the covariance
     of these.
     """
-    rows = trial_jacobian(problem, trial_index, fit, fit.candidate, noise_precision)
+    rows = trial_jacobian(problem, trial_index, fit, fit.candidate, precision_ratios)
     factor, local_per_shared = rows.eliminate_local()
     inverse_factor = np.linalg.inv(np.triu(factor))
     conditional_variance = np.sum(inverse_factor**2, axis=1)

@@ -378,8 +378,8 @@ def _with_forecast(
     # both distances count, since a large change may saturate
     small_distance = DETECTION_DISTANCE * small_reference.factor**2
     factor = max(
-        forecast.noise_factor(reference, DETECTION_DISTANCE),
-        forecast.noise_factor(small_reference.change, small_distance),
+        forecast.needed_noise_reduction(reference, DETECTION_DISTANCE),
+        forecast.needed_noise_reduction(small_reference.change, small_distance),
     )
     imitated_by = () if isfinite(factor) else forecast.imitating_unknowns(reference)
     return replace(row, noise_factor=factor, imitated_by=imitated_by)

@@ -103,25 +103,28 @@ class ForceHypothesis:
         return np.asarray(covariance + regression @ added_covariance @ regression.T)
 
     def _covariance_of_hidden_force(self) -> FloatArray:
-        """Return the covariance (E, E) that a hidden force adds to the effect parameters."""
-        added_covariance = np.zeros((len(self.effect),) * 2)
+        """Return the covariance (E, E) that a hidden force adds to the effect parameters.
+
+        A hidden force of variance v at a port looks like a change of the parameters whose laws act
+        there. Let M hold the mean products of their forces per unit. The changes x whose force
+        has about the hidden variance, x^T M x = v, have the covariance v (M + v I)^-1. For one
+        parameter this is nearly v / M, and never more than its prior variance of one. Hidden forces
+        at several ports are independent, so that their covariances add up.
+        """
+        effect_count = len(self.effect)
+        added_covariance = np.zeros((effect_count, effect_count))
         for port, process in self.processes.items():
-            forces_by_parameter = self._force_by_parameter(port)
-            acting_parameters = np.flatnonzero(forces_by_parameter.any(axis=1))
+            forces_per_unit = self._force_by_parameter(port)
+            acting_parameters = np.flatnonzero(forces_per_unit.any(axis=1))
             if not len(acting_parameters):
                 continue
             hidden_variance = (HIDDEN_SHARE * process.standard_deviation) ** 2
-            mean_products = (
-                forces_by_parameter[acting_parameters]
-                @ forces_by_parameter[acting_parameters].T
-                / forces_by_parameter.shape[1]
-            )
-            # With one parameter the added variance is (hidden variance) / (mean square force per
-            # unit), that of a change whose force has the hidden rms. The hidden variance in the
-            # denominator keeps it below the prior variance of one.
-            regularised = mean_products + hidden_variance * np.eye(len(acting_parameters))
+            acting_forces = forces_per_unit[acting_parameters]
+            sample_count = acting_forces.shape[1]
+            mean_products = acting_forces @ acting_forces.T / sample_count
+            prior_precision = np.eye(len(acting_parameters))
             added_covariance[np.ix_(acting_parameters, acting_parameters)] += (
-                hidden_variance * np.linalg.inv(regularised)
+                hidden_variance * np.linalg.inv(mean_products + hidden_variance * prior_precision)
             )
         return added_covariance
 

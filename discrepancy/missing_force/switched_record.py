@@ -154,7 +154,14 @@ class SwitchedRecord:
         It is the index in the matrices of `switched_step_matrices`.
         """
         was_on = np.r_[False, is_on[:-1]]
-        return np.asarray((2 * was_on + is_on) * self.length_count + self.length_of_sample)
+        return self._step_kind(was_on, is_on, self.length_of_sample)
+
+    def _step_kind(self, was_on: BoolArray, is_on: BoolArray, length: IntArray) -> IntArray:
+        """Return the kind of steps between samples at which the force was, and is, on or off.
+
+        The four cases follow each other: off, begins, ends, on. Each has one kind for each length.
+        """
+        return np.asarray((2 * was_on + is_on) * self.length_count + length)
 
     def products(self, is_on: BoolArray) -> TrialProducts:
         """Return the information of the trial on the shared unknowns, given a path (N,)."""
@@ -234,9 +241,9 @@ class SwitchedRecord:
         )
 
     def _steps_at_ends(self, is_on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps that end inverted stretches.
+        """Return transitions and noises (B, n, n) of the steps that lead out of inverted stretches.
 
-        Such a step leads to the first sample at which the path is not inverted any more.
+        Where a force that was off is tried as on, for example, the step at the end turns it off.
 
         Parameters
         ----------
@@ -246,13 +253,13 @@ class SwitchedRecord:
             The sample after the last sample of each stretch. No step follows the end of the
             record: its transition is the identity, without noise.
         """
-        # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
+        # the path is inverted up to the sample before the end, and not at the end
         is_last = ends == len(is_on)
-        end_sample = np.where(is_last, 0, ends)
-        was_on = ~is_on[ends - 1]
-        kind = (2 * was_on + is_on[end_sample]) * self.length_count + self.length_of_sample[
-            end_sample
-        ]
+        end_sample = np.where(is_last, 0, ends)  # any sample: the last ones are replaced below
+        inverted_before_end = ~is_on[ends - 1]
+        kind = self._step_kind(
+            inverted_before_end, is_on[end_sample], self.length_of_sample[end_sample]
+        )
         identity = np.eye(len(self.record_filter.output_rows[0]))
         transitions = np.where(
             is_last[:, None, None], identity, self.record_filter.transitions[kind]

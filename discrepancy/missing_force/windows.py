@@ -116,7 +116,10 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
 
 
 def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float:
-    """Return the log evidence of the laws of a fit at a port [nat]; -inf if it has none there.
+    """Return the log evidence of those laws of a fit that act at a port [nat].
+
+    These laws alone are fitted to the missing force at the port. The evidence is -inf if the fit
+    has no law there.
 
     Parameters
     ----------
@@ -127,12 +130,13 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     fit : CandidateFit
         The fit of a hypothesis to all trials.
     """
-    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
-    if not laws:
+    terms_at_port = [index for index, term in enumerate(fit.candidate.terms) if term.place == port]
+    if not terms_at_port:
         return -np.inf
-    candidate, effect = fit.candidate.subset_of_terms(laws, fit.effect)
-    law = search.fit_along_motion(search.hypothesis_by_port[port], candidate, effect)
-    return -np.inf if law is None else law.log_evidence
+    laws_at_port, parameters = fit.candidate.subset_of_terms(terms_at_port, fit.effect)
+    force_at_port = search.hypothesis_by_port[port]
+    law_fit = search.fit_along_motion(force_at_port, laws_at_port, parameters)
+    return -np.inf if law_fit is None else law_fit.log_evidence
 
 
 def windows_of_residuals(

@@ -83,11 +83,12 @@ class Search(FittedCandidates):
     def fit_one_more_effect(
         self, base: CandidateFit, effects: Iterable[Effect]
     ) -> list[CandidateFit]:
-        """Add each effect to a base, one at a time, and fit the sets by few steps.
+        """Add each effect to a base, one at a time, and fit the sets in a few steps.
 
-        The fits begin where the screen expects the least objective. Far from the truth the phases
-        of predictions drift away from those of the readings, and the screen, which is linear, does
-        not help; then fits also begin at points of a grid.
+        The fits begin where a screen, a linear prediction of what each effect gains, expects the
+        best fit. If the base is far from the truth, its phases drift away from those of the
+        readings, which no linear prediction can see. Fits then begin at the best points of a grid,
+        too.
 
         Parameters
         ----------
@@ -102,30 +103,32 @@ class Search(FittedCandidates):
             The best fit of each effect, in descending order of score.
         """
         effects = tuple(effects)
-        setting = self.problem.setting
-        screened_effects = effects
+        structural_effects: list[Effect] = []
+        reading_effects: list[Effect] = []
+        for effect in effects:
+            acts_on_structure = changes_structure(effect, self.problem.setting)
+            (structural_effects if acts_on_structure else reading_effects).append(effect)
+        has_large_residuals = self._has_large_residuals(base)
         # with large residuals a screen is used only for errors of readings, which shift no phases
-        if self._has_large_residuals(base):
-            screened_effects = tuple(
-                effect for effect in effects if not changes_structure(effect, setting)
-            )
+        screened_effects = reading_effects if has_large_residuals else effects
         fits = self._fit_from_screen(base, screened_effects)
-        # far from the truth: also from the best points of a grid
-        is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
-        if self._has_large_residuals(base) or (self._is_far_from_truth(base) and not is_explained):
+        # effects of the structure begin at a grid, too, where the screen is blind or found nothing
+        some_fit_passes = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
+        needs_grid = has_large_residuals or (self._is_far_from_truth(base) and not some_fit_passes)
+        if needs_grid:
             unbiased_base = self._with_unbiased_nuisances(base)
             starts_by_effect = []
-            for effect in effects:
-                if changes_structure(effect, setting):
-                    starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
-            starts_by_effect = [starts for starts in starts_by_effect if starts]
-            fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
-        # in ascending order of score, so that the best fit of each set replaces the others
+            for effect in structural_effects:
+                starts = grid_starts(self.problem, unbiased_base, effect)
+                if starts:
+                    starts_by_effect.append(starts)
+            fits += self._fit_from_starts(starts_by_effect, unbiased_base, least_gain=0.0)
+        # keep the best fit of each set of effects
         best_by_effects: dict[tuple[str, ...], CandidateFit] = {}
         for fit in sorted(fits, key=self.score):
             self.record_fit(fit, exact=False)
-            best_by_effects[fit.candidate.identifiers] = fit
-        return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
+            best_by_effects[fit.candidate.identifiers] = fit  # a later one has a higher score
+        return sorted(best_by_effects.values(), key=self.score, reverse=True)
 
     def _has_large_residuals(self, base: CandidateFit) -> bool:
         """Return whether χ² per sample of a fit is above `SEARCH.far_chi_square`."""

@@ -362,7 +362,7 @@ def refit_under_wide_noise(
 
 # ---------------------------------------------------------------- hypotheses compared under it
 
-MOST_ROUNDS = 3
+LARGEST_ROUND_COUNT = 3
 """Largest number of times that the wider noise is taken from another best hypothesis."""
 
 
@@ -372,14 +372,15 @@ def compare_under_wide_noise(search: Search) -> None:
     Sets `wide_problem` and `wide_fits` of the search, so that these fits alone are compared from
     then on. The fit without effect is always one of them. The others are chosen by their expected
     score, which is computed from their present residuals. If another hypothesis is the best one
-    under the wider noise, the noise is computed again from its residuals.
+    under the wider noise, the noise is computed again from its residuals, in at most
+    `LARGEST_ROUND_COUNT` rounds; after the last one the noise is that of the best fit before it.
     """
     best_fit = search.best()
-    probable_fits = _most_probable_sets(search)
-    for _ in range(MOST_ROUNDS):
+    probable_fits = _best_fits_of_probable_sets(search)
+    for _ in range(LARGEST_ROUND_COUNT):
         process = estimate_residual_process(search.problem, best_fit)
         search.wide_problem = with_wide_noise(search.problem, process)
-        search.wide_fits = {}
+        search.wide_fits = {}  # those of the last round were made under another noise
         wide_fits = _fit_under_wide_noise(search, search.wide_problem, probable_fits)
         best_wide_fit = max(wide_fits.values(), key=search.score)
         if best_wide_fit.candidate.key == best_fit.candidate.key:
@@ -388,7 +389,7 @@ def compare_under_wide_noise(search: Search) -> None:
     search.wide_fits = wide_fits
 
 
-def _most_probable_sets(search: Search) -> list[CandidateFit]:
+def _best_fits_of_probable_sets(search: Search) -> list[CandidateFit]:
     """Return the best fits of the most probable sets of one, two and three effects.
 
     Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
 
 import numpy as np
 
@@ -28,9 +28,21 @@ from fe.runtime.state import Losses
 from reporting.memory import ResultCache
 from reporting.words import brief, capital, comma_list, counted
 
+RESPONSE_CACHE_BYTES = 24_000_000
+"""Largest memory of the responses that a model keeps [B]; the least recently used goes first."""
 MOST_RESPONSES = 400
-"""Number of responses that a model keeps; the oldest goes first."""
+"""Largest number of these responses, which short records reach before the memory is full."""
 NO_PATCH = ModelPatch()
+
+
+def _weight_of_response(kept: object) -> int:
+    """Return the weight [B] of a trial with its response in the cache of a model.
+
+    A short response weighs as much as if `MOST_RESPONSES` of its kind filled the cache.
+    """
+    _, response = cast(tuple[Trial, Response], kept)
+    size = response.values.nbytes + (0 if response.rates is None else response.rates.nbytes)
+    return max(size, RESPONSE_CACHE_BYTES // MOST_RESPONSES)
 
 
 class Model(ABC):
@@ -414,7 +426,7 @@ class Model(ABC):
         """Return the model as one that keeps responses: many sensors are tried on one motion."""
         if self._responses is not None:
             return self
-        return self._copy_with(_responses=ResultCache(MOST_RESPONSES))
+        return self._copy_with(_responses=ResultCache(RESPONSE_CACHE_BYTES, _weight_of_response))
 
     def with_patch(
         self,

@@ -75,7 +75,9 @@ BLOCKS = {
     "flow_of_displacements": Block(0, rows_of_states=True, columns_of_states=False),
 }
 """Matrices in the equation of all unknowns."""
-LOOSE = "; a structure that can float away has no static response: set `free = true` if it can"
+ADVICE_FOR_FREE_STRUCTURE = (
+    "; a structure that can float away has no static response: set `free = true` if it can"
+)
 
 
 def _is_definite(matrix: FloatArray) -> bool:
@@ -281,7 +283,11 @@ class LumpedDescription(ModelDescription):
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
     def _matrix_faults(self, kind: str) -> Iterator[Fault]:
-        """Yield the rules on the size, symmetry and definiteness of the matrices of a kind."""
+        """Yield the rules on the size, symmetry and definiteness of the matrices of a kind.
+
+        Each is a pair: whether the rule is broken, and the message. The first broken rule ends the
+        check of a file, so that a later rule may rely on those before it, as on the size here.
+        """
         block = BLOCKS[kind]
         rows = self.state_count if block.rows_of_states else self.displacement_count
         columns = self.state_count if block.columns_of_states else self.displacement_count
@@ -294,20 +300,20 @@ class LumpedDescription(ModelDescription):
                 f"{place} must be a {rows} x {columns} matrix{form}",
             )
             values = np.array(matrix)
-            tolerance = -1e-9 * np.abs(values).max()
+            tolerance = 1e-9 * np.abs(values).max()
             if kind in SYMMETRIC:
-                is_skewed = np.min(-np.abs(values - values.T)) < tolerance
-                yield is_skewed, f"{place} must be symmetric"
+                is_asymmetric = np.abs(values - values.T).max() > tolerance
+                yield is_asymmetric, f"{place} must be symmetric"
             if kind == "damping":
-                feeds_energy = np.linalg.eigvalsh(values)[0] < tolerance
+                feeds_energy = np.linalg.eigvalsh(values)[0] < -tolerance
                 yield feeds_energy, f"{place} must not feed energy: it has a negative eigenvalue"
         if matrices and kind in ("mass", "stiffness", "capacity"):
             eigenvalues = np.linalg.eigvalsh(np.sum([*matrices.values()], axis=0))
             may_be_singular = kind == "stiffness" and self.free
             is_semidefinite = eigenvalues[0] >= -1e-9 * eigenvalues[-1]
-            is_sound = eigenvalues[0] > 0.0 or (may_be_singular and is_semidefinite)
-            advice = LOOSE if kind == "stiffness" else ""
-            yield not is_sound, f"{kind} (with its parts) must be positive definite{advice}"
+            is_definite = eigenvalues[0] > 0.0 or (may_be_singular and is_semidefinite)
+            advice = ADVICE_FOR_FREE_STRUCTURE if kind == "stiffness" else ""
+            yield not is_definite, f"{kind} (with its parts) must be positive definite{advice}"
 
     @staticmethod
     def _place_of_matrix(kind: str, name: str) -> str:

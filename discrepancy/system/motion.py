@@ -129,7 +129,7 @@ class Motion:
 
         Modes without inertia contribute only to outputs that are not differentiated.
         """
-        values, rates = self._part_of_derivatives(equations)
+        values, rates = self._outputs_of_modal_motion(equations)
         if self.system.is_truncated:
             values += self._displacements_without_inertia(
                 np.array([equation.rows[0] for equation in equations])
@@ -146,24 +146,26 @@ class Motion:
                 rates[:, column] = np.gradient(values[:, column], self.time)
         return Response(values, rates)
 
-    def _part_of_derivatives(
+    def _outputs_of_modal_motion(
         self, equations: Sequence[OutputEquation]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the part of outputs that depends on the modal coordinates and their derivatives.
+        """Return what the modal coordinates and their derivatives contribute to outputs.
 
         Returns
         -------
         values, rates : (N, C) arrays
-            This part of each output, and its time derivative. The derivative of the third
-            derivative of the coordinates is left out of the rates.
+            This part of each output, and its time derivative. The fourth derivative of the
+            coordinates is neglected in the rates.
         """
         rows_by_derivative = rows_in_coordinates(equations, self.system.shapes_with_drives)
         is_needed = [bool(np.any(derivative_rows)) for derivative_rows in rows_by_derivative]
+        # the rate of an output of one derivative needs the next higher derivative
         derivatives = [self.q, self.velocity]
         if any(is_needed[1:]):
             derivatives.append(self.acceleration)
         if any(is_needed[2:]):
-            derivatives.append(np.gradient(self.acceleration, self.time, axis=0))
+            jerk = np.gradient(self.acceleration, self.time, axis=0)
+            derivatives.append(jerk)
         values = np.zeros((len(self.time), len(equations)))
         rates = np.zeros((len(self.time), len(equations)))
         for order, derivative_rows in enumerate(rows_by_derivative):

@@ -110,7 +110,8 @@ def observe(
         If a sensor primitive names a channel that does not exist or has values that no sensor can
         have.
     """
-    patch = (_sensors_by_channel(model.built_in_sensors, campaign) + patch).in_trial(trial.name)
+    built_in_sensors = _with_channel_names(model.built_in_sensors, campaign)
+    patch = (built_in_sensors + patch).in_trial(trial.name)
     trial, patch = shift_clock_to_first_sample(trial, patch)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, campaign.outputs(trial), patch, conditions)
@@ -252,19 +253,21 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
     return tuple(campaign.loggers[logger])
 
 
-def _sensors_by_channel(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
+def _with_channel_names(sensor_patch: ModelPatch, campaign: Campaign) -> ModelPatch:
     """Return sensor primitives that name channels, not model outputs.
 
-    A primitive that names a model output is replaced by one for each channel that measures it.
+    A primitive that names a model output is replaced by one for each channel that measures it. An
+    output that no channel measures needs none.
     """
     primitives: list[Primitive] = []
-    for primitive in sensors:
-        name = getattr(primitive, "channel", EVERY_CHANNEL)
-        if name == EVERY_CHANNEL or name in campaign.channels:
+    for primitive in sensor_patch:
+        # a primitive without a channel, such as a clock, acts on all of them
+        channel_or_output = getattr(primitive, "channel", EVERY_CHANNEL)
+        if channel_or_output == EVERY_CHANNEL or channel_or_output in campaign.channels:
             primitives.append(primitive)
             continue
         for channel_name, channel in campaign.channels.items():
-            if channel.output == name:
+            if channel.output == channel_or_output:
                 primitives.append(replace(primitive, channel=channel_name))  # type: ignore[call-arg]
     return ModelPatch(tuple(primitives))
 

@@ -338,16 +338,16 @@ class SystemModel(Model):
             Values of the calibrated parameters.
         """
         patch = self.patch.in_trial(trial.name)  # the change of the model that holds in the trial
-        # A dynamic trial is simulated with the matrices at its start: the stiffness losses of its
-        # first row are enough.
-        health = trial.health[:1]
-        mean_conditions = Conditions(self.prior_mean(), health=health)
-        case_at_mean = self.patched_trial(trial, mean_conditions, patch)
-        modes_at_mean = self.excited_system(case_at_mean).system.shapes
-        case = self.patched_trial(trial, Conditions(parameters, health=health), patch)
+        # the health of a structure is its stiffness losses, with one row for each time; a dynamic
+        # trial is simulated with the matrices at its start
+        losses_at_start = trial.health[:1]
+        conditions_at_mean = Conditions(self.prior_mean(), health=losses_at_start)
+        case_at_mean = self.patched_trial(trial, conditions_at_mean, patch)
+        system_at_mean, _ = self.excited_system(case_at_mean)
+        case = self.patched_trial(trial, Conditions(parameters, health=losses_at_start), patch)
         system, excitation = self.excited_system(case)
         equations = self.output_equations(case, outputs, excitation)
-        return ported_system(system, equations, modes_at_mean)
+        return ported_system(system, equations, system_at_mean.shapes)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
@@ -471,16 +471,23 @@ class SystemModel(Model):
     def _scales_of_held_structure(
         self, system: LinearSystem, state: SystemState, campaign: Campaign
     ) -> GlobalScales:
-        """Return the scales of a structure that springs hold, at its reference load place."""
+        """Return the scales of a structure that is supported by springs.
+
+        They are seen from the reference load place of the model, or else from the place of the
+        first load in the campaign.
+        """
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
         load_row = self.force_row(self.reference or places[0], state)
-        participation = float(load_row @ system.shapes[:, 0]) ** 2
+        (displacements,) = system.equilibrium_under(load_row[None])
+        static_deflection = float(load_row @ displacements)
         # Mass of the first mode, referred to the load point: its shape is scaled to a modal mass of
         # 1, so a unit displacement of the load point needs the modal coordinate 1 / (row . shape).
-        modal_mass = 1.0 / participation if participation else float(np.trace(system.mass))
+        shape_at_load = float(load_row @ system.shapes[:, 0])
+        # the first mode may not move the load point; all mass is then of the right order
+        mass_at_load = 1.0 / shape_at_load**2 if shape_at_load else float(np.trace(system.mass))
         return GlobalScales(
-            stiffness=1.0 / float(load_row @ system.equilibrium_under(load_row[None])[0]),
-            mass=modal_mass,
+            stiffness=1.0 / static_deflection,
+            mass=mass_at_load,
             angular_frequency=float(system.angular_frequency[0]),
         )
 

@@ -79,20 +79,22 @@ class RecordedHistory:
         time : (N,) ndarray
             The times of the samples [s].
         derivative : int
-            The order of the time derivative. Without a smooth course it is 0 or 1.
+            The order of the time derivative: 0 or 1 unless the course is `SMOOTH`.
         """
         if self.hold is Hold.SMOOTH:
-            # a load keeps its first and last value outside of the record; a motion goes on
             is_load = self.motion_order is None
-            is_inside = np.clip(time, self.time[0], self.time[-1]) if is_load else time
-            return np.asarray(self._spline(is_inside, derivative))
-        if self.hold is not Hold.ZERO_ORDER and derivative == 0:
+            if is_load:  # it keeps its first and last value outside of the record
+                time = np.clip(time, self.time[0], self.time[-1])
+            # the spline continues a motion beyond the record
+            return np.asarray(self._spline(time, derivative))
+        is_linear = self.hold is not Hold.ZERO_ORDER
+        if is_linear and derivative == 0:
             return np.asarray(np.interp(time, self.time, self.values))
         if derivative == 0:
             step_values = self.values
         else:
-            # slopes of the straight lines between the samples; zero after the last sample, by a
-            # rise of zero over an infinite interval
+            # the slope of the straight line that begins at each sample; after the last sample it is
+            # zero: no rise over an infinite interval
             rises = np.diff(self.values, append=self.values[-1])
             step_values = rises / np.diff(self.time, append=np.inf)
         # the last sample before each time; slightly earlier, because times at a jump are rounded

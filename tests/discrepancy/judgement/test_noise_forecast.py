@@ -5,7 +5,7 @@ from math import isinf, sqrt
 
 import pytest
 
-from discrepancy.judgement.noise_forecast import LARGEST_NOISE_FACTOR
+from discrepancy.judgement.noise_forecast import LARGEST_NOISE_REDUCTION
 from discrepancy.judgement.separability import DETECTION_DISTANCE, compute_separability
 from discrepancy.report.decidability_text import campaign_needs
 from tests.discrepancy.rigs import chosen, setting_of, simulated
@@ -90,7 +90,7 @@ def test_the_gains_that_hide_an_effect_are_told(hidden_by_gains):
 
 
 def test_an_effect_that_gains_hide_shows_with_closer_gains_and_not_with_less_noise(campaign, beam_model):
-    quiet = with_noise_and_gains(campaign, 1.0 / LARGEST_NOISE_FACTOR, HIDING_GAIN)
+    quiet = with_noise_and_gains(campaign, 1.0 / LARGEST_NOISE_REDUCTION, HIDING_GAIN)
     calibrated = with_noise_and_gains(campaign, 1.0, 0.005)
     assert detectability_of_loss(quiet, beam_model)[0].distance < DETECTION_DISTANCE
     assert detectability_of_loss(calibrated, beam_model)[0].distance > DETECTION_DISTANCE
