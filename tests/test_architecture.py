@@ -121,24 +121,42 @@ def test_the_page_has_the_modules_of_every_package_that_has_layers_inside():
     assert set(MODULE_TABLES) == {"fe", "fmu_asset", "calibration", "twin_master", "discrepancy"}
 
 
+@cache
+def listed_modules(package: str) -> tuple[str, ...]:
+    """Return the modules of a package's table, from the lowest up."""
+    first_columns = [row.split(" | ")[0] for row in MODULE_TABLES[package].splitlines()]
+    return tuple(chain.from_iterable(re.findall(r"`(\w+)`", column) for column in first_columns))
+
+
+@cache
+def modules_by_file(package: str) -> dict[str, str]:
+    """Return the module of each file of a package, by the dotted name of the file."""
+    return {name: name.split(".")[1] for name in source_files() if name.startswith(f"{package}.")}
+
+
+@pytest.mark.parametrize("package", sorted(MODULE_TABLES))
+def test_the_table_of_a_package_has_each_of_its_modules_once(package):
+    listed = listed_modules(package)
+    assert len(set(listed) - {"errors"}) == len(listed), "a module stands in the table twice"
+    missing = set(modules_by_file(package).values()) - {"errors", *listed}
+    assert not missing, "a module is missing in the table"
+
+
+@pytest.mark.parametrize("package", sorted(MODULE_TABLES))
+def test_the_modules_of_a_table_exist(package):
+    listed = listed_modules(package)
+    folders = {module for module in listed if (ROOT / package / module).is_dir()}
+    assert folders | set(modules_by_file(package).values()) >= set(listed)
+
+
 @pytest.mark.parametrize("package", sorted(MODULE_TABLES))
 def test_modules_import_modules_below_them_only(package):
-    files = source_files()
-    listed = [
-        module
-        for row in MODULE_TABLES[package].splitlines()
-        for module in re.findall(r"`(\w+)`", row.split(" | ")[0])
-    ]
-    height = {module: number for number, module in enumerate(("errors", *listed))}
-    module_of = {name: name.split(".")[1] for name in files if name.startswith(f"{package}.")}
-    assert len(height) == len(listed) + 1, "a module stands in the table twice"
-    assert set(module_of.values()) <= set(height), "a module is missing in the table"
-    folders = {module for module in listed if (ROOT / package / module).is_dir()}
-    assert folders | set(module_of.values()) >= set(listed), "a module of the table does not exist"
+    height = {module: number for number, module in enumerate(("errors", *listed_modules(package)))}
+    module_of = modules_by_file(package)
     wrong = [
         f"{name} imports {other}"
         for name, module in module_of.items()
-        for other in imported(name, files[name])
+        for other in imported(name, source_files()[name])
         if other in module_of and height[module_of[other]] > height[module]
     ]
     assert not wrong

@@ -10,6 +10,7 @@ import pytest
 import benchmarks.blind
 from benchmarks.blind.cases import (
     DETECTABLE,
+    Case,
     Order,
     Workbench,
     finite_signals,
@@ -88,24 +89,59 @@ def test_a_hidden_effect_shows_as_its_patch_in_the_model(rig, draw):
     assert seen > 0.6
 
 
-def test_written_case_is_detectable_and_repeats_and_tells_nothing_and_seals_everything(tmp_path):
-    order = Order("case-0007", "catalogue", "lumped", ("coulomb_friction",), 5)
-    case, again = make_case(order), make_case(order)
-    assert case.truth == again.truth
-    assert case.truth["d2"]["coulomb_friction"] >= DETECTABLE
-    for name, values in case.measured.values.items():
+ORDER = Order("case-0007", "catalogue", "lumped", ("coulomb_friction",), 5)
+
+
+@pytest.fixture(scope="module")
+def friction_case() -> Case:
+    """A rig with hidden friction and its readings."""
+    return make_case(ORDER)
+
+
+@pytest.fixture(scope="module")
+def sealed_folder(friction_case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the truth of that case lies, beside the campaign that is given away."""
+    folder = tmp_path_factory.mktemp("friction")
+    write_case(friction_case, folder / "campaigns", folder / "sealed")
+    return folder / "sealed"
+
+
+@pytest.fixture(scope="module")
+def written_campaign(sealed_folder: Path) -> Path:
+    """The folder of the campaign of that case."""
+    return sealed_folder.parent / "campaigns" / ORDER.name
+
+
+def test_a_case_repeats(friction_case):
+    again = make_case(ORDER)
+    assert friction_case.truth == again.truth
+    for name, values in friction_case.measured.values.items():
         np.testing.assert_array_equal(values, again.measured.values[name])
-    write_case(case, tmp_path / "campaigns", tmp_path / "sealed")
-    folder = tmp_path / "campaigns" / "case-0007"
-    text = "".join(file.read_text(encoding="utf-8") for file in sorted(folder.iterdir()))
+
+
+def test_a_hidden_effect_is_detectable(friction_case):
+    assert friction_case.truth["d2"]["coulomb_friction"] >= DETECTABLE
+
+
+def test_a_written_campaign_names_no_effect(written_campaign):
+    text = "".join(file.read_text(encoding="utf-8") for file in sorted(written_campaign.iterdir()))
     assert not any(identifier in text for identifier in set(DRAWS) - {"load_place"})  # a key
-    assert (folder / "model.toml").read_text(encoding="utf-8") == model_text()
-    sealed = json.loads((tmp_path / "sealed" / "case-0007.json").read_text(encoding="utf-8"))
+
+
+def test_a_written_campaign_has_the_model_without_effects(written_campaign):
+    assert (written_campaign / "model.toml").read_text(encoding="utf-8") == model_text()
+
+
+def test_the_sealed_file_names_what_is_hidden(sealed_folder):
+    sealed = json.loads((sealed_folder / f"{ORDER.name}.json").read_text(encoding="utf-8"))
     assert sealed["identifiers"] == ["coulomb_friction"]
-    rows = np.loadtxt(folder / "05.csv", delimiter=",", skiprows=1)
-    trial = case.plan.trials[4]
+
+
+def test_the_written_rows_are_those_that_were_measured(friction_case, written_campaign):
+    rows = np.loadtxt(written_campaign / "05.csv", delimiter=",", skiprows=1)
+    trial = friction_case.plan.trials[4]
     np.testing.assert_allclose(rows[:, 0], trial.rows, atol=1e-9)
-    np.testing.assert_allclose(rows[:, 1:], case.measured.values[trial.name], rtol=1e-6)
+    np.testing.assert_allclose(rows[:, 1:], friction_case.measured.values[trial.name], rtol=1e-6)
 
 
 def test_generators_share_no_code_with_what_names():

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -52,10 +52,11 @@ print("USES", json.dumps(uses))
 """
 
 
-@pytest.fixture
-def example_folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def example_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder where pip has installed the example of the page."""
-    source, target = tmp_path / "source", tmp_path / "installed"
+    folder = tmp_path_factory.mktemp("example")
+    source, target = folder / "source", folder / "installed"
     shutil.copytree(EXAMPLE, source)
     options = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet"]
     command = [sys.executable, "-m", "pip", "install", *options, "--target", target, source]
@@ -98,31 +99,60 @@ def test_a_run_is_resumed_beside_plug_ins_that_were_installed_since(tmp_path):
     check_versions(tmp_path, config, 0)
 
 
-@pytest.mark.slow
-def test_the_example_of_the_page_adds_one_of_each(example_folder, tmp_path):
+class RunWithPlugIns(NamedTuple):
+    """What a process said of the plug-ins that it used, and the plug-ins that its run recorded."""
+
+    uses: dict[str, Any]
+    recorded: dict[str, str]
+
+
+@pytest.fixture(scope="module")
+def run_with_plug_ins(example_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> RunWithPlugIns:
+    """A mission with one plug-in of each kind, in a process that finds them as installed."""
+    folder = tmp_path_factory.mktemp("run_with_plug_ins") / "run"
     run = subprocess.run(
-        [sys.executable, "-c", USE_OF_ALL, EXAMPLE / "bar.toml", tmp_path / "run"],
+        [sys.executable, "-c", USE_OF_ALL, EXAMPLE / "bar.toml", folder],
         env={**os.environ, "PYTHONPATH": str(example_folder)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert run.returncode == 0, run.stderr
-    uses = json.loads(run.stdout.partition("USES")[2])
-    config = json.loads((tmp_path / "run" / "config.json").read_text(encoding="utf-8"))
-    recorded = config["provenance"]["plug_ins"]
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    return RunWithPlugIns(json.loads(run.stdout.partition("USES")[2]), config["provenance"]["plug_ins"])
+
+
+@pytest.mark.slow
+def test_a_run_records_its_plug_ins(run_with_plug_ins):
+    recorded = run_with_plug_ins.recorded
     assert set(recorded.values()) == {"bar-plug-in 1.0"}
     assert {"uav_twin.laws: saturating_spring", "uav_twin.estimators: wary"} < set(recorded)
 
+
+@pytest.mark.slow
+def test_the_example_of_the_page_adds_a_law(run_with_plug_ins):
     slope_at_rest = 2.0 / 0.1
     ratio = np.tanh(0.5)
-    np.testing.assert_allclose(uses["force"], [2.0 * ratio, slope_at_rest * (1.0 - ratio**2)])
+    expected = [2.0 * ratio, slope_at_rest * (1.0 - ratio**2)]
+    np.testing.assert_allclose(run_with_plug_ins.uses["force"], expected)
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_adds_an_effect_an_asset_and_a_belief(run_with_plug_ins):
+    uses = run_with_plug_ins.uses
     assert uses["effects"][-1] == "saturating_support"
     assert (uses["asset"], uses["belief"]) == ("bar", "bar")
-    # The bar has lost 20 % from step 4 on. The estimator leaves out the last observation, so that
-    # the belief only worsens by the probability 0.1 of one more level of 20 %.
-    assert uses["believed"][-2] == pytest.approx(0.2, abs=0.003)
-    assert uses["believed"][-1] - uses["believed"][-2] == pytest.approx(0.02, abs=0.001)
+
+
+@pytest.mark.slow
+def test_the_example_of_the_page_adds_a_sensor_model_and_an_estimator(run_with_plug_ins):
+    """The bar has lost 20 % from step 4 on. The estimator leaves out the last observation.
+
+    So the belief only worsens by the probability 0.1 of one more level of 20 %.
+    """
+    *_, second_last, last = run_with_plug_ins.uses["believed"]
+    assert second_last == pytest.approx(0.2, abs=0.003)
+    assert last - second_last == pytest.approx(0.02, abs=0.001)
 
 
 # ---------------------------------------------------------------------- packages that do not fit

@@ -317,12 +317,18 @@ def test_the_wing_has_the_weight_of_its_parts(shipped_operators):
 # ---------------------------------------------------------------- balances and convergence
 
 
-def test_sums_of_the_coarse_wing_agree(coarse_operators):
-    checks = list(wing_checks.balance_checks(coarse_operators))
+@pytest.fixture(scope="module")
+def balances(coarse_operators):
+    return list(wing_checks.balance_checks(coarse_operators))
 
-    names = [check.name for check in checks]
+
+def test_every_sum_of_the_wing_has_a_name(balances):
+    names = [check.name for check in balances]
     assert names[1:] == ["mass", "reaction", "root moment", "energy and work"]
-    for check in checks:
+
+
+def test_sums_of_the_coarse_wing_agree(balances):
+    for check in balances:
         assert check.limit is not None, check.name
         assert check.passed, check.name
         assert check.value < 1e-6, check.name
@@ -348,17 +354,25 @@ def test_the_first_figures_have_an_order_or_say_that_they_have_none(convergence)
         assert "order" in check.note or "monotone" in check.note
 
 
-@pytest.mark.long
-def test_the_mesh_converges(shipped_design):
-    meshes = wing_checks.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
+@pytest.fixture(scope="module")
+def meshes(shipped_design):
+    """The wing on a mesh of a quarter, of a half and of the whole refinement."""
+    return wing_checks.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
 
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["tip_stiffness", "first_bending", "second_bending"])
+def test_stiffness_and_frequencies_converge_with_the_mesh(meshes, name):
     assert (np.diff([mesh.unknowns for mesh in meshes]) > 0).all()
-    for name in ("tip_stiffness", "first_bending", "second_bending"):
-        quarter, half, whole = (getattr(mesh, name) for mesh in meshes)
-        assert whole == pytest.approx(half, rel=0.025)
-        assert half == pytest.approx(quarter, rel=0.025)
-    _, half_strain, whole_strain = (mesh.strain for mesh in meshes)
-    assert np.sqrt(np.mean((whole_strain / half_strain - 1.0) ** 2)) < 0.05
+    quarter, half, whole = (getattr(mesh, name) for mesh in meshes)
+    assert whole == pytest.approx(half, rel=0.025)
+    assert half == pytest.approx(quarter, rel=0.025)
+
+
+@pytest.mark.long
+def test_strains_converge_with_the_mesh(meshes):
+    _, half, whole = (mesh.strain for mesh in meshes)
+    assert np.sqrt(np.mean((whole / half - 1.0) ** 2)) < 0.05
 
 
 @pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 3.7])

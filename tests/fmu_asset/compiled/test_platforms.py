@@ -95,16 +95,19 @@ def thin_library(processor: int, size: int) -> bytes:
     return struct.pack("<Iii", 0xFEEDFACF, processor, 3) + bytes(range(1, size + 1))
 
 
+MACOS_LIBRARIES = [thin_library(0x01000007, 40), thin_library(0x0100000C, 8)]
+
+
 def test_libraries_for_macos_are_joined_at_multiples_of_its_pages():
-    libraries = [thin_library(0x01000007, 40), thin_library(0x0100000C, 8)]
+    magic_and_count = struct.pack(">II", 0xCAFEBABE, 2)
+    intel = struct.pack(">5I", 0x01000007, 3, 2**14, 52, 14)
+    arm = struct.pack(">5I", 0x0100000C, 3, 2**15, 20, 14)
 
-    joined = fat_library(libraries)
+    assert fat_library(MACOS_LIBRARIES)[:48] == magic_and_count + intel + arm
 
-    entries = struct.unpack(">II 5I 5I", joined[:48])
-    assert entries[:2] == (0xCAFEBABE, 2)
-    assert entries[2:7] == (0x01000007, 3, 2**14, 52, 14)
-    assert entries[7:] == (0x0100000C, 3, 2**15, 20, 14)
-    assert mach_o_parts(joined) == libraries
+
+def test_joined_libraries_are_parted_again():
+    assert mach_o_parts(fat_library(MACOS_LIBRARIES)) == MACOS_LIBRARIES
 
 
 def test_a_library_of_another_system_is_not_joined():

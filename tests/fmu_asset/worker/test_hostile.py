@@ -90,9 +90,19 @@ def await_processes(scratch: Path, *counts: int) -> None:
 # ---------------------------------------------------------------------- start, step, end, state
 
 
-@cases("step")
-def test_a_step_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
+@pytest.fixture
+def leaves_nothing(scratch: Path) -> Iterator[None]:
+    """What a test leaves behind: no process, no file, no open descriptor."""
     before = descriptors()
+    yield
+    await_nothing(scratch)
+    assert descriptors() == before
+
+
+@cases("step")
+@pytest.mark.usefixtures("leaves_nothing")
+def test_a_step_that_goes_wrong_is_one_sentence(hostile, what, kind, sentence) -> None:
+    """The same instance is never used again; another one goes on from the last state."""
     limits = LIMITS | ({"step_timeout": NEVER_ANSWERED} if kind is errors.FmuTimeoutError else {})
     with hostile(what, **limits) as asset:
         assert [asset.step().values[0] for _ in range(2)] == [1.0, 2.0]
@@ -103,11 +113,8 @@ def test_a_step_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, se
         if what != "NOT_A_NUMBER":
             with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
                 asset.step()
-        # The same instance is never used again; another one goes on from the last state.
         asset.restore_state(saved)
         assert (asset.step_index, asset.observe().values[0]) == (2, 2.0)
-    await_nothing(scratch)
-    assert descriptors() == before
 
 
 def test_a_slow_leak_is_noticed_between_short_steps(hostile) -> None:

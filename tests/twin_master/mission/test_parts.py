@@ -209,19 +209,30 @@ def plain(twin):
 """
 
 
+GAUSSIAN_ALARMS = "take the noise of the gauges as Gaussian"
+
+
+@pytest.fixture
+def sharp_file(tmp_path) -> Path:
+    """A file with a sensor model that has a likelihood of its own, and one that has not."""
+    file = tmp_path / "sharp.py"
+    file.write_text(SHARP, encoding="utf-8")
+    return file
+
+
 def test_a_run_says_once_that_alarms_do_not_use_the_likelihood_of_a_sensor_model_of_ones_own(
-    library_file, tmp_path
+    library_file, sharp_file, tmp_path
 ):
-    (tmp_path / "sharp.py").write_text(SHARP, encoding="utf-8")
-    words = ["run", "level_turns", "--strain-library", library_file]
-    sentence = "take the noise of the gauges as Gaussian"
-    told = said(*words, "--sensor-model", f"{tmp_path / 'sharp.py'}:sharp", "--out", tmp_path / "sharp")
-    assert told.count(sentence) == 1
-    assert "sensor model Sharp" in told
-    assert (tmp_path / "sharp" / "report.html").read_text("utf-8").count(sentence) == 1
-    words.append("--no-report")
-    told = said(*words, "--sensor-model", f"{tmp_path / 'sharp.py'}:plain", "--out", tmp_path / "plain")
-    assert sentence not in told
+    words = ["level_turns", "--strain-library", library_file, "--sensor-model", f"{sharp_file}:sharp"]
+    message = said("run", *words, "--out", tmp_path / "sharp")
+    assert message.count(GAUSSIAN_ALARMS) == 1
+    assert "sensor model Sharp" in message
+    assert (tmp_path / "sharp" / "report.html").read_text("utf-8").count(GAUSSIAN_ALARMS) == 1
+
+
+def test_a_run_with_the_likelihood_of_the_alarms_says_nothing_of_it(library_file, sharp_file, tmp_path):
+    words = ["level_turns", "--strain-library", library_file, "--sensor-model", f"{sharp_file}:plain"]
+    assert GAUSSIAN_ALARMS not in said("run", *words, "--no-report", "--out", tmp_path / "plain")
 
 
 def test_an_ensemble_flies_side_by_side_with_and_without_notices(library_file, tmp_path):
