@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -30,18 +30,19 @@ _BOUND_SIGNS = {
 }
 _NULL = {"type": "null"}
 _ALTERNATIVES = ("anyOf", "oneOf")
-_HEADER = "| key | type | unit | default | range | meaning |\n| --- | --- | --- | --- | --- | --- |"
+_OPTIONAL_COLUMNS = ("unit", "default", "range")
+"""Columns that a table has only if one of its keys has an entry there."""
 
 
 class KeyRow(NamedTuple):
     """A row of a table of keys; each entry is a text of Markdown."""
 
     key: str
+    meaning: str
     type: str
     unit: str
     default: str
     range: str
-    meaning: str
 
 
 @dataclass
@@ -79,16 +80,27 @@ def format_page(schema: JsonSchema, notation: Notation) -> str:
 
     sections = []
     for table in tables:
-        rows = _rows(table.schema, schema, link)
-        lines = [f"| {' | '.join(cell or ' ' for cell in row)} |" for row in rows]
+        rows = list(_rows(table.schema, schema, link))
         summary = table.schema.get("description", "")
         paragraphs = [
             f"## {headings[id(table.schema)]}",
             _markdown(summary),
-            "\n".join([_HEADER, *lines]),
+            _markdown_table(rows),
         ]
         sections.append("\n\n".join(text for text in paragraphs if text))
     return "\n\n".join(sections) + "\n"
+
+
+def _markdown_table(rows: Sequence[KeyRow]) -> str:
+    """Return rows as a table of Markdown, without the optional columns in which all are empty."""
+    columns = [
+        name
+        for name in KeyRow._fields
+        if name not in _OPTIONAL_COLUMNS or any(getattr(row, name) for row in rows)
+    ]
+    cells = [columns, ["---"] * len(columns)]
+    cells += [[getattr(row, name) or " " for name in columns] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 def undocumented_keys(schema: JsonSchema) -> list[str]:
@@ -198,7 +210,14 @@ def _rows(
     for key, key_schema in table["properties"].items():
         unit = key_schema.get("unit", "")
         if "same_as" in key_schema:
-            yield KeyRow(f"`{key}`", "", unit, "", "", f"As `{key_schema['same_as']}`.")
+            yield KeyRow(
+                key=f"`{key}`",
+                meaning=f"As `{key_schema['same_as']}`.",
+                type="",
+                unit=unit,
+                default="",
+                range="",
+            )
             continue
         yield KeyRow(
             key=f"`{key}`",

@@ -96,6 +96,7 @@ def simulate(
     )
     from fmu_asset.client.history_files import read_histories
     from fmu_asset.client.session import FmiAsset
+    from fmu_asset.client.undeclared_units import undeclared_units_sentence
     from fmu_asset.client.unset_inputs import unset_inputs_sentence
 
     _refuse_unwritable_files(out, plot, replace=replace)
@@ -125,9 +126,12 @@ def simulate(
     with closing(
         FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
     ) as asset:
-        unset = unset_inputs_sentence(asset.description, asset.binding, histories)
-        if unset:
-            terminal.say(f"warning: {unset}")
+        for warning in (
+            unset_inputs_sentence(asset.description, asset.binding, histories),
+            undeclared_units_sentence(asset.description, asset.binding),
+        ):
+            if warning:
+                terminal.say(f"warning: {warning}")
         _write_and_print_history(asset, run_histories(asset, steps, histories), file, out, plot)
 
 

@@ -41,6 +41,8 @@ _JSON_FIELDS = {
     if field.name not in (*_PLAIN_FIELDS, *_ARRAY_FIELDS)
 }
 """The other fields, with their pydantic adapters; they are stored as attributes in JSON."""
+_NEWER_FIELDS = ("sensors",)
+"""Fields that files of earlier versions lack; they then have their default."""
 
 Groups = Mapping[str, xr.Dataset]
 Root = Mapping[str, Any]
@@ -161,7 +163,8 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
     """Return the calibration that the groups and the root attributes of a file describe."""
     values: dict[str, Any] = {}
     for name, adapter in _JSON_FIELDS.items():
-        values[name] = adapter.validate_json(root[name])
+        if name in root or name not in _NEWER_FIELDS:
+            values[name] = adapter.validate_json(root[name])
     for name in _PLAIN_FIELDS:
         values[name] = root[name]
     values["seed"] = int(root["seed"])

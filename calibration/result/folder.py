@@ -13,6 +13,7 @@ from calibration.result.tables import (
     origin_table,
     parameters_table,
     readings_table,
+    sensors_table,
 )
 from calibration.result.text import NOTICEABLE_CORRELATION, correlation_lines
 from reporting.figures import save_figure
@@ -171,6 +172,12 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     add_titled_table(page, parameters_table(result))
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
+    _add_residuals(page, result, folder)
+    return page
+
+
+def _add_residuals(page: Page, result: Calibration, folder: Path) -> None:
+    """Add the section on residuals, with the fitted gains and zeros, to a page."""
     page.add_section("Residuals of the readings")
     if result.readings:
         readings = ReportFigure(
@@ -185,7 +192,8 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         add_figure(page, readings, folder)
     add_titled_table(page, readings_table(result))
     add_titled_table(page, channels_table(result))
-    return page
+    if result.sensors:
+        add_titled_table(page, sensors_table(result))
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:

@@ -13,6 +13,7 @@ import xarray as xr
 from scipy.special import ndtr, ndtri
 
 from calibration.errors import CalibrationRecordError
+from calibration.result.sensors import SensorFit
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, child_seed, stratified
 from fe.runtime.state import DigitalState
@@ -180,6 +181,8 @@ class Calibration:
         The readings that are more than one number, by name, with units.
     design : WingDesign or None
         The design with the measured planform, for a wing.
+    sensors : tuple of SensorFit
+        The gains and zeros that were fitted together with the parameters; empty for a wing.
 
     Raises
     ------
@@ -205,6 +208,7 @@ class Calibration:
     readings: tuple[FigureReading, ...] = ()
     measured: xr.Dataset = field(default_factory=xr.Dataset)
     design: WingDesign | None = None
+    sensors: tuple[SensorFit, ...] = ()
 
     def __repr__(self) -> str:
         return brief(

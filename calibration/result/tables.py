@@ -3,6 +3,12 @@
 from math import isfinite
 
 from calibration.result.record import Calibration, ChannelFit, FigureReading, ParameterPrior
+from calibration.result.sensors import (
+    SENSOR_COLUMNS,
+    SensorFit,
+    gains_and_farthest_zeros,
+    printed_rows,
+)
 from reporting.page import PageColumn, Table
 from reporting.record_table import (
     RecordColumn,
@@ -108,6 +114,29 @@ def channels_table(result: Calibration) -> TitledTable:
             "Rms residual in standard deviations of the noise, with the parameters at their prior "
             "means and at the most probable values; gains, zeros and initial states are fitted in "
             "both. Held-out trials took no part in the calibration."
+        ),
+    )
+
+
+def sensors_table(result: Calibration) -> TitledTable:
+    """Return the table of fitted gains and zeros beside what is stated, for the page."""
+    return _sensors_table(gains_and_farthest_zeros(result.sensors))
+
+
+def printed_sensors_table(result: Calibration) -> TitledTable:
+    """Return the table of fitted gains and zeros, at most `MOST_PRINTED_SENSORS` of them."""
+    return _sensors_table(printed_rows(result.sensors))
+
+
+def _sensors_table(rows: list[SensorFit]) -> TitledTable:
+    """Return the table of the given gains and zeros."""
+    return TitledTable(
+        table_of_records(SENSOR_COLUMNS, rows),
+        title="Gains and zeros of the channels",
+        caption=(
+            "Fitted together with the parameters, with their standard deviations; of the zeros of "
+            "a channel, the one farthest from what is stated. The last column is the distance in "
+            "stated standard deviations. calibration.nc has the zeros of all trials."
         ),
     )
 

@@ -43,7 +43,11 @@ def printed_calibration(result: Calibration) -> Iterator[str | Table]:
     yield headline(result)
     yield tables.parameters_table(result).table
     yield from correlation_lines(result)
-    for titled in (tables.readings_table(result), tables.channels_table(result)):
+    for titled in (
+        tables.readings_table(result),
+        tables.channels_table(result),
+        tables.printed_sensors_table(result),
+    ):
         if titled.table.rows:
             yield titled.table
     for finding in result.findings:

@@ -192,7 +192,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
     Raises
     ------
     CampaignFileError
-        If the value of the option has none of these forms.
+        If the value of the option has none of these forms, or is a number without its unit.
     """
     if answer == FREE:
         return FREE
@@ -212,8 +212,13 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
         # rounded to two digits in the unit of the readings, as the user sees it in that unit
         rounded_deviation = float(f"{deviation:.2g}")
         return rounded_deviation * to_si
+    if not unit and column.read_in != "1" and float(amount_text) > 0.0:
+        # one number for channels in microstrain and in mm would be right for one of them at most
+        raise CampaignFileError(
+            f"--zero of {column.head!r} needs a unit, such as {amount_text}{column.read_in} in the "
+            f"unit of its readings, but {answer!r} was given."
+        )
     try:
-        # a number without a unit is in the unit of the readings
         return float(amount_text) * factor_to_si(column.quantity, unit or column.read_in)
     except ValueError as cause:
         raise CampaignFileError(f"--zero of {column.head!r}: {cause}.") from None

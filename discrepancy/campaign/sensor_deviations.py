@@ -118,6 +118,7 @@ class SensorDeviations:
         if not phrases:
             return ""
         return (
-            "Zeros and gains without a stated standard deviation are assumed to be known: "
+            "At the import, zeros and gains without a stated standard deviation were assumed to be "
+            "known: "
             f"{listing(phrases)}."
         )

@@ -1,5 +1,6 @@
 """Faults of data that a model reveals: units, signs, swapped channels, short records."""
 
+import shlex
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -366,6 +367,7 @@ def _sign_faults(
         sentence = (
             f"The channel {name!r} moves in the opposite direction to the model in every trial: "
             "reverse its sign (as the model has it: displacement upwards, the wing's strain "
-            "positive where upward load compresses the upper skin), or correct its `output`."
+            "positive where upward load compresses the upper skin), for example by "
+            f"`discrepancy import --scale {shlex.quote(f'{name}=-1')}`, or correct its `output`."
         )
         yield DataFault(FaultKind.SIGN, sentence, name)

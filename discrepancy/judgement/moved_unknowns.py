@@ -55,6 +55,23 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
     return tuple(sorted(moved_far, key=lambda unknown: -abs(unknown.deviations)))
 
 
+def moved_sensors(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, ...]:
+    """Return the gains and zeros among `moved_unknowns`.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model.
+    fit : CandidateFit
+        The fit.
+    """
+    return tuple(
+        unknown
+        for unknown in moved_unknowns(problem, fit)
+        if unknown.name.startswith((GAIN_OF, ZERO_OF))
+    )
+
+
 def _stated_unknowns(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the stated and fitted values of all unknowns that have a stated deviation."""
     return [

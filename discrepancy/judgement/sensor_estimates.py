@@ -1,15 +1,53 @@
 """Gains and zeros of channels as they were fitted, beside what the campaign states of them."""
 
+from collections.abc import Mapping, Sequence
 from math import inf, nan
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from calibration.result.sensors import SensorFit
+from discrepancy.campaign.records import Channel, FloatArray
 from discrepancy.campaign.units import UNITS
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.normal_equations import trial_jacobian
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import SensorEstimate, SensorValue
+
+from .closed_share import NOMINAL_UNIT
+
+PERCENT = (100.0, "%")
+"""Factor and unit in which the relative error of a gain is shown."""
+
+
+def sensor_fits(
+    estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
+) -> tuple[SensorFit, ...]:
+    """Return fitted gains and zeros with the units in which they are shown.
+
+    Parameters
+    ----------
+    estimates : sequence of SensorEstimate
+        The fitted gains and zeros.
+    channels : mapping of str to Channel
+        The channels of the campaign by name.
+    """
+    fits = []
+    for estimate in estimates:
+        is_gain = estimate.kind is SensorValue.GAIN
+        factor, unit = PERCENT if is_gain else UNITS[channels[estimate.channel].quantity].drawn
+        fits.append(
+            SensorFit(
+                channel=estimate.channel,
+                kind="gain" if is_gain else "zero",
+                trial=estimate.trial,
+                value=estimate.value,
+                deviation=estimate.deviation,
+                stated_deviation=estimate.stated_deviation,
+                shown_factor=factor,
+                shown_unit="" if unit == NOMINAL_UNIT else unit,
+            )
+        )
+    return tuple(fits)
 
 
 def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimate, ...]:

@@ -24,6 +24,8 @@ from discrepancy.checks.model_check import LARGEST_DEVIATION_RATIO
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.moved_unknowns import moved_sensors, moved_sentence
+from discrepancy.judgement.sensor_estimates import sensor_estimates, sensor_fits
 from discrepancy.model_choice import ModelChoice, choose_model
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
 from discrepancy.search.wide_noise import estimate_residual_process
@@ -94,6 +96,11 @@ def calibrate_parameters(
     best = replace(best, residual_process=estimate_residual_process(problem, best))
     gate = check_absolute_fit(problem, best)
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
+    misfits = (
+        *_misfit_findings(gate),
+        moved_sentence(moved_sensors(problem, best)),
+        _repeated_data_finding(campaign, choice),
+    )
     return Calibration(
         asset=campaign.name if asset is None else asset,
         model=choice.model.name,
@@ -103,12 +110,13 @@ def calibrate_parameters(
         samples=posterior.marginal.physical_values(posterior.draws),
         prior_samples=prior_samples(priors, samples, seed),
         explained=gate.passed,
-        findings=findings(priors, posterior, gate, faults, campaign.remarks),
+        findings=findings(misfits, priors, posterior, faults, campaign.remarks),
         channels=_channel_fits(problem, posterior),
         source=campaign.name,
         seed=seed,
         provenance=collect_provenance(seed, input_hashes=hashes).as_dict(),
         design_hash=choice.design_hash,
+        sensors=sensor_fits(sensor_estimates(problem, best), campaign.channels),
     )
 
 
@@ -199,9 +207,9 @@ reported."""
 
 
 def findings(
+    misfits: Sequence[str],
     priors: tuple[ParameterPrior, ...],
     posterior: ParameterPosterior,
-    gate: Gate,
     faults: tuple[DataFault, ...],
     remarks: tuple[str, ...],
 ) -> tuple[str, ...]:
@@ -209,26 +217,18 @@ def findings(
 
     Parameters
     ----------
+    misfits : sequence of str
+        The findings on the fit itself; empty ones are left out.
     priors : tuple of ParameterPrior
         The priors of the parameters.
     posterior : ParameterPosterior
         Their posterior.
-    gate : Gate
-        The test of absolute fit at the optimum.
     faults : tuple of DataFault
         The faults of the data.
     remarks : tuple of str
         The remarks of the campaign.
     """
-    sentences: list[str] = []
-    if gate.has_failed:
-        sentences.append(
-            f"The campaign is not explained by these parameters: {small(gate.reason)} The "
-            "posterior is too narrow and may be biased; `uav-twin discrepancy run` on the same "
-            "campaign and model looks for what is missing."
-        )
-    elif gate.passed is None:
-        sentences.append(gate.reason)
+    sentences = [sentence for sentence in misfits if sentence]
     sentences += _prior_findings(priors, posterior)
     sentences += _range_findings(priors, posterior)
     sentences += _optimum_findings(priors, posterior)
@@ -237,6 +237,30 @@ def findings(
         if fault.kind is not FaultKind.UNOBSERVABLE:  # the posterior says so itself
             sentences.append(fault.sentence)
     return (*sentences, *(remark for remark in remarks if remark not in sentences))
+
+
+def _misfit_findings(gate: Gate) -> Iterator[str]:
+    """Yield a finding if the residuals at the optimum are not explained, or cannot be judged."""
+    if gate.has_failed:
+        yield (
+            f"The campaign is not explained by these parameters: {small(gate.reason)} The "
+            "posterior is too narrow and may be biased; `uav-twin discrepancy run` on the same "
+            "campaign and model looks for what is missing."
+        )
+    elif gate.passed is None:
+        yield gate.reason
+
+
+def _repeated_data_finding(campaign: Campaign, choice: ModelChoice) -> str:
+    """Return a finding if the model has a patch that was found on this campaign; empty if not."""
+    patch = choice.built_in
+    if patch is None or patch.origin.data_hash != campaign.data_hash:
+        return ""
+    return (
+        f"The patch {choice.label} was found on this campaign, so that its readings count twice: "
+        "the posterior standard deviations are too small. Calibrate with other measurements, or "
+        "take the parameters of the patch as they are."
+    )
 
 
 def _parameter_values(priors: Sequence[ParameterPrior], values: FloatArray) -> str:

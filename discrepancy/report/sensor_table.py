@@ -1,86 +1,19 @@
 """The table of the gains and zeros of channels that were fitted beside what the campaign states."""
 
 from collections.abc import Mapping, Sequence
-from math import inf, isfinite
-from typing import NamedTuple
 
+from calibration.result.sensors import SENSOR_COLUMNS, gains_and_farthest_zeros, printed_rows
 from discrepancy.campaign.records import Channel
-from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.closed_share import NOMINAL_UNIT
-from discrepancy.report.text import number
-from discrepancy.verdict import SensorEstimate, SensorValue
+from discrepancy.judgement.sensor_estimates import sensor_fits
+from discrepancy.verdict import SensorEstimate
 from reporting.page import Table
-from reporting.record_table import (
-    RecordColumn,
-    TitledTable,
-    number_cells,
-    table_of_records,
-    text_cells,
-)
-from reporting.words import plus_minus
-
-MOST_PRINTED_SENSORS = 12
-"""Most rows that are printed; the report has all channels."""
-PERCENT = (100.0, "%")
-"""Factor and unit in which the relative error of a gain is shown."""
+from reporting.record_table import TitledTable, table_of_records
 
 
-class SensorRow(NamedTuple):
-    """A fitted gain or zero of a channel, with the factor and unit in which it is shown."""
-
-    estimate: SensorEstimate
-    factor: float
-    unit: str
-
-    @property
-    def is_free_gain(self) -> bool:
-        """Whether the campaign does not state this gain; it is then shown instead of its error."""
-        estimate = self.estimate
-        return estimate.kind is SensorValue.GAIN and estimate.stated_deviation == inf
-
-    @property
-    def value(self) -> str:
-        """The fitted value with its posterior standard deviation."""
-        if self.is_free_gain:
-            return plus_minus(1.0 + self.estimate.value, self.estimate.deviation)
-        return plus_minus(self.factor * self.estimate.value, self.factor * self.estimate.deviation)
-
-    @property
-    def shown_unit(self) -> str:
-        """The unit of the value; empty for a gain itself."""
-        return "" if self.is_free_gain else self.unit
-
-    @property
-    def stated(self) -> str:
-        """The stated value, which is zero, with its standard deviation."""
-        if self.estimate.stated_deviation == inf:
-            return "not stated"
-        return f"0 ± {number(self.factor * self.estimate.stated_deviation, 2)}"
-
-    @property
-    def deviations(self) -> str:
-        """The distance from the stated value in stated standard deviations."""
-        if not isfinite(self.estimate.deviations):
-            return ""
-        return f"{self.estimate.deviations:+.1f}".replace("-", "\N{MINUS SIGN}")
-
-    @property
-    def label(self) -> str:
-        """What was fitted: the gain, its error, or the zero in a trial."""
-        if self.is_free_gain:
-            return "gain"
-        if self.estimate.kind is SensorValue.GAIN:
-            return "gain error"
-        return f"zero in {self.estimate.trial}"
-
-
-def sensor_rows(
+def sensor_table(
     estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
-) -> list[SensorRow]:
-    """Return the gain of each channel, and the farthest of its zeros that are not free.
-
-    A zero is free if its deviation is not stated: then it says nothing of the sensor. A channel
-    with free zeros only has the first of them.
+) -> TitledTable:
+    """Return the table of fitted gains and zeros, for the report.
 
     Parameters
     ----------
@@ -89,31 +22,9 @@ def sensor_rows(
     channels : mapping of str to Channel
         The channels of the campaign by name.
     """
-    rows = []
-    for channel in dict.fromkeys(estimate.channel for estimate in estimates):
-        of_channel = [estimate for estimate in estimates if estimate.channel == channel]
-        factor, unit = UNITS[channels[channel].quantity].drawn
-        for estimate in of_channel:
-            if estimate.kind is SensorValue.GAIN:
-                rows.append(SensorRow(estimate, *PERCENT))
-        zeros = [estimate for estimate in of_channel if estimate.kind is SensorValue.ZERO]
-        if zeros:
-            farthest = max(zeros, key=_distance)
-            rows.append(SensorRow(farthest, factor, "" if unit == NOMINAL_UNIT else unit))
-    return rows
-
-
-def _distance(estimate: SensorEstimate) -> float:
-    """Return the distance from the stated value in stated deviations; -1 if none is stated."""
-    return abs(estimate.deviations) if isfinite(estimate.deviations) else -1.0
-
-
-def sensor_table(
-    estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
-) -> TitledTable:
-    """Return the table of fitted gains and zeros, for the report."""
+    rows = gains_and_farthest_zeros(sensor_fits(estimates, channels))
     return TitledTable(
-        table_of_records(_columns(), sensor_rows(estimates, channels)),
+        table_of_records(SENSOR_COLUMNS, rows),
         title="Gains and zeros of the channels",
         caption=(
             "Fitted together with the verdict's hypothesis, with their standard deviations; of the "
@@ -126,22 +37,13 @@ def sensor_table(
 def printed_sensor_table(
     estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
 ) -> Table:
-    """Return the fitted gains and zeros for the terminal.
+    """Return the fitted gains and zeros for the terminal, at most `MOST_PRINTED_SENSORS` of them.
 
-    If there are more than `MOST_PRINTED_SENSORS`, only those farthest from what is stated remain.
+    Parameters
+    ----------
+    estimates : sequence of SensorEstimate
+        All fitted gains and zeros.
+    channels : mapping of str to Channel
+        The channels of the campaign by name.
     """
-    rows = sensor_rows(estimates, channels)
-    farthest = sorted(rows, key=lambda row: -_distance(row.estimate))[:MOST_PRINTED_SENSORS]
-    return table_of_records(_columns(), [row for row in rows if row in farthest])
-
-
-def _columns() -> list[RecordColumn[SensorRow]]:
-    """Return the columns of the table."""
-    return [
-        text_cells("channel", lambda row: row.estimate.channel),
-        text_cells("fitted", lambda row: row.label),
-        number_cells("value", lambda row: row.value),
-        text_cells("unit", lambda row: row.shown_unit),
-        number_cells("stated", lambda row: row.stated),
-        number_cells("deviations", lambda row: row.deviations),
-    ]
+    return table_of_records(SENSOR_COLUMNS, printed_rows(sensor_fits(estimates, channels)))

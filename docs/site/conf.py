@@ -4,6 +4,7 @@ import inspect
 from pathlib import Path
 
 import jupyter_client
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.config import Config
 from sphinx.environment import BuildEnvironment
@@ -53,8 +54,13 @@ html_show_sourcelink = False
 html_theme_options = {"show_prev_next": True, "navbar_align": "left", "secondary_sidebar_items": ["page-toc"]}
 
 
-def _front(_: str) -> str:
-    return (DOCS / "site" / "index.md").read_text(encoding="utf-8")
+def _front(text: str) -> str:
+    """Return the front page, with the tables by role and by task of the page that code hosts show."""
+    opening, mark, contents = (
+        (DOCS / "site" / "index.md").read_text(encoding="utf-8").partition("```{toctree}")
+    )
+    tables = text[text.index("## By role") :]
+    return f"{opening}{tables}\n## All pages\n\n{mark}{contents}"
 
 
 def _interface(text: str) -> str:
@@ -100,6 +106,36 @@ def _spread(app: Sphinx, env: BuildEnvironment, names: list[str]) -> None:
     names[:] = pages
 
 
+def _keep_printed_tables(app: Sphinx, tree: nodes.document) -> None:
+    """Mark the tables in what commands print, whose lines scroll while lines of text wrap.
+
+    A table reaches from the line above its rule of dashes to the next line that is not indented.
+    """
+    for block in tree.findall(nodes.literal_block):
+        lines = block.astext().splitlines(keepends=True)
+        heads = [number - 1 for number, line in enumerate(lines) if set(line.strip()) == {"─"}]
+        if not heads or heads[0] < 0:
+            continue
+        block.children.clear()
+        first = 0
+        for head in heads:
+            end = head + 2
+            while end < len(lines) and lines[end].startswith(" ") and lines[end].strip():
+                end += 1
+            for text, classes in ((lines[first:head], []), (lines[head:end], ["printed-table"])):
+                block += nodes.inline("", "".join(text), classes=classes)
+            first = end
+        block += nodes.inline("", "".join(lines[first:]))
+        block.rawsource = ""  # other than the text: Sphinx then writes the parts as they are
+
+
+def _mark_tables_of_keys(app: Sphinx, tree: nodes.document) -> None:
+    """Mark the tables of the file formats, whose second column has sentences."""
+    if app.env.docname.startswith("reference/formats/"):
+        for table in tree.findall(nodes.table):
+            table["classes"].append("keys")
+
+
 def _quiet(app: Sphinx, config: Config) -> None:
     """Accept that the language of a notebook is not known where its kernel is not asked."""
     if config.nb_execution_mode == "off":
@@ -111,3 +147,5 @@ def setup(app: Sphinx) -> None:
     app.connect("config-inited", _quiet)
     app.connect("source-read", _make)
     app.connect("env-before-read-docs", _spread)
+    app.connect("doctree-read", _keep_printed_tables)
+    app.connect("doctree-read", _mark_tables_of_keys)

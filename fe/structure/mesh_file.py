@@ -101,8 +101,19 @@ def _check_jacobians(mesh: StructureMesh) -> None:
         worst = mesh.cell(int(least.argmin()))
         raise MeshError(
             f"{mesh.source}: {is_bad.sum()} of {len(is_bad)} elements are inside out or flat "
-            f"(their Jacobian is not positive everywhere), the worst is element {worst}."
+            f"(their Jacobian is not positive everywhere), the worst is element {worst}. "
+            f"{_remedy_of_bad_elements(mesh)}"
         )
+
+
+def _remedy_of_bad_elements(mesh: StructureMesh) -> str:
+    """Return what to do about elements without volume, for kinds with curved edges and others."""
+    if mesh.kind.edges:
+        return (
+            "At a curved surface make the mesh finer there, or let the mesher optimise its "
+            "elements (in Gmsh Mesh.HighOrderOptimize = 2)."
+        )
+    return "Mesh the part again there, or correct the order of the nodes of these elements."
 
 
 def _check_connected(mesh: StructureMesh) -> None:

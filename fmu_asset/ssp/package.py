@@ -30,6 +30,9 @@ NAMESPACES = {
 OWN_NAMESPACE = "urn:uav-twin:coupling"
 """The namespace of our annotations for what SSP 1.0 lacks: delayed connections, substeps."""
 
+OSP_NAMESPACE = "http://opensimulationplatform.com/SSP/OSPAnnotations"
+"""The namespace of the annotation of the Open Simulation Platform with the step of a system."""
+
 INTERFACES: dict[str, Interface | None] = {
     "any": None,
     "CoSimulation": "co-simulation",

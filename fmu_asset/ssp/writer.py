@@ -16,7 +16,15 @@ from fmu_asset.packing.contents import checked_target
 from reporting.files import atomic_write_bytes
 from reporting.units import BASE_UNITS
 
-from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, parse_xml, validate
+from .package import (
+    INTERFACES,
+    NAMESPACES,
+    OSP_NAMESPACE,
+    OWN_NAMESPACE,
+    SSD_NAME,
+    parse_xml,
+    validate,
+)
 
 _DOCUMENTS = {
     SSD_NAME: "ssd",
@@ -35,6 +43,7 @@ def write_ssp(
     *,
     parameter_names: Mapping[Endpoint, str] | None = None,
     stop_time: float | None = None,
+    step_size: float | None = None,
     replace: bool = False,
 ) -> Path:
     """Write a system as an SSP 1.0 file, its XML checked by the published schemas.
@@ -49,6 +58,8 @@ def write_ssp(
         The names of parameters in the parameter set; by default `component.variable`.
     stop_time : float, optional
         End of the default experiment [s].
+    step_size : float, optional
+        Communication step size [s], in the annotation of the Open Simulation Platform.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -72,6 +83,8 @@ def write_ssp(
         "parameters": _written_parameters(wiring, parameter_names or {}, units),
         "units": units,
         "stop_time": None if stop_time is None else float(stop_time),
+        "step_size": None if step_size is None else float(step_size),
+        "osp_namespace": OSP_NAMESPACE,
         "implementations": {interface: name for name, interface in INTERFACES.items()},
         "resource": _name_in_archive,
         "namespaces": NAMESPACES,

@@ -447,7 +447,7 @@ def swings(*names: str, first_column: bool = True) -> None:
 
 
 ASSUMED_ZEROS_AND_GAINS = (
-    "Zeros and gains without a stated standard deviation are assumed to be known: "
+    "At the import, zeros and gains without a stated standard deviation were assumed to be known: "
     "the zero of 'x' to 0.2 um and the gain of 'x' to 2 %."
 )
 
@@ -473,7 +473,7 @@ def test_assumed_zeros_and_gains_are_printed_and_remarked():
         ("exact", "exact", (0.0, 0.0)),
         ("free", "0.5%", (np.inf, 0.005)),
         ("x=0.001mm", "x=0.03", (1e-6, 0.03)),
-        ("3", "x=exact", (3e-6, 0.0)),
+        ("3um", "x=exact", (3e-6, 0.0)),
     ],
 )
 def test_zeros_and_gains_are_as_stated(zero, gain, known):
@@ -493,6 +493,12 @@ def test_holds_begins_and_files_for_proof_are_written():
     assert (first.begins.value, first.held_out) == ("still", False)
     assert (second.begins.value, second.held_out) == ("unknown", True)
     assert [item.hold.value for item in first.inputs] == ["zero_order"]
+
+
+def test_a_zero_without_a_unit_is_refused():
+    swings("a.csv")
+    sentence = refused(*IMPORT, "a.csv", "--kind", "driven", *PLAIN, "--zero", "3")
+    assert "--zero of 'x' needs a unit, such as 3" in sentence
 
 
 def test_a_table_without_a_time_has_the_interval_that_is_stated():

@@ -18,7 +18,7 @@ from fe.structure.design import parse_structure
 from fe.wing.design import parse_design
 from fmu_asset.client.binding import parse_binding
 from fmu_asset.errors import BindingError
-from reporting.format_tables import undocumented_keys
+from reporting.format_tables import format_page, undocumented_keys
 from scenarios import binding_files, scenario_files, structure_files
 from tests import command_line
 from tests.refusals import refused
@@ -56,6 +56,19 @@ def content_of(path):
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_key_of_a_format_has_a_description_and_every_number_a_unit(name):
     assert undocumented_keys(FORMATS[name].schema()) == []
+
+
+def test_a_table_of_keys_has_no_column_that_is_empty():
+    schema = {
+        "properties": {
+            "name": {"type": "string", "description": "Name of the part."},
+            "mass": {"type": "number", "unit": "kg", "description": "Its mass."},
+        }
+    }
+    header, _, name, mass = format_page(schema, "toml").strip().splitlines()[-4:]
+    assert header == "| key | meaning | type | unit |"
+    assert name == "| `name` | Name of the part. | text |   |"
+    assert mass == "| `mass` | Its mass. | number | kg |"
 
 
 def test_schemas_and_pages_are_those_of_the_classes():

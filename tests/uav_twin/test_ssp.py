@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fmu_asset.client.binding import load_binding
 from tests.command_line import refused, said
 from tests.fmu_asset.making import edited
 
@@ -33,6 +34,14 @@ def mapped(*entries: tuple[str, str]) -> tuple[str, str]:
 
 
 IN_STEPS_OF_A_SECOND = ("--stop-time", "3", "--step-size", "1", "--in-process")
+
+
+def test_the_step_of_a_system_of_one_fmu_is_that_of_its_binding(system, heat_exchanger, tmp_path):
+    printed = said("ssp", "simulate", system, "--stop-time", "7200", "--out", tmp_path / "x.csv")
+    binding_file = heat_exchanger / "binding.toml"
+    step_size = load_binding(binding_file).step_size
+    assert f"every {step_size:g} s." in printed
+    assert step_size != 7200 / 500
 
 
 def outlet_temperature(conductance: float, mass_flow: float) -> float:

@@ -11,6 +11,7 @@ from pydantic import Field
 from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.client.binding import Binding, load_binding
 from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.undeclared_units import undeclared_units_sentence
 from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
@@ -347,6 +348,7 @@ class FmuSource(AssetSource):
         """
         asset = FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters())
         self._warn_of_unset_inputs(asset)
+        self._warn_of_undeclared_units(asset)
         return asset.binding
 
     def _warn_of_unset_inputs(self, asset: FmiAsset) -> None:
@@ -364,6 +366,12 @@ class FmuSource(AssetSource):
         unset = unset_inputs_sentence(asset.description, asset.binding, given_names)
         if unset:
             _logger.warning("%s", unset)
+
+    def _warn_of_undeclared_units(self, asset: FmiAsset) -> None:
+        """Warn of variables of which only the binding states a unit, such as degC."""
+        sentence = undeclared_units_sentence(asset.description, asset.binding)
+        if sentence:
+            _logger.warning("%s", sentence)
 
     def _check_state_units(self, binding: Binding) -> None:
         """Refuse a state factor whose unit differs from that of its monitor or health input."""

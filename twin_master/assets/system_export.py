@@ -105,6 +105,7 @@ def export_scenario(
             out,
             parameter_names=names,
             stop_time=stop_time,
+            step_size=binding.step_size,
             replace=replace_file,
         )
 
@@ -161,7 +162,13 @@ def export_design(
         wiring = system_of_one_fmu(wing.name, fmu, binding)
         names = _parameter_names(wiring, binding)
         wiring = _with_values(wiring, binding, {}, {})
-        return write_ssp(wiring, out, parameter_names=names, replace=replace_file)
+        return write_ssp(
+            wiring,
+            out,
+            parameter_names=names,
+            step_size=binding.step_size,
+            replace=replace_file,
+        )
 
 
 def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:

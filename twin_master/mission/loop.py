@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Protocol
 
+from reporting.log import module_logger
 from reporting.progress import Progress, SilentProgress
 from twin_master.errors import (
     ImpossibleObservation,
@@ -29,6 +30,8 @@ from twin_master.mission.steps import History, MissionStep, Plant, Reading
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin, TwinStep
 from twin_master.scenario.schema import Scenario
+
+_logger = module_logger(__name__)
 
 
 class Source(Protocol):
@@ -72,6 +75,8 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
         step = MissionStep(reading, twin_step)
         for sink in sinks:
             sink(step)
+        for notice in twin_step.notices:
+            _logger.info("%s", notice.sentence)
         time_stored = time.perf_counter()
         yield replace(
             step,
@@ -139,6 +144,7 @@ def fly(
     if plant.ended:
         history.ended = early_end_sentence(scenario, twin.steps, plant.ended)
         history.notices.append((twin.steps - 1, Notice("ended", history.ended)))
+        _logger.info("%s", history.ended)
     return history
 
 

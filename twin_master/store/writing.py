@@ -14,6 +14,7 @@ from reporting.folders import restore_folder
 from reporting.json_file import JsonObject, read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from reporting.notebook import html_table
+from reporting.words import brief
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.pictures import plot_belief
@@ -189,7 +190,7 @@ def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int
     }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunOutcome:
     """A finished run.
 
@@ -221,6 +222,9 @@ class RunOutcome:
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return brief(self, folder=str(self.folder), control=self.control, notices=len(self.notices))
 
     @cached_property
     def tree(self) -> "DataTree":

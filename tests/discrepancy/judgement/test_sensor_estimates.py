@@ -6,6 +6,7 @@ from math import hypot, inf, isnan, nan
 import numpy as np
 import pytest
 
+from calibration.result.sensors import MOST_PRINTED_SENSORS
 from discrepancy.catalogue.library import library
 from discrepancy.files.verdict import read_verdict_file, write_verdict
 from discrepancy.fits.normal_equations import normal_equations
@@ -14,7 +15,7 @@ from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import render_report, verdict_card
 from discrepancy.report.printed import verdict_lines
-from discrepancy.report.sensor_table import MOST_PRINTED_SENSORS, printed_sensor_table
+from discrepancy.report.sensor_table import printed_sensor_table
 from discrepancy.verdict import MovedUnknown, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
 from reporting.page import Table
@@ -150,7 +151,10 @@ def test_of_many_channels_the_farthest_are_printed():
     (some, *_) = sensor_estimates(problem, kit.fitted(problem))
     channel = problem.campaign.channels[some.channel]
     names = [f"g{number}" for number in range(30)]
-    many = [replace(some, channel=name, deviations=0.1 * number) for number, name in enumerate(names)]
+    many = [
+        replace(some, channel=name, value=0.1 * number * some.stated_deviation)
+        for number, name in enumerate(names)
+    ]
     printed = printed_sensor_table(many, dict.fromkeys(names, channel))
     assert [row[0] for row in printed.rows] == names[-MOST_PRINTED_SENSORS:]
 

@@ -11,14 +11,19 @@ import pytest
 
 from calibration.result.file import load_calibration, result_bytes, save_calibration
 from calibration.result.record import ParameterPrior
+from calibration.result.text import printed_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, ModelError
+from discrepancy.files.verdict import StoredPatch
 from discrepancy.model_choice import ModelChoice, ModelKind
 from discrepancy.parameters.calibration import calibrate_parameters
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Response
 from discrepancy.system.scales import Scales
+from discrepancy.verdict import VerdictKind
+from reporting.page import Table
 from tests.discrepancy.core import kit
+from tests.discrepancy.rigs import ORIGIN
 
 FORCE = np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])
 NOISE = 0.02
@@ -265,6 +270,70 @@ def test_the_colour_of_the_noise_is_no_gap_where_its_record_has_it(monkeypatch, 
     campaign = replace(campaign, trials=campaign.trials[:1])
     choice = ModelChoice(problem.model, ModelKind.LUMPED, "chain.toml", "0" * 64)
     assert calibrate_parameters(campaign, choice, samples=20).explained is recorded
+
+
+def gain_campaign(gain_deviation):
+    """Return readings of a spring of known stiffness by a sensor that shows 3 % too much."""
+    values = 1.03 * noisy(spring, 1.0, seed=6)
+    campaign = campaign_of(values)
+    channel = replace(campaign.channels["y"], gain_deviation=gain_deviation, offset_deviation=0.1)
+    return replace(campaign, channels={"y": channel})
+
+
+@pytest.fixture(scope="module")
+def known_spring():
+    """The calibration of a spring that is known to 0.1 %, with a gain that is stated to 0.5 %."""
+    choice = choice_of(spring, (1.0, 0.001, 0.5, 2.0))
+    return calibrate_parameters(gain_campaign(0.005), choice, samples=200)
+
+
+def test_the_gain_of_a_sensor_has_the_posterior_of_the_closed_form(known_spring):
+    (gain, zero) = known_spring.sensors
+    reading = gain_campaign(0.005).trials[0].values[:, 0]
+    # linear in gain error, zero and stiffness error: y = f (1 + gain - stiffness) + zero
+    force = FORCE / 10.0
+    design = np.column_stack([force, np.ones(len(force)), -force])
+    precision = np.diag([0.005**-2, 0.1**-2, 0.001**-2]) + design.T @ design / NOISE**2
+    expected = np.linalg.solve(precision, design.T @ (reading - force) / NOISE**2)
+    assert (gain.kind, zero.kind) == ("gain", "zero")
+    assert gain.value == pytest.approx(expected[0], rel=0.02)
+    assert gain.deviation == pytest.approx(np.sqrt(np.linalg.inv(precision)[0, 0]), rel=0.02)
+
+
+def test_a_gain_that_is_far_from_what_is_stated_is_named(known_spring):
+    (sentence,) = [finding for finding in known_spring.findings if "moves" in finding]
+    assert "the gain of y by +1." in sentence
+    assert "(stated to 0.5 %;" in sentence
+
+
+def test_the_file_of_a_calibration_holds_gains_and_zeros(known_spring, tmp_path):
+    again = load_calibration(save_calibration(known_spring, tmp_path / "c.nc"))
+    assert again.sensors == known_spring.sensors
+
+
+def test_fitted_gains_and_zeros_are_printed(known_spring):
+    (table,) = [
+        entry
+        for entry in printed_calibration(known_spring)
+        if isinstance(entry, Table) and entry.columns[1].name == "fitted"
+    ]
+    gain, zero = table.rows
+    assert [gain[1], gain[3], gain[4]] == ["gain error", "%", "0 ± 0.5"]
+    assert [zero[1], zero[3], zero[4]] == ["zero in t0", "mm", "0 ± 100"]
+
+
+def test_a_patch_found_on_the_same_campaign_is_reported(known_spring):
+    choice = choice_of(spring, (1.0, 0.001, 0.5, 2.0))
+    campaign = gain_campaign(0.005)
+    reasons = []
+    for data_hash in (campaign.data_hash, "1" * 64):
+        origin = replace(ORIGIN, data_hash=data_hash)
+        patch = StoredPatch(VerdictKind.NAMED, "A gain.", (), {}, (), origin)
+        result = calibrate_parameters(campaign, replace(choice, built_in=patch), samples=200)
+        reasons.append([finding for finding in result.findings if "count twice" in finding])
+    same, other = reasons
+    assert len(same) == 1
+    assert other == []
 
 
 @pytest.fixture(scope="module")

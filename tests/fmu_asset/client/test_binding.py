@@ -2,6 +2,7 @@
 
 import dataclasses
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.instance_host import worker_limits
 from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.undeclared_units import undeclared_units_sentence
 from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
 from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import BindingError, FmuInputError
@@ -163,6 +165,23 @@ def test_inputs_that_nobody_sets_are_named_with_their_start_values(room):
     assert "1 input stays at its start value, because nobody sets it: " in sentence
     given_names = {"control": draft.control, "health": draft.health}
     assert sentence == unset_inputs_sentence(room, draft, given_names)
+
+
+@pytest.mark.parametrize(("unit", "is_named"), [("degC", True), ("mm", True), ("K", False)])
+def test_a_variable_without_a_unit_is_named_if_the_binding_has_none_of_si(room, unit, is_named):
+    without_units = replace(room, variables=tuple(replace(v, unit=None) for v in room.variables))
+    draft = parse_draft(without_units)
+    (name, vector) = next(iter(draft.observation.items()))
+    in_unit = draft.observation | {name: vector.model_copy(update={"unit": unit})}
+    sentence = undeclared_units_sentence(
+        without_units, draft.model_copy(update={"observation": in_unit})
+    )
+    assert (f"{vector.variables[0]} ({unit})" in sentence) == is_named
+    assert (sentence != "") == is_named
+
+
+def test_a_variable_with_a_unit_is_not_doubted(room):
+    assert undeclared_units_sentence(room, parse_draft(room)) == ""
 
 
 LIMITED = changed(WING_BINDING, limits={"step_time": 3.0, "memory": 500.0})

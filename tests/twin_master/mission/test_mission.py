@@ -120,6 +120,15 @@ def test_failing_gauges_are_noticed(whole_flight):
     assert whole_flight.flight.notices
 
 
+@pytest.mark.parametrize("whole_flight", ["failing_gauges"], indirect=True)
+def test_notices_are_records_of_the_log_as_they_are_given(whole_flight, tmp_path, caplog):
+    with caplog.at_level("INFO", logger="uav_twin"):
+        flight = part(whole_flight.known, tmp_path)
+    messages = [record.message for record in caplog.records if record.name.endswith("mission.loop")]
+    assert messages
+    assert messages == [notice.sentence for _, notice in flight.notices]
+
+
 WITHOUT = "import sys; sys.modules['numba'] = None; from uav_twin import cli; cli.main()"
 
 
