@@ -125,7 +125,7 @@ def _print_report(file: Path, report: "DeckReport", tolerance: float) -> None:
     from fe.solver_deck.regions import COMPARED_DENSITY
 
     rows = [
-        (f"displacements under {name}", f"{value:.1e}", f"{tolerance:.0e}")
+        (f"displacements under {name}", f"{value:.1e}", f"{report.load_limits[name]:.0e}")
         for name, value in report.load_deviations.items()
     ]
     if len(report.frequencies):

@@ -59,16 +59,33 @@ class CalculixJobs:
     time_limit: float
 
     def matrices(
-        self, name: str, blocks: Sequence[KeywordBlock], *, free: bool = False
+        self,
+        name: str,
+        blocks: Sequence[KeywordBlock],
+        *,
+        free: bool = False,
+        step_lines: Sequence[str] = (),
     ) -> StoredMatrices:
-        """Return the matrices of the model with other blocks; `free` as in `LinearModel.text`.
+        """Return the matrices of the model with other blocks.
+
+        Parameters
+        ----------
+        name : str
+            Name of the job.
+        blocks : sequence of KeywordBlock
+            The blocks of the model.
+        free : bool
+            As in `LinearModel.text`.
+        step_lines : sequence of str
+            Further lines of the step.
 
         Raises
         ------
         CalculixError
             If CalculiX fails.
         """
-        self._run(name, self.model.text(_STORE_MATRICES, blocks=blocks, free=free))
+        lines = [*_STORE_MATRICES, *step_lines]
+        self._run(name, self.model.text(lines, blocks=blocks, free=free))
         if not (self.folder / f"{name}.sti").is_file():
             raise CalculixError(
                 f"{self.model.path}: CalculiX has stored no stiffness matrix; the deck needs "

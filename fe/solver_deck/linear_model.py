@@ -20,6 +20,9 @@ from .mesh_of_deck import DeckMesh, read_deck_mesh
 ContactChoice = Literal["tied", "open"]
 """What becomes of contact pairs: surfaces that stick to each other, or that do not touch."""
 
+_LONGEST_NUMBER = 20
+"""Characters of a number that CalculiX reads; it cuts off others without a word."""
+
 TRANSLATIONS = (1, 2, 3)
 ROTATIONS = (4, 5, 6)
 
@@ -66,7 +69,6 @@ _LEFT_OUT = {
     "DAMPING": "damping is left out; write it into the table [damping]",
     "DASHPOT": "dashpots are left out; write damping into the table [damping]",
     "MODEL CHANGE": "changes of the model during the analysis are left out",
-    "DSLOAD": "*DSLOAD is left out; write the pressure as *DLOAD on faces of elements",
 }
 """Keywords that are left out, with the sentence that says so."""
 
@@ -158,6 +160,12 @@ class LinearModel:
         for step in steps:
             lines += ["*STEP", *step, "*END STEP"]
         return "\n".join(lines) + "\n"
+
+
+def real_text(value: float) -> str:
+    """Return a number in at most the 20 characters that CalculiX reads of it."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_NUMBER else f"{value:.13e}"
 
 
 def block_lines(block: KeywordBlock) -> list[str]:

@@ -37,6 +37,11 @@ class DeckElement:
     type_name: str
     nodes: tuple[int, ...]
 
+    @property
+    def has_rotations(self) -> bool:
+        """Whether the nodes bear moments, as those of shells and beams do."""
+        return re.fullmatch(r"S\d.*|B\d.*", self.type_name) is not None
+
 
 @dataclass
 class DeckMesh:
