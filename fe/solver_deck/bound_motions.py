@@ -235,7 +235,7 @@ def _signs_by_displacements(
         DeckLoad("moment", lines=["*CLOAD", f"{node},{direction},1."])
         for node, direction in rotations
     ]
-    printed = jobs.displacements(loads, blocks)
+    printed = jobs.displacements(loads, blocks, preloaded=False)
     reader = MotionReader(matrices.places)
     signs = {}
     for place, solution, displacements in zip(rotations, solutions.T, printed, strict=True):
@@ -338,15 +338,17 @@ def _rotations_of_rigid_sections(
 def _free_number(jobs: CalculixJobs) -> int:
     """Return the first number that no node and no element of the deck has."""
     mesh = jobs.model.mesh
-    return max(*mesh.points, *mesh.elements) + 1
+    largest_node = max(mesh.points)
+    largest_element = max(mesh.elements)
+    return max(largest_node, largest_element) + 1
 
 
 def _added_nodes(jobs: CalculixJobs, positions: Mapping[int, int]) -> list[KeywordBlock]:
     """Return the *NODE of added nodes, each at the position of a node of the deck."""
     lines = []
     for added, node in positions.items():
-        coordinates = jobs.model.mesh.points[node].tolist()
-        lines.append(DataLine("", [str(added), *map(real_text, coordinates)]))
+        coordinates = [real_text(value) for value in jobs.model.mesh.points[node].tolist()]
+        lines.append(DataLine("", [str(added), *coordinates]))
     return [KeywordBlock("", "NODE", {}, lines)]
 
 

@@ -10,22 +10,19 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import ArpackError
 
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError, FiniteElementError, SolutionError
 from fe.structure.abaqus import KeywordBlock
-from fe.structure.affine import natural_frequencies, static_responses
-from fe.structure.matrix_files import READ_WEIGHTS
-from fe.structure.operators import assemble_structure
-from fe.structure.tables import UNITS
 from fe.verification.calculix_run import required_calculix
 
 from .bound_motions import MOST_MOMENTS, read_rotations, read_tied_motions
 from .calculix_jobs import CalculixJobs, StoredMatrices
+from .comparison import DeckReport, compare_with_calculix, refuse_deviations
 from .linear_model import (
-    TRANSLATIONS,
     ContactChoice,
-    HeldMotion,
     LinearModel,
+    PreloadChoice,
     read_linear_model,
 )
 from .loads import DeckLoad, read_loads
@@ -47,13 +44,8 @@ from .structure_file import (
 
 _CHANGED_MODULUS = 0.5
 """By what the modulus of a region is multiplied to find its stiffness."""
-_COMPARED_MODES = 6
-MOMENT_TOLERANCE = 1e-4
-"""Deviation that is accepted under moments on beams, if the tolerance is smaller.
-
-CalculiX changes the weights of the mean rotation of a beam's section by up to 1e-5 at random
-(routine usermpc.f), so that no two of its runs agree better.
-"""
+_LIFT = 5e-4
+"""Part of the stiffness that is added before it is tested whether what remains is indefinite."""
 _ROUNDING = 1e-12
 """A region changes nothing if it changes no entry by this fraction of the largest one."""
 
@@ -71,6 +63,8 @@ class DeckOptions:
         empty, they are chosen.
     contact : "tied" or "open"
         What becomes of contact pairs.
+    preload : "tangent" or "none"
+        What becomes of a preload.
     time_limit : float
         Time that a run of CalculiX may take [s].
     tolerance : float
@@ -81,44 +75,9 @@ class DeckOptions:
     regions: Sequence[str] = ()
     outputs: Sequence[str] = ()
     contact: ContactChoice = "tied"
+    preload: PreloadChoice = "tangent"
     time_limit: float = 600.0
     tolerance: float = 1e-5
-
-
-@dataclass(frozen=True)
-class DeckReport:
-    """A structure that was made from a deck, and how it agrees with CalculiX.
-
-    Attributes
-    ----------
-    unknowns : int
-        Number of unknowns.
-    regions : list of Region
-        The regions that may lose stiffness.
-    load_deviations : dict of str to float
-        For each load the largest difference of a nodal displacement to that of CalculiX, over the
-        largest displacement.
-    load_limits : dict of str to float
-        For each load the largest deviation that is accepted.
-    has_mass : bool
-        Whether the deck has a density.
-    frequencies : (m,) array
-        Lowest frequencies [Hz]. If the deck has no density, they are those with the density
-        `COMPARED_DENSITY`, and serve for the comparison alone.
-    frequency_deviation : float
-        Largest relative difference of a frequency to that of CalculiX.
-    remarks : list of str
-        Sentences on what is linearised and what is left out.
-    """
-
-    unknowns: int
-    regions: list[Region]
-    load_deviations: dict[str, float]
-    load_limits: dict[str, float]
-    has_mass: bool
-    frequencies: FloatArray
-    frequency_deviation: float
-    remarks: list[str]
 
 
 def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
@@ -168,14 +127,16 @@ def _sentence_on_deck(deck: Path, folder: Path, message: str) -> str:
 def _convert(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
     """Write a deck as a structure; the parameters are those of `convert_deck`."""
     required_calculix()
-    model = read_linear_model(deck, options.contact)
+    model = read_linear_model(deck, options.contact, options.preload)
     regions = choose_regions(model, options.regions)
     jobs = CalculixJobs(model, folder / "calculix", options.time_limit)
     blocks = with_densities(model, with_own_materials(model, regions))
     structure, remarks = _structure_of_deck(jobs, blocks, regions, options)
     file = write_structure_files(structure, folder, name)
-    report = _compare(file, structure, jobs, blocks, [*model.remarks, *remarks], options.tolerance)
-    _refuse_deviations(deck, report, options.tolerance)
+    report = compare_with_calculix(
+        file, structure, jobs, blocks, [*model.remarks, *remarks], options.tolerance
+    )
+    refuse_deviations(deck, report, options.tolerance)
     if not model.has_mass:
         sparse.save_npz(folder / MASS_FILE, 0.0 * structure.matrices.mass)
     return report
@@ -186,26 +147,37 @@ def _structure_of_deck(
 ) -> tuple[DeckStructure, list[str]]:
     """Return a deck as matrices, and sentences on loads that are left out."""
     model = jobs.model
-    matrices = jobs.matrices("whole", blocks)
+    unloaded = jobs.matrices("whole", blocks)
+    matrices = _preloaded_matrices(jobs, blocks, unloaded)
     remarks: list[str] = []
     region_stiffness = {}
     for number, region in enumerate(regions, start=1):
         changed = jobs.matrices(
             f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
         )
-        if changed.places != matrices.places:
+        if changed.places != unloaded.places:
             raise CalculixError(
                 f"{model.path}: the matrices of one run have other rows when the modulus of "
                 f"{region.set_name} changes; name other regions by --region."
             )
-        difference = matrices.stiffness - changed.stiffness
-        if abs(difference).max() > _ROUNDING * abs(matrices.stiffness).max():
+        difference = unloaded.stiffness - changed.stiffness
+        if abs(difference).max() > _ROUNDING * abs(unloaded.stiffness).max():
             region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
         else:
             remarks.append(
                 f"{region.set_name} is no region: its modulus changes nothing that can move"
             )
-    chosen = _choose_loads(jobs, blocks, matrices)
+    if model.preload and region_stiffness:
+        weight = _stable_weight(model, matrices.stiffness, list(region_stiffness.values()))
+        region_stiffness = {
+            region: weight * stiffness for region, stiffness in region_stiffness.items()
+        }
+        if weight < 1.0:
+            remarks.append(
+                f"a loss of 1 of a region stands for a loss of {weight:.1f} of its modulus: with "
+                "more in all regions, the preload would make the structure unstable"
+            )
+    chosen = _choose_loads(jobs, blocks, unloaded)
     remarks += chosen.remarks
     if not model.has_mass:
         remarks.append("the deck has no *DENSITY: the structure has no mass, hence no modes")
@@ -219,6 +191,69 @@ def _structure_of_deck(
         length_unit=options.length_unit,
     )
     return structure, remarks
+
+
+def _stable_weight(
+    model: LinearModel, stiffness: sparse.csr_array, regions: Sequence[sparse.csr_array]
+) -> float:
+    """Return which part of the regions' stiffness a preloaded structure can lose in all of them.
+
+    Parameters
+    ----------
+    model : LinearModel
+        The model of the deck.
+    stiffness : sparse (n, n) array
+        The stiffness with the preload.
+    regions : sequence of sparse (n, n) array
+        The stiffness of each region without preload.
+
+    Returns
+    -------
+    float
+        The largest tenth at which the remaining stiffness is not indefinite.
+
+    Raises
+    ------
+    SolutionError
+        If a loss of a tenth makes the structure unstable.
+    """
+    lost = regions[0]
+    for region in regions[1:]:
+        lost = lost + region
+    for tenths in range(10, 0, -1):
+        # A small part of the stiffness lifts what is exactly singular without the regions.
+        remaining = stiffness * (1.0 + _LIFT) - 0.1 * tenths * lost
+        try:
+            Factorisation(sparse.csr_array(remaining))
+        except SolutionError:
+            continue
+        return 0.1 * tenths
+    raise SolutionError(
+        f"{model.path}: the preload makes the structure unstable if its regions lose a tenth of "
+        "their stiffness; leave it out by --preload none, or lower it."
+    )
+
+
+def _preloaded_matrices(
+    jobs: CalculixJobs, blocks: list[KeywordBlock], unloaded: StoredMatrices
+) -> StoredMatrices:
+    """Return the matrices at the end of the preload; those of the unloaded structure without one.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX fails, or if the preload changes which motions are unknowns.
+    """
+    if not jobs.model.preload:
+        return unloaded
+    preloaded = jobs.matrices("preloaded", blocks, preloaded=True)
+    if preloaded.places != unloaded.places:
+        raise CalculixError(
+            f"{jobs.model.path}: the matrices after the preload have other rows than those before "
+            "it, as where the preload has forces on nodes of shells or beams; leave it out by "
+            "--preload none."
+        )
+    return preloaded
 
 
 class _ChosenLoads(NamedTuple):
@@ -349,105 +384,3 @@ def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatr
         else:
             matched.append(0.0)
     return np.array(matched)
-
-
-def _compare(
-    file: Path,
-    structure: DeckStructure,
-    jobs: CalculixJobs,
-    blocks: list[KeywordBlock],
-    remarks: list[str],
-    tolerance: float,
-) -> DeckReport:
-    """Return how a structure file agrees with CalculiX in statics and frequencies."""
-    assembled = assemble_structure(file)
-    deviations = {}
-    if structure.loads:
-        # Our factors come first: they refuse a mechanism, on which CalculiX computes nonsense.
-        responses = static_responses(assembled)
-        printed = jobs.displacements(structure.loads, blocks)
-        for load, theirs in zip(structure.loads, printed, strict=True):
-            ours = assembled.full_displacement(responses[load.name].displacement)
-            scale = UNITS[structure.length_unit]
-            largest = float(np.abs(responses[load.name].displacement).max()) / scale
-            deviations[load.name] = _largest_deviation(structure, ours / scale, theirs, largest)
-    frequencies = np.empty(0)
-    frequency_deviation = 0.0
-    if assembled.unknowns > 1:
-        count = min(_COMPARED_MODES, max(1, assembled.unknowns // 4))
-        frequencies = natural_frequencies(assembled, count).frequency
-        calculix_frequencies = jobs.frequencies(count, blocks)
-        frequencies = frequencies[: len(calculix_frequencies)]
-        frequency_deviation = float(np.abs(frequencies / calculix_frequencies - 1.0).max())
-    return DeckReport(
-        unknowns=assembled.unknowns,
-        regions=list(structure.region_stiffness),
-        load_deviations=deviations,
-        load_limits={
-            load.name: _limit(structure.model, load, tolerance) for load in structure.loads
-        },
-        has_mass=structure.model.has_mass,
-        frequencies=frequencies,
-        frequency_deviation=frequency_deviation,
-        remarks=remarks,
-    )
-
-
-def _limit(model: LinearModel, load: DeckLoad, tolerance: float) -> float:
-    """Return the largest deviation that is accepted under a load."""
-    of_beams = {
-        node
-        for element in model.mesh.elements.values()
-        if element.type_name.startswith("B")
-        for node in element.nodes
-    }
-    if any(node in of_beams for node, _ in load.moments):
-        return max(tolerance, MOMENT_TOLERANCE)
-    return tolerance
-
-
-def _largest_deviation(
-    structure: DeckStructure,
-    ours: FloatArray,
-    theirs: dict[int, FloatArray],
-    largest_of_rows: float,
-) -> float:
-    """Return the largest difference of a nodal displacement, over the largest displacement.
-
-    The largest displacement is that of any node, or of any row: under torsion of a straight beam
-    its section alone moves.
-    """
-    counts = structure.row_counts()
-    held = set(structure.model.held)
-    nodes = sorted({node for node, _ in structure.matrices.places})
-    differences = [0.0]
-    largest = max(largest_of_rows, *(float(np.abs(row).max()) for row in theirs.values()))
-    for node, displacement in zip(nodes, ours, strict=True):
-        for axis in TRANSLATIONS:
-            is_read = counts.get((node, axis)) in READ_WEIGHTS
-            if node in theirs and is_read and HeldMotion(node, axis) not in held:
-                differences.append(abs(float(displacement[axis - 1] - theirs[node][axis - 1])))
-    return max(differences) / largest if largest > 0.0 else 0.0
-
-
-def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
-    """Raise `CalculixError` if the structure deviates from CalculiX, or nothing was compared."""
-    if not report.load_deviations and not len(report.frequencies):
-        raise CalculixError(
-            f"{deck}: a structure of {report.unknowns} unknown has no frequency that could be "
-            "compared with CalculiX, and no load of the deck was read; add a *STEP with *STATIC "
-            "and a *CLOAD."
-        )
-    deviations = {
-        f"displacements under {name}": value for name, value in report.load_deviations.items()
-    }
-    limits = {f"displacements under {name}": value for name, value in report.load_limits.items()}
-    deviations["frequencies"] = report.frequency_deviation
-    limits["frequencies"] = tolerance
-    worst = max(deviations, key=lambda name: deviations[name] / limits[name])
-    if not deviations[worst] <= limits[worst]:
-        raise CalculixError(
-            f"{deck}: the matrices and CalculiX must agree to {limits[worst]:g}, but the {worst} "
-            f"differ by {deviations[worst]:.2g}; no structure was written. Remove what is not "
-            "linear, or allow more by --tolerance."
-        )

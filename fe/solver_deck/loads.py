@@ -19,6 +19,9 @@ from .pressures import (
 )
 from .shell_sides import ShellGeometry, ShellSide
 
+_SECTORS = 180
+"""CalculiX models two degrees of an axisymmetric body; a force in a deck is that on the whole."""
+
 
 @dataclass
 class DeckLoad:
@@ -167,7 +170,10 @@ def _nodal_load(model: LinearModel, where: str, values: Sequence[str]) -> DeckLo
     }
     if transformed.intersection(nodes):
         raise NotReadError("a force in the axes of *TRANSFORM is left out; give it along x, y, z")
-    at_nodes = {(node, direction): value for node in nodes}
+    axisymmetric = model.mesh.axisymmetric_nodes
+    at_nodes = {
+        (node, direction): value / _SECTORS if node in axisymmetric else value for node in nodes
+    }
     if direction in ROTATIONS:
         return DeckLoad("moment", moments=at_nodes)
     return DeckLoad("force", forces=at_nodes)

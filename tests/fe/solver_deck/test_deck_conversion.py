@@ -10,7 +10,8 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
-from fe.solver_deck.conversion import DeckOptions, DeckReport, convert_deck
+from fe.solver_deck.comparison import DeckReport
+from fe.solver_deck.conversion import DeckOptions, convert_deck
 from fe.solver_deck.linear_model import read_linear_model
 from fe.solver_deck.loads import DeckLoads, read_loads
 from fe.solver_deck.shell_sides import ShellSide

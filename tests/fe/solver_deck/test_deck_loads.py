@@ -8,7 +8,8 @@ import pytest
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
-from fe.solver_deck.conversion import DeckOptions, DeckReport, convert_deck
+from fe.solver_deck.comparison import DeckReport
+from fe.solver_deck.conversion import DeckOptions, convert_deck
 from fe.solver_deck.linear_model import read_linear_model, real_text
 from fe.solver_deck.loads import DeckLoads, read_loads
 from fe.solver_deck.shell_sides import ShellSide
