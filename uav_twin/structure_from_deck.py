@@ -13,7 +13,7 @@ from reporting.files import explained_write_errors, refuse_filled
 from reporting.progress import stage
 
 if TYPE_CHECKING:
-    from fe.solver_deck.conversion import DeckReport
+    from fe.solver_deck.comparison import DeckReport
 
 
 def from_deck(
@@ -53,6 +53,14 @@ def from_deck(
         Literal["tied", "open"],
         typer.Option("--contact", help="What becomes of contact pairs."),
     ] = "tied",
+    preload: Annotated[
+        Literal["tangent", "none"],
+        typer.Option(
+            "--preload",
+            help="What becomes of static steps before a step with PERTURBATION: the stiffness at "
+            "their end, or that of the unloaded structure.",
+        ),
+    ] = "tangent",
     time_limit: Annotated[
         float,
         typer.Option("--time-limit", min=1.0, help="Seconds that one run of CalculiX may take."),
@@ -85,6 +93,7 @@ def from_deck(
         regions=region or (),
         outputs=output or (),
         contact=contact,
+        preload=preload,
         time_limit=time_limit,
         tolerance=tolerance,
     )
@@ -125,7 +134,7 @@ def _print_report(file: Path, report: "DeckReport", tolerance: float) -> None:
     from fe.solver_deck.regions import COMPARED_DENSITY
 
     rows = [
-        (f"displacements under {name}", f"{value:.1e}", f"{tolerance:.0e}")
+        (f"displacements under {name}", f"{value:.1e}", f"{report.load_limits[name]:.0e}")
         for name, value in report.load_deviations.items()
     ]
     if len(report.frequencies):

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
@@ -59,16 +58,35 @@ class CalculixJobs:
     time_limit: float
 
     def matrices(
-        self, name: str, blocks: Sequence[KeywordBlock], *, free: bool = False
+        self,
+        name: str,
+        blocks: Sequence[KeywordBlock],
+        *,
+        free: bool = False,
+        preloaded: bool = False,
+        step_lines: Sequence[str] = (),
     ) -> StoredMatrices:
-        """Return the matrices of the model with other blocks; `free` as in `LinearModel.text`.
+        """Return the matrices of the model with other blocks.
+
+        Parameters
+        ----------
+        name : str
+            Name of the job.
+        blocks : sequence of KeywordBlock
+            The blocks of the model.
+        free, preloaded : bool
+            As in `LinearModel.text`.
+        step_lines : sequence of str
+            Further lines of the step.
 
         Raises
         ------
         CalculixError
             If CalculiX fails.
         """
-        self._run(name, self.model.text(_STORE_MATRICES, blocks=blocks, free=free))
+        lines = [*_STORE_MATRICES, *step_lines]
+        text = self.model.text(lines, blocks=blocks, free=free, preloaded=preloaded)
+        self._run(name, text)
         if not (self.folder / f"{name}.sti").is_file():
             raise CalculixError(
                 f"{self.model.path}: CalculiX has stored no stiffness matrix; the deck needs "
@@ -83,9 +101,22 @@ class CalculixJobs:
         return StoredMatrices(stiffness, mass, places)
 
     def displacements(
-        self, loads: Sequence[DeckLoad], blocks: Sequence[KeywordBlock]
+        self,
+        loads: Sequence[DeckLoad],
+        blocks: Sequence[KeywordBlock],
+        *,
+        preloaded: bool = True,
     ) -> list[dict[int, FloatArray]]:
         """Return the displacement (3,) of each node under each load alone, in the deck's unit.
+
+        Parameters
+        ----------
+        loads : sequence of DeckLoad
+            The loads.
+        blocks : sequence of KeywordBlock
+            The blocks of the model.
+        preloaded : bool
+            Whether they follow the preload, if the model has one.
 
         Raises
         ------
@@ -97,8 +128,15 @@ class CalculixJobs:
             other_loads_end = ["*CLOAD, OP=NEW", "*DLOAD, OP=NEW"]
             prints = [f"*NODE PRINT, NSET={ALL_NODES}, GLOBAL=YES", "U"]
             steps.append(["*STATIC", *other_loads_end, *load.lines, *prints])
-        text = self.model.text(*steps, blocks=[*blocks, self._set_of_all_nodes()])
-        tables = read_tables(self._run("static", text)).get(ALL_NODES, [])
+        # A second step of small changes would forget the preload.
+        jobs = [steps]
+        if preloaded and self.model.preload:
+            jobs = [[step] for step in steps]
+        blocks = [*blocks, self._set_of_all_nodes()]
+        tables: list[FloatArray] = []
+        for job in jobs:
+            text = self.model.text(*job, blocks=blocks, preloaded=preloaded)
+            tables += read_tables(self._run("static", text)).get(ALL_NODES, [])
         if len(tables) != len(loads):
             raise CalculixError(
                 f"{self.model.path}: CalculiX printed {len(tables)} static solutions instead of "
@@ -114,7 +152,7 @@ class CalculixJobs:
         CalculixError
             If CalculiX fails.
         """
-        text = self.model.text(["*FREQUENCY", str(count)], blocks=blocks)
+        text = self.model.text(["*FREQUENCY", str(count)], blocks=blocks, preloaded=True)
         return read_frequencies(self._run("modes", text))[:count]
 
     def _set_of_all_nodes(self) -> KeywordBlock:
@@ -122,8 +160,9 @@ class CalculixJobs:
         numbers = sorted(
             {node for element in self.model.mesh.elements.values() for node in element.nodes}
         )
-        rows = np.array_split(np.array(numbers), max(1, len(numbers) // _MEMBERS_IN_LINE))
-        data = [DataLine("", [str(number) for number in row.tolist()]) for row in rows]
+        starts = range(0, len(numbers), _MEMBERS_IN_LINE)
+        rows = [numbers[start : start + _MEMBERS_IN_LINE] for start in starts]
+        data = [DataLine("", [str(number) for number in row]) for row in rows]
         return KeywordBlock("", "NSET", {"NSET": ALL_NODES}, data)
 
     def _run(self, name: str, text: str) -> str:

@@ -4,22 +4,27 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import ArpackError
 
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError, FiniteElementError, SolutionError
 from fe.structure.abaqus import KeywordBlock
-from fe.structure.affine import natural_frequencies, static_responses
-from fe.structure.matrix_files import READ_WEIGHTS
-from fe.structure.operators import assemble_structure
-from fe.structure.tables import UNITS
 from fe.verification.calculix_run import required_calculix
 
+from .bound_motions import MOST_MOMENTS, read_rotations, read_tied_motions
 from .calculix_jobs import CalculixJobs, StoredMatrices
-from .linear_model import TRANSLATIONS, ContactChoice, HeldMotion, read_linear_model
+from .comparison import DeckReport, compare_with_calculix, refuse_deviations
+from .linear_model import (
+    ContactChoice,
+    LinearModel,
+    PreloadChoice,
+    read_linear_model,
+)
 from .loads import DeckLoad, read_loads
 from .regions import (
     Region,
@@ -28,18 +33,19 @@ from .regions import (
     with_own_materials,
     with_scaled_modulus,
 )
+from .row_vectors import LoadRows
 from .structure_file import (
     MASS_FILE,
     DeckStructure,
     choose_output_sets,
-    has_rows_for,
     row_counts,
     write_structure_files,
 )
 
 _CHANGED_MODULUS = 0.5
 """By what the modulus of a region is multiplied to find its stiffness."""
-_COMPARED_MODES = 6
+_LIFT = 5e-4
+"""Part of the stiffness that is added before it is tested whether what remains is indefinite."""
 _ROUNDING = 1e-12
 """A region changes nothing if it changes no entry by this fraction of the largest one."""
 
@@ -57,6 +63,8 @@ class DeckOptions:
         empty, they are chosen.
     contact : "tied" or "open"
         What becomes of contact pairs.
+    preload : "tangent" or "none"
+        What becomes of a preload.
     time_limit : float
         Time that a run of CalculiX may take [s].
     tolerance : float
@@ -67,41 +75,9 @@ class DeckOptions:
     regions: Sequence[str] = ()
     outputs: Sequence[str] = ()
     contact: ContactChoice = "tied"
+    preload: PreloadChoice = "tangent"
     time_limit: float = 600.0
     tolerance: float = 1e-5
-
-
-@dataclass(frozen=True)
-class DeckReport:
-    """A structure that was made from a deck, and how it agrees with CalculiX.
-
-    Attributes
-    ----------
-    unknowns : int
-        Number of unknowns.
-    regions : list of Region
-        The regions that may lose stiffness.
-    load_deviations : dict of str to float
-        For each load the largest difference of a nodal displacement to that of CalculiX, over the
-        largest displacement.
-    has_mass : bool
-        Whether the deck has a density.
-    frequencies : (m,) array
-        Lowest frequencies [Hz]. If the deck has no density, they are those with the density
-        `COMPARED_DENSITY`, and serve for the comparison alone.
-    frequency_deviation : float
-        Largest relative difference of a frequency to that of CalculiX.
-    remarks : list of str
-        Sentences on what is linearised and what is left out.
-    """
-
-    unknowns: int
-    regions: list[Region]
-    load_deviations: dict[str, float]
-    has_mass: bool
-    frequencies: FloatArray
-    frequency_deviation: float
-    remarks: list[str]
 
 
 def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
@@ -151,14 +127,16 @@ def _sentence_on_deck(deck: Path, folder: Path, message: str) -> str:
 def _convert(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
     """Write a deck as a structure; the parameters are those of `convert_deck`."""
     required_calculix()
-    model = read_linear_model(deck, options.contact)
+    model = read_linear_model(deck, options.contact, options.preload)
     regions = choose_regions(model, options.regions)
     jobs = CalculixJobs(model, folder / "calculix", options.time_limit)
     blocks = with_densities(model, with_own_materials(model, regions))
     structure, remarks = _structure_of_deck(jobs, blocks, regions, options)
     file = write_structure_files(structure, folder, name)
-    report = _compare(file, structure, jobs, blocks, [*model.remarks, *remarks])
-    _refuse_deviations(deck, report, options.tolerance)
+    report = compare_with_calculix(
+        file, structure, jobs, blocks, [*model.remarks, *remarks], options.tolerance
+    )
+    refuse_deviations(deck, report, options.tolerance)
     if not model.has_mass:
         sparse.save_npz(folder / MASS_FILE, 0.0 * structure.matrices.mass)
     return report
@@ -169,51 +147,195 @@ def _structure_of_deck(
 ) -> tuple[DeckStructure, list[str]]:
     """Return a deck as matrices, and sentences on loads that are left out."""
     model = jobs.model
-    matrices = jobs.matrices("whole", blocks)
+    unloaded = jobs.matrices("whole", blocks)
+    matrices = _preloaded_matrices(jobs, blocks, unloaded)
     remarks: list[str] = []
     region_stiffness = {}
     for number, region in enumerate(regions, start=1):
         changed = jobs.matrices(
             f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
         )
-        if changed.places != matrices.places:
+        if changed.places != unloaded.places:
             raise CalculixError(
                 f"{model.path}: the matrices of one run have other rows when the modulus of "
                 f"{region.set_name} changes; name other regions by --region."
             )
-        difference = matrices.stiffness - changed.stiffness
-        if abs(difference).max() > _ROUNDING * abs(matrices.stiffness).max():
+        difference = unloaded.stiffness - changed.stiffness
+        if abs(difference).max() > _ROUNDING * abs(unloaded.stiffness).max():
             region_stiffness[region] = (difference / (1.0 - _CHANGED_MODULUS)).tocsr()
         else:
             remarks.append(
                 f"{region.set_name} is no region: its modulus changes nothing that can move"
             )
-    deck_loads = read_loads(model)
-    remarks += deck_loads.remarks
-    counts = row_counts(matrices.places)
-    loads = []
-    for load in deck_loads.loads:
-        if load.acceleration is not None and not model.has_mass:
-            remarks.append(f"the load {load.name} is left out: the deck has no *DENSITY")
-        elif has_rows_for(load, counts, set(model.held)):
-            loads.append(load)
-        else:
+    if model.preload and region_stiffness:
+        weight = _stable_weight(model, matrices.stiffness, list(region_stiffness.values()))
+        region_stiffness = {
+            region: weight * stiffness for region, stiffness in region_stiffness.items()
+        }
+        if weight < 1.0:
             remarks.append(
-                f"the load {load.name} is left out: it acts on nodes that the matrices do not "
-                "have, such as those of a tied surface"
+                f"a loss of 1 of a region stands for a loss of {weight:.1f} of its modulus: with "
+                "more in all regions, the preload would make the structure unstable"
             )
+    chosen = _choose_loads(jobs, blocks, unloaded)
+    remarks += chosen.remarks
     if not model.has_mass:
         remarks.append("the deck has no *DENSITY: the structure has no mass, hence no modes")
     structure = DeckStructure(
         model=model,
         matrices=matrices,
         region_stiffness=region_stiffness,
-        loads=loads,
-        gravity_forces=_gravity_forces(jobs, blocks, loads, matrices),
-        output_sets=choose_output_sets(model, counts, options.outputs),
+        loads=chosen.loads,
+        load_vectors=chosen.vectors,
+        output_sets=choose_output_sets(model, row_counts(matrices.places), options.outputs),
         length_unit=options.length_unit,
     )
     return structure, remarks
+
+
+def _stable_weight(
+    model: LinearModel, stiffness: sparse.csr_array, regions: Sequence[sparse.csr_array]
+) -> float:
+    """Return which part of the regions' stiffness a preloaded structure can lose in all of them.
+
+    Parameters
+    ----------
+    model : LinearModel
+        The model of the deck.
+    stiffness : sparse (n, n) array
+        The stiffness with the preload.
+    regions : sequence of sparse (n, n) array
+        The stiffness of each region without preload.
+
+    Returns
+    -------
+    float
+        The largest tenth at which the remaining stiffness is not indefinite.
+
+    Raises
+    ------
+    SolutionError
+        If a loss of a tenth makes the structure unstable.
+    """
+    lost = regions[0]
+    for region in regions[1:]:
+        lost = lost + region
+    for tenths in range(10, 0, -1):
+        # A small part of the stiffness lifts what is exactly singular without the regions.
+        remaining = stiffness * (1.0 + _LIFT) - 0.1 * tenths * lost
+        try:
+            Factorisation(sparse.csr_array(remaining))
+        except SolutionError:
+            continue
+        return 0.1 * tenths
+    raise SolutionError(
+        f"{model.path}: the preload makes the structure unstable if its regions lose a tenth of "
+        "their stiffness; leave it out by --preload none, or lower it."
+    )
+
+
+def _preloaded_matrices(
+    jobs: CalculixJobs, blocks: list[KeywordBlock], unloaded: StoredMatrices
+) -> StoredMatrices:
+    """Return the matrices at the end of the preload; those of the unloaded structure without one.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX fails, or if the preload changes which motions are unknowns.
+    """
+    if not jobs.model.preload:
+        return unloaded
+    preloaded = jobs.matrices("preloaded", blocks, preloaded=True)
+    if preloaded.places != unloaded.places:
+        raise CalculixError(
+            f"{jobs.model.path}: the matrices after the preload have other rows than those before "
+            "it, as where the preload has forces on nodes of shells or beams; leave it out by "
+            "--preload none."
+        )
+    return preloaded
+
+
+class _ChosenLoads(NamedTuple):
+    """The loads that act on a structure, and sentences on those that are left out.
+
+    Attributes
+    ----------
+    loads : list of DeckLoad
+        The loads.
+    vectors : dict of str to (n,) array
+        The forces of those that nodes and directions alone do not describe.
+    remarks : list of str
+        The sentences.
+    """
+
+    loads: list[DeckLoad]
+    vectors: dict[str, FloatArray]
+    remarks: list[str]
+
+
+def _choose_loads(
+    jobs: CalculixJobs, blocks: list[KeywordBlock], matrices: StoredMatrices
+) -> _ChosenLoads:
+    """Return the loads of a deck whose action on the rows of the matrices is known."""
+    deck_loads = read_loads(jobs.model)
+    remarks = list(deck_loads.remarks)
+    load_rows = _load_rows(jobs, blocks, matrices, deck_loads.loads)
+    loads = []
+    for load in deck_loads.loads:
+        if load.acceleration is not None and not jobs.model.has_mass:
+            remarks.append(f"the load {load.name} is left out: the deck has no *DENSITY")
+        elif load_rows.missing_rotations(load):
+            node, _ = load_rows.missing_rotations(load)[0]
+            remarks.append(
+                f"the load {load.name} is left out: node {node} has no rotation on which its "
+                "moment could act"
+            )
+        elif load_rows.missing(load):
+            remarks.append(
+                f"the load {load.name} is left out: it acts on nodes whose motion does not follow "
+                "from the matrices, such as those of shells that are tied"
+            )
+        else:
+            loads.append(load)
+    vectors = _gravity_forces(jobs, blocks, loads, matrices)
+    for load in loads:
+        if load.name not in vectors and not load_rows.names_all(load):
+            vectors[load.name] = load_rows.vector(load)
+    return _ChosenLoads(loads, vectors, remarks)
+
+
+def _load_rows(
+    jobs: CalculixJobs,
+    blocks: list[KeywordBlock],
+    matrices: StoredMatrices,
+    loads: list[DeckLoad],
+) -> LoadRows:
+    """Return how the loads act on the rows, also where CalculiX has eliminated what they move."""
+    load_rows = LoadRows(matrices.places, set(jobs.model.held))
+    of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
+    with_rows = set(matrices.places)
+    tied = [
+        place
+        for load in loads
+        for place in load_rows.missing(load)
+        if place[0] in of_elements and place not in with_rows
+    ]
+    with_rotations = {
+        node
+        for element in jobs.model.mesh.elements.values()
+        if element.has_rotations
+        for node in element.nodes
+    }
+    rotations = [
+        place
+        for load in loads
+        for place in load_rows.missing_rotations(load)
+        if place[0] in with_rotations
+    ]
+    bound = read_tied_motions(jobs, blocks, matrices, list(dict.fromkeys(tied)))
+    bound |= read_rotations(jobs, blocks, matrices, list(dict.fromkeys(rotations))[:MOST_MOMENTS])
+    return LoadRows(matrices.places, load_rows.held, bound)
 
 
 def _gravity_forces(
@@ -262,78 +384,3 @@ def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatr
         else:
             matched.append(0.0)
     return np.array(matched)
-
-
-def _compare(
-    file: Path,
-    structure: DeckStructure,
-    jobs: CalculixJobs,
-    blocks: list[KeywordBlock],
-    remarks: list[str],
-) -> DeckReport:
-    """Return how a structure file agrees with CalculiX in statics and frequencies."""
-    assembled = assemble_structure(file)
-    deviations = {}
-    if structure.loads:
-        # Our factors come first: they refuse a mechanism, on which CalculiX computes nonsense.
-        responses = static_responses(assembled)
-        printed = jobs.displacements(structure.loads, blocks)
-        for load, theirs in zip(structure.loads, printed, strict=True):
-            ours = assembled.full_displacement(responses[load.name].displacement)
-            scale = UNITS[structure.length_unit]
-            deviations[load.name] = _largest_deviation(structure, ours / scale, theirs)
-    frequencies = np.empty(0)
-    frequency_deviation = 0.0
-    if assembled.unknowns > 1:
-        count = min(_COMPARED_MODES, max(1, assembled.unknowns // 4))
-        frequencies = natural_frequencies(assembled, count).frequency
-        calculix_frequencies = jobs.frequencies(count, blocks)
-        frequencies = frequencies[: len(calculix_frequencies)]
-        frequency_deviation = float(np.abs(frequencies / calculix_frequencies - 1.0).max())
-    return DeckReport(
-        unknowns=assembled.unknowns,
-        regions=list(structure.region_stiffness),
-        load_deviations=deviations,
-        has_mass=structure.model.has_mass,
-        frequencies=frequencies,
-        frequency_deviation=frequency_deviation,
-        remarks=remarks,
-    )
-
-
-def _largest_deviation(
-    structure: DeckStructure, ours: FloatArray, theirs: dict[int, FloatArray]
-) -> float:
-    """Return the largest difference of a nodal displacement, over the largest displacement."""
-    counts = structure.row_counts()
-    held = set(structure.model.held)
-    nodes = sorted({node for node, _ in structure.matrices.places})
-    differences = [0.0]
-    largest = max(float(np.abs(row).max()) for row in theirs.values())
-    for node, displacement in zip(nodes, ours, strict=True):
-        for axis in TRANSLATIONS:
-            is_read = counts.get((node, axis)) in READ_WEIGHTS
-            if node in theirs and is_read and HeldMotion(node, axis) not in held:
-                differences.append(abs(float(displacement[axis - 1] - theirs[node][axis - 1])))
-    return max(differences) / largest if largest > 0.0 else 0.0
-
-
-def _refuse_deviations(deck: Path, report: DeckReport, tolerance: float) -> None:
-    """Raise `CalculixError` if the structure deviates from CalculiX, or nothing was compared."""
-    if not report.load_deviations and not len(report.frequencies):
-        raise CalculixError(
-            f"{deck}: a structure of {report.unknowns} unknown has no frequency that could be "
-            "compared with CalculiX, and no load of the deck was read; add a *STEP with *STATIC "
-            "and a *CLOAD."
-        )
-    deviations = {
-        f"displacements under {name}": value for name, value in report.load_deviations.items()
-    }
-    deviations["frequencies"] = report.frequency_deviation
-    worst = max(deviations, key=lambda name: deviations[name])
-    if not deviations[worst] <= tolerance:
-        raise CalculixError(
-            f"{deck}: the matrices and CalculiX must agree to {tolerance:g}, but the {worst} "
-            f"differ by {deviations[worst]:.2g}; no structure was written. Remove what is not "
-            "linear, or allow more by --tolerance."
-        )

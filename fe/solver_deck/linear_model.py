@@ -6,7 +6,7 @@ sentence what is linearised and what is left out.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,12 @@ from .mesh_of_deck import DeckMesh, read_deck_mesh
 
 ContactChoice = Literal["tied", "open"]
 """What becomes of contact pairs: surfaces that stick to each other, or that do not touch."""
+
+PreloadChoice = Literal["tangent", "none"]
+"""What becomes of a preload: the stiffness at its end, or that of the unloaded structure."""
+
+_LONGEST_NUMBER = 20
+"""Characters of a number that CalculiX reads; it cuts off others without a word."""
 
 TRANSLATIONS = (1, 2, 3)
 ROTATIONS = (4, 5, 6)
@@ -66,7 +72,6 @@ _LEFT_OUT = {
     "DAMPING": "damping is left out; write it into the table [damping]",
     "DASHPOT": "dashpots are left out; write damping into the table [damping]",
     "MODEL CHANGE": "changes of the model during the analysis are left out",
-    "DSLOAD": "*DSLOAD is left out; write the pressure as *DLOAD on faces of elements",
 }
 """Keywords that are left out, with the sentence that says so."""
 
@@ -87,6 +92,22 @@ _NOT_IN_MODEL = {
     "TIME POINTS",
 }
 """Blocks before the first step that are no part of the linear model, or are written anew."""
+
+_WRITTEN_ANEW = {"BOUNDARY", "HEADING", "NODE FILE", "NODE PRINT"}
+"""Blocks before the first step of a preloaded model that are not part of it."""
+
+_OUTPUT = {
+    "CONTACT FILE",
+    "CONTACT PRINT",
+    "EL FILE",
+    "EL PRINT",
+    "ELEMENT OUTPUT",
+    "NODE FILE",
+    "NODE OUTPUT",
+    "NODE PRINT",
+    "SECTION PRINT",
+}
+"""Blocks of a step that print results."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +138,10 @@ class LinearModel:
         Sentences on what is linearised and left out.
     has_mass : bool
         Whether a material has a density.
+    preload : list of list of KeywordBlock
+        The blocks of the steps that preload the structure; empty if it is not preloaded.
+    preload_supports : list of KeywordBlock
+        The *BOUNDARY before these steps.
     """
 
     path: Path
@@ -126,12 +151,15 @@ class LinearModel:
     held: list[HeldMotion]
     remarks: list[str]
     has_mass: bool
+    preload: list[list[KeywordBlock]] = field(default_factory=list)
+    preload_supports: list[KeywordBlock] = field(default_factory=list)
 
     def text(
         self,
         *steps: Iterable[str],
         blocks: Sequence[KeywordBlock] | None = None,
         free: bool = False,
+        preloaded: bool = False,
     ) -> str:
         """Return the deck of this model with the given steps.
 
@@ -143,10 +171,14 @@ class LinearModel:
             Blocks of the model in place of its own.
         free : bool
             Whether the nodes can move along all axes; rotations stay held.
+        preloaded : bool
+            Whether the steps follow the preload, if the model has one.
         """
         lines = []
         for block in self.blocks if blocks is None else blocks:
             lines += block_lines(block)
+        if preloaded and self.preload:
+            return "\n".join([*lines, *self._preloaded_lines(steps)]) + "\n"
         directions = ROTATIONS if free else (*TRANSLATIONS, *ROTATIONS)
         supports = [
             f"{motion.node},{motion.direction}"
@@ -159,6 +191,29 @@ class LinearModel:
             lines += ["*STEP", *step, "*END STEP"]
         return "\n".join(lines) + "\n"
 
+    def _preloaded_lines(self, steps: Iterable[Iterable[str]]) -> list[str]:
+        """Return the lines of supports, preload, and steps with small changes from its end."""
+        lines = []
+        for block in self.preload_supports:
+            lines += block_lines(block)
+        for preload_step in self.preload:
+            for block in preload_step:
+                lines += block_lines(block)
+        for step in steps:
+            step_lines = list(step)
+            if not any(line.startswith("*DLOAD") for line in step_lines):
+                # A pressure that stays would add the stiffness of loads that follow the surface to
+                # a *FREQUENCY, but not to a *STATIC.
+                step_lines.append("*DLOAD, OP=NEW")
+            lines += ["*STEP, PERTURBATION", *step_lines, "*END STEP"]
+        return lines
+
+
+def real_text(value: float) -> str:
+    """Return a number in at most the 20 characters that CalculiX reads of it."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_NUMBER else f"{value:.13e}"
+
 
 def block_lines(block: KeywordBlock) -> list[str]:
     """Return the lines of a block as they stand in a deck."""
@@ -168,7 +223,9 @@ def block_lines(block: KeywordBlock) -> list[str]:
     return [head, *(",".join(values) for _, values in block.data)]
 
 
-def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearModel:
+def read_linear_model(
+    path: Path, contact: ContactChoice = "tied", preload: PreloadChoice = "tangent"
+) -> LinearModel:
     """Read the linear model of a deck.
 
     Parameters
@@ -177,6 +234,8 @@ def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearMode
         The deck.
     contact : "tied" or "open"
         What becomes of contact pairs.
+    preload : "tangent" or "none"
+        What becomes of static steps before a first step of small changes (PERTURBATION).
 
     Raises
     ------
@@ -190,6 +249,40 @@ def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearMode
         )
     _refuse_other_models(path, all_blocks)
     before_steps, steps = _split_steps(all_blocks)
+    preload_steps = _preload_steps(steps) if preload == "tangent" else []
+    if preload_steps:
+        blocks = [block for block in before_steps if block.keyword not in _WRITTEN_ANEW]
+    else:
+        blocks = _unloaded_blocks(before_steps, contact)
+    mesh = read_deck_mesh(blocks)
+    if not mesh.elements:
+        raise MeshError(f"{path}: a deck with elements is expected, but it has none.")
+    supports = _supports(before_steps, steps)
+    held, moved = _held_motions(supports, mesh)
+    if preload_steps:
+        remarks = _preload_remarks(all_blocks, preload_steps)
+    else:
+        remarks = _remarks(all_blocks, contact)
+    if moved and not preload_steps:
+        remarks.append("prescribed displacements are left out: what they move is held at zero")
+    has_mass = any(block.keyword in ("DENSITY", "MASS") for block in blocks)
+    return LinearModel(
+        path=path,
+        blocks=blocks,
+        steps=_steps_after(steps, preload_steps),
+        mesh=mesh,
+        held=held,
+        remarks=remarks,
+        has_mass=has_mass,
+        preload=preload_steps,
+        preload_supports=[block for block in before_steps if block.keyword == "BOUNDARY"],
+    )
+
+
+def _unloaded_blocks(
+    before_steps: list[KeywordBlock], contact: ContactChoice
+) -> list[KeywordBlock]:
+    """Return the blocks of the linear model at rest."""
     blocks: list[KeywordBlock] = []
     for block in before_steps:
         if block.keyword == "CONTACT PAIR" and contact == "tied":
@@ -200,24 +293,32 @@ def read_linear_model(path: Path, contact: ContactChoice = "tied") -> LinearMode
                 blocks.append(block)
         elif block.keyword not in _NOT_IN_MODEL:
             blocks.append(block)
-    mesh = read_deck_mesh(blocks)
-    if not mesh.elements:
-        raise MeshError(f"{path}: a deck with elements is expected, but it has none.")
-    supports = _supports(before_steps, steps)
-    held, moved = _held_motions(supports, mesh)
-    remarks = _remarks(all_blocks, contact)
-    if moved:
-        remarks.append("prescribed displacements are left out: what they move is held at zero")
-    has_mass = any(block.keyword in ("DENSITY", "MASS") for block in blocks)
-    return LinearModel(
-        path=path,
-        blocks=blocks,
-        steps=steps,
-        mesh=mesh,
-        held=held,
-        remarks=remarks,
-        has_mass=has_mass,
-    )
+    return blocks
+
+
+def _preload_steps(steps: list[list[KeywordBlock]]) -> list[list[KeywordBlock]]:
+    """Return the steps before the first with PERTURBATION, if one of them is static."""
+    for number, step in enumerate(steps):
+        if "PERTURBATION" in step[0].parameters:
+            earlier = steps[:number]
+            static = [step for step in earlier if any(b.keyword == "STATIC" for b in step)]
+            return [_without_output(step) for step in static]
+    return []
+
+
+def _steps_after(
+    steps: list[list[KeywordBlock]], preload_steps: list[list[KeywordBlock]]
+) -> list[list[KeywordBlock]]:
+    """Return the steps from the first with PERTURBATION on, or all if there is no preload."""
+    if not preload_steps:
+        return steps
+    first = next(n for n, step in enumerate(steps) if "PERTURBATION" in step[0].parameters)
+    return steps[first:]
+
+
+def _without_output(step: list[KeywordBlock]) -> list[KeywordBlock]:
+    """Return the blocks of a step without those that print results."""
+    return [block for block in step if block.keyword not in _OUTPUT]
 
 
 def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:
@@ -309,4 +410,20 @@ def _remarks(blocks: list[KeywordBlock], contact: ContactChoice) -> list[str]:
             sentences.append("preload is left out: the stiffness is that of the unloaded structure")
         if block.keyword == "INITIAL CONDITIONS" and block.parameters.get("TYPE") == "STRESS":
             sentences.append("initial stresses are left out")
+    return list(dict.fromkeys(sentences))
+
+
+def _preload_remarks(
+    blocks: list[KeywordBlock], preload_steps: list[list[KeywordBlock]]
+) -> list[str]:
+    """Return the sentences on the preload, and on what is left out of the steps after it."""
+    sentences = [
+        f"the stiffness is that at the end of the preload of {len(preload_steps)} "
+        f"{'step' if len(preload_steps) == 1 else 'steps'}, and stays as it is there",
+        "the loads of the preload keep size and direction: they are no loads of the structure",
+        "a region loses the stiffness that it has without preload",
+    ]
+    if any(block.keyword == "CONTACT PAIR" for block in blocks):
+        sentences.append("contact stays as the preload leaves it")
+    sentences += [_LEFT_OUT[block.keyword] for block in blocks if block.keyword in _LEFT_OUT]
     return list(dict.fromkeys(sentences))

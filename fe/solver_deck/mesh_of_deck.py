@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -37,6 +38,11 @@ class DeckElement:
     type_name: str
     nodes: tuple[int, ...]
 
+    @property
+    def has_rotations(self) -> bool:
+        """Whether the nodes bear moments, as those of shells and beams do."""
+        return re.fullmatch(r"S\d.*|B\d.*", self.type_name) is not None
+
 
 @dataclass
 class DeckMesh:
@@ -56,6 +62,16 @@ class DeckMesh:
     elements: dict[int, DeckElement] = field(default_factory=dict)
     node_sets: dict[str, list[int]] = field(default_factory=dict)
     element_sets: dict[str, list[int]] = field(default_factory=dict)
+
+    @cached_property
+    def axisymmetric_nodes(self) -> frozenset[int]:
+        """The nodes of axisymmetric elements."""
+        return frozenset(
+            node
+            for element in self.elements.values()
+            if element.type_name.startswith("CAX")
+            for node in element.nodes
+        )
 
     def nodes_named(self, text: str, where: str) -> list[int]:
         """Return the nodes of a set, or the one whose number is given."""

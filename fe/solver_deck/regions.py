@@ -9,7 +9,7 @@ from fe.structure.abaqus import DataLine, KeywordBlock
 from fe.structure.deck_text import real
 from reporting.words import comma_list
 
-from .linear_model import LinearModel
+from .linear_model import LinearModel, real_text
 
 _PROPERTIES = {
     "CONDUCTIVITY",
@@ -313,6 +313,6 @@ def _scaled_records(
         texts = []
         for position, text in enumerate(values, start=start):
             is_modulus = position in moduli and text
-            texts.append(repr(factor * real(where, text)) if is_modulus else text)
+            texts.append(real_text(factor * real(where, text)) if is_modulus else text)
         lines.append(DataLine(where, texts))
     return lines

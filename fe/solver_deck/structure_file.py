@@ -11,7 +11,7 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
-from fe.structure.matrix_files import FORCE_WEIGHTS, READ_WEIGHTS
+from fe.structure.matrix_files import READ_WEIGHTS
 from fe.structure.matrix_tables import Place
 
 from .calculix_jobs import StoredMatrices
@@ -61,8 +61,8 @@ class DeckStructure:
         The stiffness of each region.
     loads : list of DeckLoad
         The loads.
-    gravity_forces : dict of str to (n,) array
-        Force of gravity of each load that has one.
+    load_vectors : dict of str to (n,) array
+        Forces of each load that nodes and directions alone do not describe, such as gravity.
     output_sets : list of OutputSet
         The sets of nodes whose displacement is an output.
     length_unit : str
@@ -73,7 +73,7 @@ class DeckStructure:
     matrices: StoredMatrices
     region_stiffness: dict[Region, sparse.csr_array]
     loads: list[DeckLoad]
-    gravity_forces: dict[str, FloatArray]
+    load_vectors: dict[str, FloatArray]
     output_sets: list[OutputSet]
     length_unit: str
 
@@ -159,15 +159,6 @@ def _can_be_read(node: int, counts: dict[Place, int], held: set[HeldMotion]) -> 
     )
 
 
-def has_rows_for(load: DeckLoad, counts: dict[Place, int], held: set[HeldMotion]) -> bool:
-    """Return whether every force of a load acts on rows of the matrices, or on what is held."""
-    return all(
-        HeldMotion(*place) in held or counts.get(place) in FORCE_WEIGHTS
-        for place, force in load.forces.items()
-        if force
-    )
-
-
 def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> Path:
     """Write the structure file `NAME.toml` with its matrices and vectors into a folder.
 
@@ -207,9 +198,9 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
 
 def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
     """Write the vector of a load, and return the name of its file."""
-    if load.name in structure.gravity_forces:
+    if load.name in structure.load_vectors:
         file = f"{load.name}.npy"
-        np.save(folder / file, structure.gravity_forces[load.name])
+        np.save(folder / file, structure.load_vectors[load.name])
         return file
     counts = structure.row_counts()
     rows = [

@@ -1,0 +1,425 @@
+"""Motions that CalculiX binds to the unknowns of the matrices: those of tied nodes, and rotations.
+
+A tied node has no row in the matrices, because CalculiX eliminates it: its motion is a weighted sum
+of rows. A weak spring of stiffness k between the node and an added node r shows the weights: in the
+column of r, the stored stiffness holds -k times the weight of each row.
+
+Shells and beams have no rotations as unknowns either. If a node bears a moment, CalculiX makes the
+mean rotation of its section an unknown in place of another motion. The weights of the rotation
+follow from the stiffness before and after this substitution.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.full.factorisation import Factorisation
+from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.errors import CalculixError
+from fe.structure.abaqus import DataLine, KeywordBlock
+from fe.structure.matrix_tables import Place
+
+from .calculix_jobs import CalculixJobs, StoredMatrices
+from .linear_model import ROTATIONS, TRANSLATIONS, real_text
+from .loads import DeckLoad
+from .row_vectors import MotionReader, WeightedRows
+
+_PROBE_STIFFNESS = 1.0
+_SMALLEST_WEIGHT = 1e-9
+"""Weights below this, relative to the largest, are rounding."""
+_SMALLEST_MOTION = 1e-6
+"""Motions of nodes below this, relative to the largest of any row, are rounding."""
+MOST_MOMENTS = 40
+"""Largest number of nodes and directions with moments, each of which takes a run of CalculiX."""
+
+
+class _Probe(NamedTuple):
+    """A spring that shows the weights of a motion.
+
+    Attributes
+    ----------
+    motion : Place
+        Node and direction of the motion.
+    added_node : int
+        The added node at the other end, which has a row in this direction.
+    direction : int
+        Its direction along an axis.
+    """
+
+    motion: Place
+    added_node: int
+    direction: int
+
+
+def read_tied_motions(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    places: Sequence[Place],
+) -> dict[Place, WeightedRows]:
+    """Return how motions along axes that have no rows follow from the rows.
+
+    Parameters
+    ----------
+    jobs : CalculixJobs
+        CalculiX at work on the deck.
+    blocks : sequence of KeywordBlock
+        The blocks of the model.
+    matrices : StoredMatrices
+        The matrices of these blocks.
+    places : sequence of Place
+        Nodes and directions without rows.
+
+    Returns
+    -------
+    dict of Place to WeightedRows
+        The weights of each motion; without those that CalculiX would not show.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX fails.
+    """
+    if not places:
+        return {}
+    first = _free_number(jobs)
+    nodes = list(dict.fromkeys(node for node, _ in places))
+    added_node = {node: first + number for number, node in enumerate(nodes)}
+    probes = [_Probe((node, axis), added_node[node], axis) for node, axis in places]
+    added_blocks = _added_nodes(jobs, {added_node[node]: node for node in nodes})
+    added_blocks += _supports_of(probes)
+    for probe in probes:
+        node, axis = probe.motion
+        added_blocks += _spring(jobs, probe.added_node, (node, axis), (probe.added_node, axis))
+    return _weights_of(jobs, [*blocks, *added_blocks], matrices, probes)
+
+
+def read_rotations(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    places: Sequence[Place],
+) -> dict[Place, WeightedRows]:
+    """Return how rotations of nodes of shells and beams follow from the rows.
+
+    The parameters are those of `read_tied_motions`, with the directions 4, 5 and 6.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX fails.
+    SolutionError
+        If the stiffness cannot be factorised.
+    """
+    mean_rotations = {}
+    rigid_sections = []
+    for place in places:
+        weights = _mean_rotation(jobs, blocks, matrices, place)
+        if weights is None:
+            rigid_sections.append(place)
+        else:
+            mean_rotations[place] = weights
+    signed = _with_signs(jobs, blocks, matrices, mean_rotations)
+    return signed | _rotations_of_rigid_sections(jobs, blocks, matrices, rigid_sections)
+
+
+def _mean_rotation(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    place: Place,
+) -> WeightedRows | None:
+    """Return the weights of the mean rotation of a node's section, up to their common sign.
+
+    With the weights c and the eliminated row e, the motion of e is (rotation - sum of the other
+    c_i u_i) / c_e. The row of the rotation in the new stiffness is therefore K_ee / c_e^2 on the
+    diagonal, and (K_ei - K_ee c_i / c_e) / c_e beside it, which is solved for c.
+
+    Returns
+    -------
+    WeightedRows or None
+        The weights; None if the moment makes no new unknown.
+    """
+    node, direction = place
+    loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
+    new_places = Counter(loaded.places) - Counter(matrices.places)
+    lost_places = Counter(matrices.places) - Counter(loaded.places)
+    if new_places.total() != 1 or lost_places.total() != 1:
+        return None
+    rotation = loaded.places.index(next(iter(new_places)))
+    eliminated = _eliminated_row(matrices, loaded, rotation, next(iter(lost_places)))
+    if eliminated is None:
+        return None
+    kept = np.delete(np.arange(len(matrices.places)), eliminated)
+    kept_in_loaded = np.delete(np.arange(len(loaded.places)), rotation)
+    old_row = matrices.stiffness[[eliminated]].toarray().ravel()
+    new_row = loaded.stiffness[[rotation]].toarray().ravel()
+    weights = np.empty(len(matrices.places))
+    weights[eliminated] = np.sqrt(old_row[eliminated] / new_row[rotation])
+    difference = old_row[kept] - weights[eliminated] * new_row[kept_in_loaded]
+    weights[kept] = difference * weights[eliminated] / old_row[eliminated]
+    return _significant(weights)
+
+
+def _eliminated_row(
+    matrices: StoredMatrices, loaded: StoredMatrices, rotation: int, lost_place: Place
+) -> int | None:
+    """Return the row that a rotation replaces; None if the other rows do not stand in order.
+
+    Several rows may have the name of the lost one. Of those, it is the one without which the
+    diagonals of both matrices have the most entries in common.
+    """
+    remaining = np.delete(loaded.stiffness.diagonal(), rotation)
+    remaining_places = [*loaded.places[:rotation], *loaded.places[rotation + 1 :]]
+    diagonal = matrices.stiffness.diagonal()
+    best_row = None
+    fewest_changes = len(diagonal)
+    for row, place in enumerate(matrices.places):
+        if place != lost_place:
+            continue
+        if [*matrices.places[:row], *matrices.places[row + 1 :]] != remaining_places:
+            continue
+        changes = int(np.sum(~np.isclose(np.delete(diagonal, row), remaining, rtol=1e-10)))
+        if changes < fewest_changes:
+            best_row = row
+            fewest_changes = changes
+    return best_row
+
+
+def _with_signs(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    rotations: Mapping[Place, WeightedRows],
+) -> dict[Place, WeightedRows]:
+    """Return the weights with the sign with which CalculiX moves the nodes under a moment.
+
+    Torsion of a straight beam moves no node of the deck. The sign then follows from the places of
+    the expanded nodes in the section, which the rotations about the two other axes tell.
+    """
+    if not rotations:
+        return {}
+    known = _signs_by_displacements(jobs, blocks, matrices, rotations)
+    for place, sign in list(known.items()):
+        if sign != 0.0:
+            continue
+        node, direction = place
+        others = {}
+        for other in ROTATIONS:
+            weights = _mean_rotation(jobs, blocks, matrices, (node, other))
+            if other != direction and weights is not None:
+                others[node, other] = weights
+        signs = _signs_by_displacements(jobs, blocks, matrices, others)
+        signed = {key: weights.times(signs[key]) for key, weights in others.items()}
+        known[place] = _sign_by_section(matrices.places, place, rotations[place], signed)
+    return {
+        place: weights.times(known[place]) for place, weights in rotations.items() if known[place]
+    }
+
+
+def _signs_by_displacements(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    rotations: Mapping[Place, WeightedRows],
+) -> dict[Place, float]:
+    """Return 1, -1, or 0 if the moment moves no node, for each rotation of unknown sign."""
+    if not rotations:
+        return {}
+    count = len(matrices.places)
+    moments = np.column_stack([weights.vector(count) for weights in rotations.values()])
+    solutions = Factorisation(matrices.stiffness).solve(moments)
+    loads = [
+        DeckLoad("moment", lines=["*CLOAD", f"{node},{direction},1."])
+        for node, direction in rotations
+    ]
+    printed = jobs.displacements(loads, blocks, preloaded=False)
+    reader = MotionReader(matrices.places)
+    signs = {}
+    for place, solution, displacements in zip(rotations, solutions.T, printed, strict=True):
+        ours = []
+        theirs = []
+        for node, displacement in displacements.items():
+            for axis in TRANSLATIONS:
+                value = reader.displacement(solution, (node, axis))
+                if value is not None:
+                    ours.append(value)
+                    theirs.append(displacement[axis - 1])
+        largest = max(map(abs, ours), default=0.0)
+        moves = largest > _SMALLEST_MOTION * np.abs(solution).max()
+        signs[place] = float(np.sign(np.dot(ours, theirs))) if moves else 0.0
+    return signs
+
+
+def _sign_by_section(
+    places: Sequence[Place],
+    place: Place,
+    weights: WeightedRows,
+    others: Mapping[Place, WeightedRows],
+) -> float:
+    """Return the sign of a rotation about an axis from those about the two other axes.
+
+    The mean rotation about a has the weights (a x p) / (m |p|^2) at an expanded node, where p is
+    its place in the section without the component along a, and m the number of expanded nodes.
+    Hence p is -(a x w) / |w|^2 but for a positive factor.
+
+    Returns
+    -------
+    float
+        1 or -1; 0 if the other rotations do not tell the places.
+    """
+    node, direction = place
+    axis = np.eye(3)[direction - 4]
+    section = np.zeros((0, 3))
+    for (_, other), other_weights in others.items():
+        other_axis = np.eye(3)[other - 4]
+        vectors = _vectors_of_section(places, node, other_weights)
+        squares = np.sum(vectors**2, axis=1, keepdims=True)
+        offsets = np.divide(
+            -np.cross(other_axis, vectors), squares, out=np.zeros_like(vectors), where=squares > 0.0
+        )
+        # The component along the axis of the torsion does not matter.
+        offsets -= np.outer(offsets @ axis, axis)
+        section = section + offsets if len(section) else offsets
+    if not len(section):
+        return 0.0
+    vectors = _vectors_of_section(places, node, weights)
+    return float(np.sign(np.sum(vectors * np.cross(axis, section))))
+
+
+def _vectors_of_section(places: Sequence[Place], node: int, weights: WeightedRows) -> FloatArray:
+    """Return the weights (m, 3) of the expanded nodes of a node, which stand in order."""
+    dense = weights.vector(len(places))
+    vectors: list[FloatArray] = []
+    previous_axis = 4
+    for row, (row_node, axis) in enumerate(places):
+        if row_node != node:
+            continue
+        if axis <= previous_axis:
+            vectors.append(np.zeros(3))
+        vectors[-1][axis - 1] = dense[row]
+        previous_axis = axis
+    return np.array(vectors)
+
+
+def _rotations_of_rigid_sections(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    places: Sequence[Place],
+) -> dict[Place, WeightedRows]:
+    """Return the weights of rotations that are unknowns already, as where beams meet shells.
+
+    CalculiX makes such a section rigid. An equation lets an added node follow the rotation, and a
+    spring between it and a second added node shows the weights.
+    """
+    if not places:
+        return {}
+    first = _free_number(jobs)
+    probes: list[_Probe] = []
+    positions: dict[int, int] = {}
+    added_blocks: list[KeywordBlock] = []
+    for number, (node, direction) in enumerate(places):
+        follower = first + 2 * number
+        probe = _Probe((node, direction), follower + 1, 1)
+        positions |= {follower: node, probe.added_node: node}
+        terms = [str(text) for text in (follower, 1, 1.0, node, direction, -1.0)]
+        lines = [DataLine("", ["2"]), DataLine("", terms)]
+        added_blocks.append(KeywordBlock("", "EQUATION", {}, lines))
+        added_blocks += _spring(jobs, follower, (follower, 1), (probe.added_node, 1))
+        added_blocks += _supports_of([_Probe(probe.motion, follower, 1), probe])
+        probes.append(probe)
+    added_blocks = [*_added_nodes(jobs, positions), *added_blocks]
+    return _weights_of(jobs, [*blocks, *added_blocks], matrices, probes)
+
+
+def _free_number(jobs: CalculixJobs) -> int:
+    """Return the first number that no node and no element of the deck has."""
+    mesh = jobs.model.mesh
+    largest_node = max(mesh.points)
+    largest_element = max(mesh.elements)
+    return max(largest_node, largest_element) + 1
+
+
+def _added_nodes(jobs: CalculixJobs, positions: Mapping[int, int]) -> list[KeywordBlock]:
+    """Return the *NODE of added nodes, each at the position of a node of the deck."""
+    lines = []
+    for added, node in positions.items():
+        coordinates = [real_text(value) for value in jobs.model.mesh.points[node].tolist()]
+        lines.append(DataLine("", [str(added), *coordinates]))
+    return [KeywordBlock("", "NODE", {}, lines)]
+
+
+def _supports_of(probes: Sequence[_Probe]) -> list[KeywordBlock]:
+    """Return the *BOUNDARY that holds added nodes in the directions without a spring."""
+    free: dict[int, set[int]] = {}
+    for probe in probes:
+        free.setdefault(probe.added_node, set()).add(probe.direction)
+    lines = [
+        DataLine("", [str(node), str(axis)])
+        for node, axes in free.items()
+        for axis in TRANSLATIONS
+        if axis not in axes
+    ]
+    return [KeywordBlock("", "BOUNDARY", {}, lines)] if lines else []
+
+
+def _spring(jobs: CalculixJobs, number: int, first: Place, second: Place) -> list[KeywordBlock]:
+    """Return the blocks of a spring between two motions."""
+    element = 3 * number + first[1]
+    name = f"UAVPROBE{element}"
+    ends = [str(element), str(first[0]), str(second[0])]
+    return [
+        KeywordBlock("", "ELEMENT", {"TYPE": "SPRING2", "ELSET": name}, [DataLine("", ends)]),
+        KeywordBlock(
+            "",
+            "SPRING",
+            {"ELSET": name},
+            [
+                DataLine("", [str(first[1]), str(second[1])]),
+                DataLine("", [real_text(_PROBE_STIFFNESS)]),
+            ],
+        ),
+    ]
+
+
+def _weights_of(
+    jobs: CalculixJobs,
+    blocks: Sequence[KeywordBlock],
+    matrices: StoredMatrices,
+    probes: Sequence[_Probe],
+) -> dict[Place, WeightedRows]:
+    """Return the weights that springs show; none if they change the other rows."""
+    try:
+        probed = jobs.matrices("probes", blocks)
+    except CalculixError:
+        return {}
+    added_nodes = {probe.added_node for probe in probes}
+    rows = [row for row, (node, _) in enumerate(probed.places) if node not in added_nodes]
+    if not _are_same_rows(jobs, [probed.places[row] for row in rows], matrices.places):
+        return {}
+    result = {}
+    for probe in probes:
+        place = (probe.added_node, probe.direction)
+        column = probed.stiffness[[probed.places.index(place)]].toarray().ravel()
+        weights = -column[rows] / _PROBE_STIFFNESS
+        if weights.any():
+            result[probe.motion] = _significant(weights)
+    return result
+
+
+def _are_same_rows(jobs: CalculixJobs, places: Sequence[Place], expected: Sequence[Place]) -> bool:
+    """Return whether rows have the same names, but for the numbers of nodes CalculiX adds."""
+    known = jobs.model.mesh.points
+    names = [(node if node in known else None, axis) for node, axis in places]
+    expected_names = [(node if node in known else None, axis) for node, axis in expected]
+    return names == expected_names
+
+
+def _significant(weights: FloatArray) -> WeightedRows:
+    """Return the weights (n,) without those that are rounding."""
+    size = np.abs(weights)
+    rows: IntArray = np.flatnonzero(size > _SMALLEST_WEIGHT * size.max())
+    return WeightedRows(rows, weights[rows])

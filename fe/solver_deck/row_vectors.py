@@ -1,0 +1,165 @@
+"""Vectors over the rows of the matrices: motions of nodes as weighted rows, and nodal forces."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray, IntArray
+from fe.structure.matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, RowWeights
+from fe.structure.matrix_tables import Place
+
+from .linear_model import HeldMotion
+from .loads import DeckLoad
+from .shell_sides import ShellSide
+
+_LAYERS = (1, 2, 3)
+"""Numbers of rows that a shell has through its thickness; a single row is its middle."""
+
+
+class WeightedRows(NamedTuple):
+    """A motion as a weighted sum of rows of the matrices.
+
+    Attributes
+    ----------
+    rows : (m,) array of int
+        The rows.
+    weights : (m,) array
+        Their weights.
+    """
+
+    rows: IntArray
+    weights: FloatArray
+
+    def vector(self, count: int) -> FloatArray:
+        """Return the weights of all rows (count,)."""
+        vector = np.zeros(count)
+        vector[self.rows] = self.weights
+        return vector
+
+    def times(self, factor: float) -> "WeightedRows":
+        """Return the motion multiplied by a factor."""
+        return WeightedRows(self.rows, factor * self.weights)
+
+
+class MotionReader:
+    """The rows of each motion of a node.
+
+    Parameters
+    ----------
+    places : sequence of Place
+        Node and direction of each row.
+    """
+
+    def __init__(self, places: Sequence[Place]) -> None:
+        self.rows: dict[Place, list[int]] = {}
+        for row, place in enumerate(places):
+            self.rows.setdefault(place, []).append(row)
+
+    def weighted(self, place: Place, table: RowWeights) -> WeightedRows | None:
+        """Return a motion as weighted rows; None if there are none of known weights."""
+        rows = self.rows.get(place, [])
+        if len(rows) not in table:
+            return None
+        return WeightedRows(np.array(rows), np.array(table[len(rows)]))
+
+    def displacement(self, solution: FloatArray, place: Place) -> float | None:
+        """Return the displacement of a node in a solution (n,) as CalculiX prints it."""
+        weighted = self.weighted(place, READ_WEIGHTS)
+        return None if weighted is None else float(solution[weighted.rows] @ weighted.weights)
+
+
+@dataclass(frozen=True)
+class LoadRows:
+    """How forces and moments at nodes act on the rows of the matrices.
+
+    Attributes
+    ----------
+    places : list of Place
+        Node and direction of each row.
+    held : set of HeldMotion
+        Motions that are held, and take up what acts on them.
+    bound : dict of Place to WeightedRows
+        Motions without a row of their own: those of tied nodes, and rotations.
+    """
+
+    places: list[Place]
+    held: set[HeldMotion]
+    bound: Mapping[Place, WeightedRows] = field(default_factory=dict)
+
+    @cached_property
+    def _reader(self) -> MotionReader:
+        """The rows of each motion."""
+        return MotionReader(self.places)
+
+    def names_all(self, load: DeckLoad) -> bool:
+        """Return whether all forces of a load act on rows that their names tell, or on supports."""
+        has_others = bool(load.moments) or any(
+            any(forces.values()) for forces in load.side_forces.values()
+        )
+        return not has_others and not self.missing(load, bound=False)
+
+    def missing(self, load: DeckLoad, *, bound: bool = True) -> list[Place]:
+        """Return the motions of a load's forces along axes that have no rows and are not held.
+
+        Parameters
+        ----------
+        load : DeckLoad
+            The load.
+        bound : bool
+            Whether bound motions count as having rows.
+        """
+        tables = [load.forces, *load.side_forces.values()]
+        places = [place for table in tables for place, force in table.items() if force]
+        return [
+            place
+            for place in dict.fromkeys(places)
+            if HeldMotion(*place) not in self.held
+            and self._reader.weighted(place, FORCE_WEIGHTS) is None
+            and not (bound and place in self.bound)
+        ]
+
+    def missing_rotations(self, load: DeckLoad) -> list[Place]:
+        """Return the motions of a load's moments that have no rows and are not held."""
+        return [
+            place
+            for place, moment in load.moments.items()
+            if moment and place not in self.bound and HeldMotion(*place) not in self.held
+        ]
+
+    def vector(self, load: DeckLoad) -> FloatArray:
+        """Return the forces (n,) of a load on the rows, without its acceleration."""
+        vector = np.zeros(len(self.places))
+        for place, force in (*load.forces.items(), *load.moments.items()):
+            self._add(vector, self._rows_of(place), force, place)
+        for side, forces in load.side_forces.items():
+            for place, force in forces.items():
+                self._add(vector, self._rows_of_side(place, side), force, place)
+        return vector
+
+    def _add(
+        self, vector: FloatArray, weighted: WeightedRows | None, force: float, place: Place
+    ) -> None:
+        """Add a force on a motion to a vector (n,)."""
+        if weighted is not None and HeldMotion(*place) not in self.held:
+            np.add.at(vector, weighted.rows, force * weighted.weights)
+
+    def _rows_of(self, place: Place) -> WeightedRows | None:
+        """Return the rows on which a force at a node acts."""
+        if place in self.bound:
+            return self.bound[place]
+        return self._reader.weighted(place, FORCE_WEIGHTS)
+
+    def _rows_of_side(self, place: Place, side: ShellSide) -> WeightedRows | None:
+        """Return the row on which a force on one side of a shell acts.
+
+        CalculiX expands a node of a shell from the bottom to the top, and stores the rows in this
+        order.
+        """
+        rows = self._reader.rows.get(place, [])
+        if len(rows) not in _LAYERS:
+            return self._rows_of(place)
+        row = rows[0] if side is ShellSide.BOTTOM else rows[-1]
+        return WeightedRows(np.array([row]), np.ones(1))
