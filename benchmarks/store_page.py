@@ -60,6 +60,8 @@ and FACTOR a factor of the state, such as `z1`. A unit in upper case is that of 
 binding. Where sensors have different units, the unit is `see sensor_unit`. Every variable has its
 unit and meaning in `.attrs["units"]` and `.attrs["long_name"]`.
 
+The names of the twins are in the group of the fleet, and the groups inside it inherit them.
+
 Stores of fleets of earlier versions are read in this layout, with one sentence for each file.
 """
 _HEADER = "| variable | axes | unit | meaning |\n| --- | --- | --- | --- |\n"

@@ -23,6 +23,7 @@ from twin_master.command_options import (
     PolicyOption,
     SeedOption,
     SensorModelOption,
+    StoreOption,
     ViewOption,
     WorkersOption,
     complete_scenario,
@@ -142,6 +143,7 @@ def run(
     ] = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
+    store: StoreOption = "",
     policy: PolicyOption = None,
     sensor_model: SensorModelOption = None,
     estimator: EstimatorOption = None,
@@ -174,9 +176,10 @@ def run(
             raise _wrong_use_of_seeds()
         fleet = ensemble(scenario, seed_range(seeds), overrides).with_parts(parts)
         engine = choose_engine(workers, cluster)
+        fleet = fleet.with_store(store)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
         return
-    _refuse_processes_of_one_mission(workers, cluster)
+    _refuse_options_of_seeds(workers, cluster, store)
     has_changes = out is not None or policy is not None or overrides != Overrides()
     if resume is None:
         folder, fly_mission = _new_mission(scenario, out, overrides, parts, replace=replace)
@@ -186,13 +189,18 @@ def run(
     _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
 
 
-def _refuse_processes_of_one_mission(workers: int | None, cluster: str | None) -> None:
-    """Refuse the options --workers and --cluster where only one mission flies."""
-    if workers is not None or cluster is not None:
-        raise typer.BadParameter(
-            "belongs to --seeds: one mission flies alone.",
-            param_hint="--workers" if cluster is None else "--cluster",
-        )
+def _refuse_options_of_seeds(workers: int | None, cluster: str | None, store: str) -> None:
+    """Refuse the options --workers, --cluster and --store where only one mission flies."""
+    is_given = {
+        "--workers": workers is not None,
+        "--cluster": cluster is not None,
+        "--store": bool(store),
+    }
+    for option, given in is_given.items():
+        if given:
+            raise typer.BadParameter(
+                "belongs to --seeds: one mission flies alone.", param_hint=option
+            )
 
 
 def _wrong_use_of_seeds() -> typer.BadParameter:

@@ -53,6 +53,15 @@ ClusterOption = Annotated[
 FleetFolderOption = Annotated[
     Path | None, typer.Option("--out", show_default="runs/NAME", help="The folder to make.")
 ]
+StoreOption = Annotated[
+    str,
+    typer.Option(
+        "--store",
+        metavar="ADDRESS",
+        show_default="in the folder",
+        help="Keep the arrays of the fleet at this address of fsspec, such as s3://BUCKET/NAME.zarr.",
+    ),
+]
 LibraryOption = Annotated[
     Path | None,
     typer.Option(

@@ -28,6 +28,7 @@ from twin_master.command_options import (
     MetricsOption,
     PolicyOption,
     SensorModelOption,
+    StoreOption,
     ViewOption,
     WorkersOption,
 )
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.engine import Engine
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
-    from twin_master.fleet.reading import Estimated
+    from twin_master.fleet.reading import Figures
     from twin_master.fleet.watched_asset import WatchedAsset
     from twin_master.watch.metrics_server import MetricsServer
 
@@ -266,6 +267,7 @@ def run(
     seed: FleetSeedOption = None,
     workers: WorkersOption = None,
     cluster: ClusterOption = None,
+    store: StoreOption = "",
     replace: Annotated[
         bool,
         typer.Option(
@@ -287,9 +289,15 @@ def run(
     from twin_master.mission.parts import TwinParts
 
     parts = TwinParts(policy, sensor_model, estimator)
-    fleet = load_fleet(file, seed).with_parts(parts)
-    engine = choose_engine(workers, cluster)
-    fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
+    fleet = load_fleet(file, seed).with_parts(parts).with_store(store)
+    fly_and_print_fleet(
+        fleet,
+        out,
+        choose_engine(workers, cluster),
+        replace=replace,
+        report=not no_report,
+        json=json,
+    )
 
 
 def learn(
@@ -385,6 +393,7 @@ def fly_and_print_fleet(
         Whether to print JSON.
     """
     from twin_master.fleet.flight import fly_fleet
+    from twin_master.fleet.reading import figures_of_fleets
 
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
@@ -394,7 +403,7 @@ def fly_and_print_fleet(
         )
     if report:
         _write_report(outcome.folder)
-    figures = _figures_by_group([outcome.folder])
+    figures = figures_of_fleets([outcome.folder])
     if json:
         terminal.print_json(
             {
@@ -427,13 +436,11 @@ def _print_outcome(outcome: "FleetOutcome") -> None:
     for name, reason in reasons[:MOST_ENDINGS]:
         terminal.say(f"  {name}: {reason}", fg="yellow")
     if len(reasons) > MOST_ENDINGS:
-        further_count = len(reasons) - MOST_ENDINGS
-        terminal.say(f"  and {further_count} more, in {outcome.folder / 'fleet.json'}")
+        file = outcome.folder / "fleet.json"
+        terminal.say(f"  and {len(reasons) - MOST_ENDINGS} more, in {file}")
     report = outcome.folder / REPORT_NAME
-    if report.is_file():
-        terminal.say(f"Report: {report}")
-    else:
-        terminal.say(f"Fleet: {outcome.folder}")
+    has_report = report.is_file()
+    terminal.say(f"Report: {report}" if has_report else f"Fleet: {outcome.folder}")
 
 
 def _write_report(folder: Path) -> None:
@@ -458,30 +465,16 @@ def compare(
 
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
-    figures = _figures_by_group(folders)
+    from twin_master.fleet.reading import figures_of_fleets
+
+    figures = figures_of_fleets(folders)
     if json:
         terminal.print_json(figures)
     else:
         _print_figures(figures)
 
 
-Figures = dict[str, dict[str, "Estimated | int"]]
-"""The figures of each group, by the name of the group and of the figure."""
-
-
-def _figures_by_group(folders: list[Path]) -> Figures:
-    """Return the figures of each group by name; of several folders, the name has the folder."""
-    from twin_master.fleet.reading import group_figures, open_fleet
-
-    figures = {}
-    for folder in folders:
-        for name, group in open_fleet(folder).children.items():
-            full_name = name if len(folders) == 1 else f"{folder}: {name}"
-            figures[full_name] = group_figures(group)
-    return figures
-
-
-def _print_figures(figures: Figures) -> None:
+def _print_figures(figures: "Figures") -> None:
     """Print the figures as a table with a column for each group."""
     from twin_master.fleet.reading import figure_rows
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fe.reduction.model_cache import reduced_model
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
-from twin_master.fleet.plan import Member
+from twin_master.fleet.members import Member
 from twin_master.fleet.posterior import LikelihoodGrid, likelihood_grid, shared_posterior
 from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

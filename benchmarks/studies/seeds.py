@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.errors import FleetError
-from twin_master.fleet.plan import Member
-from twin_master.fleet.reading import Outcomes
+from twin_master.fleet.members import Member
+from twin_master.fleet.outcomes import Outcomes
 from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side

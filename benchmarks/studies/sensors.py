@@ -15,7 +15,7 @@ from scipy.linalg import qr
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.plan import Member
+from twin_master.fleet.members import Member
 from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.sensor_design import choose_sensors, draw_readings

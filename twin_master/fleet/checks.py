@@ -167,7 +167,9 @@ def _check_true_parameters(group: Group, scenario: Scenario) -> None:
     from fe.wing.design import wing_structure
 
     usual_value = scenario.asset.true_parameters.get(_WING_PARAMETER, 1.0)
-    values = [member.parameters.get(_WING_PARAMETER, usual_value) for member in group.members]
+    values = [usual_value]
+    if _WING_PARAMETER in group.parameter_spreads:
+        values = [member.parameters[_WING_PARAMETER] for member in group.members]
     low, high = wing_structure(scenario.state_names, 0).ranges[_WING_PARAMETER]
     outside = [value for value in values if not low - _ROUNDING <= value <= high + _ROUNDING]
     if outside:

@@ -17,7 +17,7 @@ from reporting.files import hash_record
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
 from twin_master.errors import FleetError
-from twin_master.fleet.plan import Member
+from twin_master.fleet.members import Member
 from twin_master.fleet.shard import ShardResult, fly_shard, result_of_unflown
 
 if TYPE_CHECKING:

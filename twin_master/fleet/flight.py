@@ -9,9 +9,11 @@ import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from reporting.files import (
     atomic_write_text,
@@ -31,10 +33,13 @@ from twin_master.fleet.checks import check_fleet, flies_model, source_of
 from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.evidence import reason_transitions_are_fixed
-from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.reading import figure_rows, group_figures, open_fleet
+from twin_master.fleet.members import Member
+from twin_master.fleet.plan import Fleet, Group, load_fleet
+from twin_master.fleet.reading import figure_rows, group_figures, open_fleet, open_groups
 from twin_master.fleet.shard import ShardResult, reason_flown_one_by_one, result_of_unflown
-from twin_master.fleet.store import STORE_NAME, check_installed, create_store
+from twin_master.fleet.store import check_installed
+from twin_master.fleet.store_address import STORE_NAME, StoreAddress
+from twin_master.fleet.store_writing import GroupWriter, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.parts import (
     NO_PARTS,
@@ -51,7 +56,6 @@ from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:
-    import zarr
     from matplotlib.axes import Axes
 
 RESULT_NAME = "fleet.json"
@@ -91,7 +95,7 @@ class FleetOutcome:
 
     def _repr_html_(self) -> str:
         """Return how the twins of each group fared, for a notebook."""
-        groups = open_fleet(self.folder).children
+        groups = open_groups(self.folder)
         figures = {name: group_figures(group) for name, group in groups.items()}
         title = f"Fleet of {self.twins} twins in {self.folder}"
         return html_table(title, ("result", *figures), figure_rows(figures))
@@ -120,6 +124,7 @@ def fly_fleet(
     policy: GivenPolicy | None = None,
     sensor_model: GivenSensorModel | None = None,
     estimator: GivenEstimator | None = None,
+    store: str = "",
     replace_old: bool = False,
     progress: Progress | None = None,
 ) -> FleetOutcome:
@@ -137,6 +142,8 @@ def fly_fleet(
     policy, sensor_model, estimator : optional
         The parts of all twins in the place of those of the scenarios, see `fly`. Other processes
         than this one must be able to import the modules of objects.
+    store : str
+        The address of the store, such as "s3://bucket/winter.zarr"; by default it is in the folder.
     replace_old : bool
         Whether another fleet in the folder is removed.
     progress : Progress, optional
@@ -151,6 +158,7 @@ def fly_fleet(
     ------
     FleetError
         If an asset cannot fly: the message lists all such assets, and no twin has flown. If the
+        store cannot be at its address. If the
         cluster cannot be used: shards that were flown stay in the store. If the extra `fleet` is
         not installed.
     RunFolderError
@@ -169,6 +177,9 @@ def fly_fleet(
         fleet = fleet.with_parts(given_parts)
     progress = progress or SilentProgress()
     engine = engine or Engine()
+    if store:
+        fleet = fleet.with_store(store)
+    StoreAddress(folder, fleet.store).check()
     check_installed("zarr", *(["distributed"] if engine.needs_dask else []))
     check = partial(check_fleet, fleet)
     with locked_fleet_folder(
@@ -309,29 +320,58 @@ def prepare_kit(
 
 
 class Shard(NamedTuple):
-    """Twins of one group that one process flies together.
+    """Twins of one group in successive rows that one process flies together.
 
     Attributes
     ----------
     group_number : int
         The number of their group in the fleet.
-    members : sequence of Member
-        The twins, which share a scenario.
+    rows : range
+        Their rows; the twins share a scenario.
     """
 
     group_number: int
-    members: Sequence[Member]
+    rows: range
 
 
 def _shards(fleet: Fleet) -> Iterator[Shard]:
-    """Yield the shards of a fleet, group by group, each with its members in order.
+    """Yield the shards of a fleet, group by group, each with its twins in order.
 
     If the members have different scenarios, each is a shard of its own.
     """
     for number, group in enumerate(fleet.groups):
         size = fleet.head.shard if len(group.scenarios) == 1 else 1
-        for first in range(0, len(group.members), size):
-            yield Shard(number, group.members[first : first + size])
+        twin_count = len(group.members)
+        for first in range(0, twin_count, size):
+            yield Shard(number, range(first, min(first + size, twin_count)))
+
+
+class _StoredRows:
+    """Which rows of the groups of a fleet are in its store.
+
+    The rows of single twins are noted, because the twins of a shard are stored one by one if
+    workers died over it.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        The plan of the fleet.
+    journal : Path
+        The journal, which names the rows that were stored before.
+    """
+
+    def __init__(self, fleet: Fleet, journal: Path) -> None:
+        self._is_stored = [np.zeros(len(group.members), dtype=bool) for group in fleet.groups]
+        for record, *_ in records(journal):
+            self.note(record["group"], range(*record["rows"]))
+
+    def note(self, group_number: int, rows: range) -> None:
+        """Note that rows of a group are in the store."""
+        self._is_stored[group_number][rows.start : rows.stop] = True
+
+    def has_all(self, group_number: int, rows: range) -> bool:
+        """Return whether all of some rows of a group are in the store."""
+        return bool(self._is_stored[group_number][rows.start : rows.stop].all())
 
 
 class _ShardCounts(NamedTuple):
@@ -358,14 +398,19 @@ class _FleetFlight:
         self._fleet = fleet
         self._folder = folder
         self._journal = journal
-        self._store_of = cache(self._open_group)
+        self._stored_rows = _StoredRows(fleet, journal.path)
+        address = StoreAddress(folder, fleet.store)
+        self._writers = [GroupWriter(address, fleet, group) for group in fleet.groups]
         self._packed_kit = lru_cache(maxsize=_PACKED_KITS)(self._pack_kit)
 
     def fly(self, engine: Engine, progress: Progress) -> _ShardCounts:
         """Fly the shards that are not in the store yet."""
         shards = list(_shards(self._fleet))
-        remaining = self._remaining(shards)
-        remaining_twins = sum(len(shard.members) for shard in remaining)
+        remaining = [shard for shard in shards if not self._stored_rows.has_all(*shard)]
+        remaining_twins = sum(len(shard.rows) for shard in remaining)
+        # A kill may have come between the last twin of a file and the end of the file.
+        for number in range(len(self._fleet.groups)):
+            self._finish_files(number)
         with progress.stage("Flying", total=self._fleet.size, unit="twins") as stage:
             stage.advance(self._fleet.size - remaining_twins)
             if remaining:
@@ -374,31 +419,15 @@ class _FleetFlight:
                     stage.advance(len(piece.members))
         return _ShardCounts(flown=len(remaining), kept=len(shards) - len(remaining))
 
-    def _remaining(self, shards: Sequence[Shard]) -> list[Shard]:
-        """Return the shards with twins that are missing in the store.
-
-        The rows of single twins are compared, because the twins of a shard are stored one by one if
-        workers died over it.
-        """
-        stored_rows = set()
-        for record, *_ in records(self._journal.path):
-            first_row, end_row = record["rows"]
-            stored_rows |= {(record["group"], row) for row in range(first_row, end_row)}
-        remaining = []
-        for shard in shards:
-            rows = {(shard.group_number, member.row) for member in shard.members}
-            if not rows <= stored_rows:
-                remaining.append(shard)
-        return remaining
-
     def _pieces(self, shards: Sequence[Shard]) -> Iterator[Piece]:
         """Yield the shards, each with the knowledge and the recordings that a worker needs.
 
         If the scenario of a single asset, with its own FMU or calibration, cannot be prepared, the
         asset is stored as failed and the other shards are flown.
         """
-        for number, members in shards:
+        for number, rows in shards:
             group = self._fleet.groups[number]
+            members = group.members[rows.start : rows.stop]
             try:
                 kit = self._packed_kit(number, members[0].scenario_number)
                 members_with_recordings = tuple(
@@ -424,29 +453,38 @@ class _FleetFlight:
     def _store(self, group_number: int, members: Sequence[Member], result: ShardResult) -> None:
         """Write the result of successive members into the store, and then into the journal."""
         group = self._fleet.groups[group_number]
-        first_row = members[0].row
-        end = members[-1].row + 1
+        rows = range(members[0].row, members[-1].row + 1)
         with explained_write_errors(self._folder / STORE_NAME):
-            store = self._store_of(group.name)
-            for path, values in result.variables.items():
-                store[path][first_row:end] = values
+            self._writers[group_number].write(result.variables, rows.start)
         self._journal.append(
             {
                 "group": group_number,
-                "rows": [first_row, end],
+                "rows": [rows.start, rows.stop],
                 "failures": _with_group_name(group, result.failures),
                 "ended": _with_group_name(group, result.ended),
             }
         )
+        self._stored_rows.note(group_number, rows)
+        self._finish_files(group_number, rows)
 
-    def _open_group(self, group_name: str) -> Mapping[str, zarr.Array[object]]:
-        """Return the arrays of a group in the store, by their paths."""
-        import zarr
+    def _finish_files(self, group_number: int, rows: range | None = None) -> None:
+        """Finish the files of a group whose twins are all in the store.
 
-        store = self._folder / STORE_NAME
-        group = zarr.open_group(store, mode="r+", path=group_name, use_consolidated=False)
-        members = group.members(max_depth=1)
-        return {path: member for path, member in members if isinstance(member, zarr.Array)}
+        Parameters
+        ----------
+        group_number : int
+            The number of the group.
+        rows : range, optional
+            Only the files that have some of these rows; all files if left out.
+        """
+        writer = self._writers[group_number]
+        for number, rows_of_file in enumerate(writer.file_rows):
+            is_touched = rows is None or (
+                rows.start < rows_of_file.stop and rows_of_file.start < rows.stop
+            )
+            if is_touched and self._stored_rows.has_all(group_number, rows_of_file):
+                with explained_write_errors(self._folder / STORE_NAME):
+                    writer.finish_file(number)
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:

@@ -5,7 +5,6 @@ The results are a record for the report, and `learnt.toml`, which replaces value
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,8 +38,13 @@ from twin_master.fleet.posterior import (
     shared_posterior,
 )
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
-from twin_master.fleet.store import open_group
-from twin_master.fleet.store_layout import observation_rows, stored_values
+from twin_master.fleet.row_file import RowFile
+from twin_master.fleet.store import flown_rows, open_group
+from twin_master.fleet.store_layout import (
+    row_blocks,
+    stored_values,
+)
+from twin_master.fleet.stored_observations import ObservedTwins, StoredObservations
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
@@ -49,8 +53,6 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-BLOCK_TWINS = 256
-"""Number of twins whose observations are read and weighed together."""
 NOISE_TWINS = 100
 """Largest number of twins of a group from which the noise is learnt.
 
@@ -67,6 +69,8 @@ NODE_DEVIATIONS = 6.0
 
 The unit is the standard deviation of the calibration.
 """
+_MEMBERS_TOGETHER = 4096
+"""Number of members of a population whose log evidence is in memory at the same time."""
 _LEAST_PROBABILITY = 1e-3
 _LARGEST_PROBABILITY = 0.9
 """Probabilities of worsening under which damage may grow or stay in any step."""
@@ -211,10 +215,10 @@ def _lessons_of_groups(
     lessons = {}
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
-            group = open_group(folder, record["name"])
+            group = open_group(folder, record["name"], names=False)
             twins_by_scenario = list(flown_twins(folder, record, group))
             if twins_by_scenario:
-                lessons[record["name"]] = _learn_group(record, group, twins_by_scenario)
+                lessons[record["name"]] = _learn_group(folder, record, group, twins_by_scenario)
             stage.advance()
     return lessons
 
@@ -254,49 +258,6 @@ def _records_with_shared_distribution(
     return {"groups": records, "shared": shared_distribution}
 
 
-class _Piece(NamedTuple):
-    """The observations of some twins of one scenario in T steps.
-
-    Attributes
-    ----------
-    observed : (B, T, G + I) array
-        The readings of sensors and inspections in SI units; NaN where there is none.
-    control : (B, T) array
-        The control in force in each step.
-    """
-
-    observed: Float
-    control: Index
-
-
-class _StoredObservations:
-    """The observations of a group in the store, read by blocks of twins.
-
-    A fleet may have more observations than fit in memory. The last block is kept, because the twins
-    of a block may have scenarios of their own.
-    """
-
-    def __init__(self, group: "xr.DataTree", scenario: Scenario) -> None:
-        self._group = group
-        self._scenario = scenario
-        self._block = lru_cache(maxsize=1)(self._read_block)
-
-    def pieces(self, rows: Index) -> Iterator[_Piece]:
-        """Yield the observations of the twins in the rows of the store (B,), in ascending order."""
-        for number in np.unique(rows // BLOCK_TWINS).tolist():
-            rows_of_block = rows[rows // BLOCK_TWINS == number] - number * BLOCK_TWINS
-            observed, control = self._block(number)
-            yield _Piece(observed[rows_of_block], control[rows_of_block])
-
-    def _read_block(self, number: int) -> _Piece:
-        """Return the observations of all twins of a block."""
-        rows = slice(number * BLOCK_TWINS, (number + 1) * BLOCK_TWINS)
-        control = stored_values(self._group, "observed/control_index", rows).astype(np.int64)
-        # Steps that were not flown have the control -1. They have no observations, so that the
-        # evidence does not depend on their control: the first control takes its place.
-        return _Piece(observation_rows(self._group, self._scenario, rows), np.maximum(control, 0))
-
-
 class _Observations(NamedTuple):
     """The observations of B twins of one scenario.
 
@@ -304,27 +265,30 @@ class _Observations(NamedTuple):
     ----------
     knowledge : Knowledge
         The knowledge that the twins share: model, policy and calibration draws.
-    store : _StoredObservations
+    store : StoredObservations
         The observations of their group.
     rows : (B,) array
         The rows of the twins in the store, in ascending order.
     """
 
     knowledge: Knowledge
-    store: _StoredObservations
+    store: StoredObservations
     rows: Index
 
     def first_twins(self, count: int) -> "_Observations":
         """Return the observations of the first twins."""
         return self._replace(rows=self.rows[:count])
 
-    def pieces(self) -> Iterator[_Piece]:
+    def pieces(self) -> Iterator[ObservedTwins]:
         """Yield the observations of the twins, some twins at a time."""
         return self.store.pieces(self.rows)
 
 
 def _learn_group(
-    record: JsonObject, group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
+    folder: Path,
+    record: JsonObject,
+    group: "xr.DataTree",
+    twins_by_scenario: Sequence[TwinsOfScenario],
 ) -> _GroupLessons:
     """Learn from the twins of one group.
 
@@ -333,6 +297,8 @@ def _learn_group(
 
     Parameters
     ----------
+    folder : Path
+        The folder of the fleet.
     record : dict
         The record of the group in `config.json`.
     group : DataTree
@@ -357,19 +323,21 @@ def _learn_group(
             "can be learnt from it; check its model and its noise."
         )
     grid = _probability_grid(family, explained, noise.mean) if family.names else None
-    rows = np.concatenate([twins.rows for twins in twins_by_scenario])
+    counts = _counts(group, scenario.control_names)
+    flown_count = sum(len(twins.rows) for twins in twins_by_scenario)
     lessons: JsonObject = {
         "twins": twin_count,
-        "left_out": len(rows) - twin_count,
-        "alarmed": int(np.sum(notice_counts(group, "alarm")[rows] > 0)),
+        "left_out": flown_count - twin_count,
+        "alarmed": counts.alarmed,
         "noise_factor": noise.summary,
     }
     if family.reason_fixed:
         lessons["transitions_kept_because"] = family.reason_fixed
     if nodes is not None:
-        lessons["population"] = _population(observations[0], family, grid, nodes, noise.mean)
-    flown_controls = _followed_controls(group, rows, scenario.control_names)
-    return _GroupLessons(family, grid, flown_controls, lessons)
+        lessons["population"] = _population(
+            folder, observations[0], family, grid, nodes, noise.mean
+        )
+    return _GroupLessons(family, grid, counts.followed_controls, lessons)
 
 
 def _transition_family(scenario: Scenario) -> TransitionFamily:
@@ -384,15 +352,37 @@ def _observations(
     group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
 ) -> list[_Observations]:
     """Return the observations of the twins of a group that have flown, by scenario."""
-    store = _StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
+    store = StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
     return [_Observations(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
 
 
-def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
-    """Return the controls under which a twin in the rows has flown a step before its last one."""
-    control = stored_values(group, "observed/control_index")[rows]
-    is_followed = control[:, 1:] >= 0
-    return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
+class _GroupCounts(NamedTuple):
+    """What is counted of the twins of a group beside what is learnt from them.
+
+    Attributes
+    ----------
+    alarmed : int
+        The number of flown twins that raised an alarm.
+    followed_controls : set of str
+        The controls under which a flown twin has flown a step before its last one.
+    """
+
+    alarmed: int
+    followed_controls: set[str]
+
+
+def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
+    """Count alarms and controls of the flown twins of a group, block by block."""
+    alarmed = 0
+    followed_controls: set[str] = set()
+    for rows in row_blocks(group):
+        flown = flown_rows(stored_values(group, "status", rows))
+        alarmed += int(np.sum(notice_counts(group, "alarm", rows)[flown] > 0))
+        control = stored_values(group, "observed/control_index", rows)[flown]
+        is_followed = control[:, 1:] >= 0
+        followed = np.unique(control[:, :-1][is_followed]).tolist()
+        followed_controls |= {control_names[index] for index in followed}
+    return _GroupCounts(alarmed, followed_controls)
 
 
 def _explained_observations(
@@ -589,6 +579,7 @@ def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
 
 
 def _population(
+    folder: Path,
     observations: _Observations,
     family: TransitionFamily,
     grid: LikelihoodGrid | None,
@@ -597,8 +588,13 @@ def _population(
 ) -> JsonObject:
     """Return the record of the population of the calibrated parameter in a group.
 
+    The log evidence of the twins is read several times. It is kept in a temporary file, because
+    that of many twins would not fit in memory.
+
     Parameters
     ----------
+    folder : Path
+        The folder of the fleet, which has room for the temporary file.
     observations : _Observations
         The observations of the group.
     family : TransitionFamily
@@ -616,13 +612,10 @@ def _population(
         probability = np.array([marginal.mean for marginal in grid.marginals])
     draws = observations.knowledge.draws
     model = with_noise_factor(observations.knowledge.sensor_model, noise_factor, nodes.predicted)
-    log_evidence = np.concatenate(
-        [
-            parameter_evidence(family, probability, model, observed, control)
-            for observed, control in observations.pieces()
-        ]
-    )
-    population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
+    with RowFile(folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER) as log_evidence:
+        for observed, control in observations.pieces():
+            log_evidence.append(parameter_evidence(family, probability, model, observed, control))
+        population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
     return {
         "parameter": draws.name,
         "mean": population.mean.summary,

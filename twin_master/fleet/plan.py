@@ -1,21 +1,28 @@
 """The plan of a fleet: its file, its groups, and the seed of every twin."""
 
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field
 
 from reporting.files import hash_file, hash_record
 from reporting.former_names import with_present_names
 from reporting.json_file import JsonObject
-from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
+from reporting.toml_file import Fault, read_toml, validate
 from twin_master.assets.resolution import Overrides, OverridesOrMapping, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
+from twin_master.fleet.members import (
+    CountedMembers,
+    ListedMembers,
+    Member,
+    Members,
+    SeededMembers,
+    Spread,
+    seeded_member,
+)
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import encode_policy
@@ -31,9 +38,7 @@ from twin_master.scenario.section import (
     Seed,
     repeated_name_fault,
 )
-from twin_master.seeds import generator
 from twin_master.watch.broker_address import is_broker
-from twin_master.watch.message import FeedItem
 
 SHARD = 256
 """Twins that are flown in one piece, unless the fleet file says otherwise."""
@@ -42,15 +47,6 @@ LARGEST = 1_000_000
 
 
 Text = Annotated[str, Field(min_length=1)]
-
-
-class Spread(Section):
-    """A parameter of the true assets that is normally distributed over the group."""
-
-    mean: Number
-    """Mean of the parameter [unit of the binding]."""
-    standard_deviation: NotNegative = 0.0
-    """Standard deviation of the parameter over the group [unit of the binding]."""
 
 
 PRESENT_NAMES = {"group.inspections_a_turn": "inspections_per_step"}
@@ -139,37 +135,6 @@ class FleetFile(Section):
 
 
 @dataclass(frozen=True)
-class Member:
-    """One asset of a group with its twin.
-
-    Attributes
-    ----------
-    row : int
-        Its number in the group, and its row in the store.
-    name : str
-        The name of the asset.
-    seed : int
-        The seed of its mission; ``uav-twin run --seed`` flies the same mission.
-    parameters : dict of str to float
-        Its true parameters in SI units, by name; only those that differ between the assets.
-    scenario_number : int
-        The number of its scenario in the group.
-    file : Path or None
-        The file of this asset alone: its FMU, its calibration, or the recording of a real asset.
-    recording : tuple of FeedItem or None
-        The observations of a real asset, as they are sent to a worker.
-    """
-
-    row: int
-    name: str
-    seed: int
-    parameters: Mapping[str, float]
-    scenario_number: int = 0
-    file: Path | None = None
-    recording: tuple[FeedItem, ...] | None = None
-
-
-@dataclass(frozen=True)
 class Group:
     """Assets that share a scenario, or that each fly it with their own FMU or calibration.
 
@@ -181,7 +146,7 @@ class Group:
         The resolved scenarios: one for all assets, or one for each.
     parameter_spreads : dict of str to Spread
         The parameters that differ from asset to asset.
-    members : tuple of Member
+    members : Members
         The assets; empty if they become known by their messages to a broker.
     observations : str
         Where the observations of real assets come from, a pattern of files or an address; empty if
@@ -193,7 +158,7 @@ class Group:
     name: str
     scenarios: tuple[Scenario, ...]
     parameter_spreads: Mapping[str, Spread]
-    members: tuple[Member, ...]
+    members: Members
     observations: str = ""
     scenario_file: Mapping[str, str] = field(default_factory=dict)
 
@@ -205,9 +170,7 @@ class Group:
             "parameters": {
                 name: spread.model_dump() for name, spread in self.parameter_spreads.items()
             },
-            "members": [
-                [member.name, member.seed, member.scenario_number] for member in self.members
-            ],
+            "members": self.members.record(),
         }
         if self.observations:
             files = [member.file for member in self.members if member.file is not None]
@@ -232,11 +195,15 @@ class Fleet:
         The groups.
     parts : TwinParts
         The parts of all twins that a user gives in the place of those of the scenarios.
+    store : str
+        The address of the store, such as "s3://bucket/winter.zarr"; empty if it is in the folder of
+        the fleet.
     """
 
     head: FleetSection
     groups: tuple[Group, ...]
     parts: TwinParts = NO_PARTS
+    store: str = ""
 
     @property
     def size(self) -> int:
@@ -251,6 +218,8 @@ class Fleet:
             parts["policy"] = hash_record([self._policy_hash(group) for group in self.groups])
         if parts:
             record["parts"] = parts
+        if self.store:
+            record["store"] = self.store
         return record
 
     def with_parts(self, parts: TwinParts) -> "Fleet":
@@ -263,6 +232,10 @@ class Fleet:
         """
         parts.with_objects()  # refuses a wrong name before anything is written
         return replace(self, parts=parts)
+
+    def with_store(self, address: str) -> "Fleet":
+        """Return the fleet with its store at an address; in its folder if the address is empty."""
+        return replace(self, store=address)
 
     def _policy_hash(self, group: Group) -> str:
         """Return the hash of the given policy for the states and controls of a group."""
@@ -356,8 +329,7 @@ def ensemble(
     """
     resolved_scenario = resolve_scenario(load_scenario(scenario), overrides)
     mission = resolved_scenario.mission
-    members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
-    group = Group(mission.name, (resolved_scenario,), {}, members)
+    group = Group(mission.name, (resolved_scenario,), {}, SeededMembers(seeds))
     head = FleetSection(name=mission.name, title=mission.title, seed=mission.seed, shard=shard)
     return Fleet(head, (group,))
 
@@ -507,9 +479,7 @@ def _with_values_of_group(section: GroupSection, scenario: Scenario) -> Scenario
     return parse_scenario(table, f"group {section.name}")
 
 
-def _members(
-    section: GroupSection, seed: int, observations: str, files: list[Path]
-) -> tuple[Member, ...]:
+def _members(section: GroupSection, seed: int, observations: str, files: list[Path]) -> Members:
     """Return the assets of a group.
 
     Parameters
@@ -526,34 +496,24 @@ def _members(
     """
     if observations:
         if is_broker(observations):
-            return ()  # an asset of a broker joins the group with its first message
-        return tuple(
-            Member(row, asset_name(path), seed, {}, file=path)
-            for row, path in enumerate(recording_files(observations))
+            return ListedMembers(())  # an asset of a broker joins the group with its first message
+        return ListedMembers(
+            tuple(
+                Member(row, asset_name(path), seed, {}, file=path)
+                for row, path in enumerate(recording_files(observations))
+            )
         )
     if files:
-        return tuple(_member(section, seed, row, file) for row, file in enumerate(files))
-    return tuple(_member(section, seed, row) for row in range(section.count or 0))
+        return ListedMembers(
+            tuple(_member_with_file(section, seed, row, file) for row, file in enumerate(files))
+        )
+    return CountedMembers(section.name, seed, section.count or 0, section.parameters)
 
 
-def _member(section: GroupSection, seed: int, row: int, file: Path | None = None) -> Member:
-    """Return an asset of a group with a seed and normally distributed true parameters.
-
-    The seed depends on the seed of the fleet, the name of the group and the row of the asset alone,
-    so that the mission of a twin does not change if other assets or groups are added.
-    """
-    key = (zlib.crc32(section.name.encode()), row)
-    sequence = np.random.SeedSequence(seed, spawn_key=key)
-    # 63 of the 64 random bits, so that the seed fits into a signed 64-bit integer of the store.
-    member_seed = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
-    deviates = generator(member_seed, "population").standard_normal(len(section.parameters))
-    parameters = {}
-    for name, standard_normal_value in zip(sorted(section.parameters), deviates, strict=True):
-        spread = section.parameters[name]
-        parameters[name] = spread.mean + spread.standard_deviation * float(standard_normal_value)
-    if file is None:
-        return Member(row, f"{section.name}-{row}", member_seed, parameters)
-    return Member(row, file.stem, member_seed, parameters, scenario_number=row, file=file)
+def _member_with_file(section: GroupSection, seed: int, row: int, file: Path) -> Member:
+    """Return an asset with an FMU or a calibration, and thus a scenario, of its own."""
+    member = seeded_member(section.name, seed, row, section.parameters, file.stem)
+    return replace(member, scenario_number=row, file=file)
 
 
 def recording_files(pattern: str) -> list[Path]:

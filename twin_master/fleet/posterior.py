@@ -1,6 +1,6 @@
 """Posteriors of probabilities and populations, on grids that are narrowed until they suffice."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -51,8 +51,6 @@ POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
-_MEMBERS_TOGETHER = 4096
-"""Number of members of a population whose likelihoods are in memory at the same time."""
 _TINY = 1e-300
 """Smallest number whose logarithm is taken."""
 
@@ -489,8 +487,10 @@ class PopulationPosterior:
     deviation: Distribution
 
 
-def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> PopulationPosterior:
-    """Infer mean and standard deviation of a normal population from B observed members.
+def population_posterior(
+    nodes: Float, log_evidence: Iterable[Float], scale: float
+) -> PopulationPosterior:
+    """Infer mean and standard deviation of a normal population from observed members.
 
     A parameter of the members is distributed normally in the population. The prior of the mean is
     uniform over the range of the nodes. The prior of the standard deviation is a half-t
@@ -500,8 +500,9 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
     ----------
     nodes : (E,) array
         Equally spaced values of the parameter.
-    log_evidence : (B, E) array
-        The log evidence of each member's observations at each of these values.
+    log_evidence : iterable of (B, E) array
+        The log evidence of each member's observations at each of these values, some members at a
+        time. It is iterated over several times.
     scale : float
         The scale of the prior of the standard deviation.
     """
@@ -521,8 +522,7 @@ def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> Pop
             np.diff(ndtr((edges[:, None] - means) / deviation), axis=0) for deviation in deviations
         ]
         log_evidence_of_all = np.zeros((POPULATION_POINTS, POPULATION_POINTS))
-        for first in range(0, len(log_evidence), _MEMBERS_TOGETHER):
-            members = log_evidence[first : first + _MEMBERS_TOGETHER]
+        for members in log_evidence:
             likelihood = _member_likelihood(nodes, members, values)
             for column, probability in enumerate(probabilities):
                 evidence_of_members = np.maximum(likelihood @ probability, _TINY)

@@ -1,17 +1,20 @@
 """Outcomes, damage and decisions of the twins of a fleet, read from the fleet's store."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from reporting.json_file import JsonRecord
 from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
+from twin_master.fleet.members import RecordedMembers
+from twin_master.fleet.outcomes import Estimated, Outcomes
 from twin_master.fleet.store import (
     ENDED,
     FAILED,
@@ -21,7 +24,7 @@ from twin_master.fleet.store import (
     flown_rows,
     open_group,
 )
-from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
+from twin_master.fleet.store_layout import ALL_ROWS, NOTICE_KINDS, row_blocks, stored_values
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability
@@ -31,117 +34,6 @@ from twin_master.seeds import generator
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-@dataclass(frozen=True)
-class Estimated:
-    """An estimated quantity with its standard error; NaN if it cannot be estimated.
-
-    Attributes
-    ----------
-    value, error : float
-        The estimate, and its standard error.
-    unit : str
-        The unit of both; empty for a plain number, or where factors of a state differ in it.
-    """
-
-    value: float
-    error: float
-    unit: str = ""
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """The outcomes of N missions, for a state of F factors.
-
-    Attributes
-    ----------
-    prompt_fallbacks : Estimated
-        Of the missions whose true damage called for a fallback to a gentler control, the fraction
-        in which it came within `WITHIN` steps; NaN if there is no such mission. A mission that
-        ended within `WITHIN` steps of the call, without a fallback, is not counted.
-    early_fallbacks : Estimated
-        The fraction of missions with a fallback before the damage that calls for it; NaN if no
-        damage calls for one.
-    rms : tuple of Estimated
-        For each factor, the root mean square error of its filtered mean over all steps of all
-        missions, in SI units.
-    bias : tuple of Estimated
-        For each factor, the mean error of its filtered mean, in SI units.
-    log_evidence : Estimated
-        The mean log evidence of a step.
-    credible_coverage : Estimated
-        The fraction of the steps in which the true state lies in the smallest set of states that
-        has a probability of `CREDIBILITY` under the filtered belief.
-    """
-
-    prompt_fallbacks: Estimated
-    early_fallbacks: Estimated
-    rms: tuple[Estimated, ...]
-    bias: tuple[Estimated, ...]
-    log_evidence: Estimated
-    credible_coverage: Estimated
-
-    @classmethod
-    def from_store(cls, stored_arrays: Mapping[Any, Any]) -> "Outcomes":
-        """Return the outcomes of all twins in a group of the store that have flown.
-
-        Of a twin whose asset ended its simulation early, the flown steps are counted.
-
-        Parameters
-        ----------
-        stored_arrays : mapping of str to array
-            The variables of the group by name, with a row for each twin.
-        """
-        rows_flown = flown_rows(np.asarray(stored_arrays["status"]))
-
-        def values(name: str) -> Float:
-            return np.asarray(stored_arrays[name])[rows_flown].astype(np.float64)
-
-        delay = values("delay")
-        delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
-        early = values("early")  # 1: early, 0: not early, -1: not defined
-        error = np.ma.masked_invalid(
-            values("filtered/mean") - values("truth/state")
-        )  # masked: steps not flown
-        # Means over the steps of each mission: (N, T, F) becomes (F, N).
-        mean_square = (error**2).mean(axis=1).filled(np.nan).T
-        mean_error = error.mean(axis=1).filled(np.nan).T
-        return cls(
-            prompt_fallbacks=_fraction(delays_when_called_for <= WITHIN),
-            early_fallbacks=_fraction(early[early >= 0.0] > 0.0),
-            rms=tuple(_root(_mean(factor)) for factor in mean_square),
-            bias=tuple(_mean(factor) for factor in mean_error),
-            log_evidence=_mean(np.nanmean(values("filtered/log_evidence"), axis=1)),
-            credible_coverage=_mean(values("credible")),
-        )
-
-
-def _fraction(hits: NDArray[np.bool_]) -> Estimated:
-    """Return the fraction of hits among trials; NaN if there is no trial.
-
-    Its error is the standard deviation of the posterior Beta(hits + 1, misses + 1) of the
-    probability of a hit under a uniform prior. It is above 0 even if no trial is a hit.
-    """
-    if not len(hits):
-        return Estimated(float("nan"), float("nan"))
-    a = np.sum(hits) + 1.0
-    b = np.sum(~hits) + 1.0
-    error = np.sqrt(a * b / (a + b + 1.0)) / (a + b)  # standard deviation of Beta(a, b)
-    return Estimated(float(np.mean(hits)), float(error))
-
-
-def _mean(values: Float) -> Estimated:
-    """Return the mean of one value for each of N independent missions, with its standard error."""
-    count = len(values)
-    error = float(np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
-    return Estimated(float(np.mean(values)), error)
-
-
-def _root(mean_square: Estimated) -> Estimated:
-    """Return the root r of a mean square, with the first-order standard error d(r^2) / (2 r)."""
-    root = float(np.sqrt(mean_square.value))
-    return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
 
 def open_fleet(folder: Path | str) -> "xr.DataTree":
@@ -164,35 +56,53 @@ def open_fleet(folder: Path | str) -> "xr.DataTree":
     RunFolderError, FleetError
         If the folder does not hold a fleet, or if its store cannot be read.
     """
-    groups = fleet_config(Path(folder))["fleet"]["groups"]
     check_installed("zarr")
     import xarray as xr
 
-    nodes = {group["name"]: open_group(Path(folder), group["name"]) for group in groups}
-    return xr.DataTree(children=nodes)
+    return xr.DataTree(children=open_groups(Path(folder), names=True))
 
 
-def notice_counts(group: "xr.DataTree", kind: str) -> Index:
-    """Return how many notices of a kind each of the B twins in a group gave: (B,)."""
+def open_groups(folder: Path, *, names: bool = False) -> "dict[str, xr.DataTree]":
+    """Return the groups of the store of a fleet by name.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the fleet.
+    names : bool
+        Whether to read the names of the twins.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If the folder does not hold a fleet, or if its store cannot be read.
+    """
+    records = fleet_config(folder)["fleet"]["groups"]
+    return {record["name"]: open_group(folder, record["name"], names=names) for record in records}
+
+
+def notice_counts(group: "xr.DataTree", kind: str, rows: slice = ALL_ROWS) -> Index:
+    """Return how many notices of a kind each of the B twins in some rows gave: (B,)."""
     return np.asarray(
-        stored_values(group, "notice/count")[:, NOTICE_KINDS.index(kind)], dtype=np.int64
+        stored_values(group, "notice/count", rows)[:, NOTICE_KINDS.index(kind)], dtype=np.int64
     )
 
 
-def believed_means(group: "xr.DataTree") -> Float:
+def believed_means(group: "xr.DataTree", rows: slice = ALL_ROWS) -> Float:
     """Return the mean of F state factors of B twins in T steps, a (B, T, F) array in SI units.
 
     They are NaN in steps in which the probability that no state of the model explains the
     observations is above `BELIEVED`.
     """
-    is_unexplained = stored_values(group, "notice/none_of_these") > BELIEVED
-    return np.where(is_unexplained[..., np.newaxis], np.nan, stored_values(group, "filtered/mean"))
+    is_unexplained = stored_values(group, "notice/none_of_these", rows) > BELIEVED
+    mean = stored_values(group, "filtered/mean", rows)
+    return np.where(is_unexplained[..., np.newaxis], np.nan, mean)
 
 
-def last_steps(group: "xr.DataTree") -> Index:
+def last_steps(group: "xr.DataTree", rows: slice = ALL_ROWS) -> Index:
     """Return the number of the last flown step of each of B twins: (B,); 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
-    flown_steps = (stored_values(group, "observed/control_index") >= 0).sum(axis=1)
+    flown_steps = (stored_values(group, "observed/control_index", rows) >= 0).sum(axis=1)
     last_step: Index = np.maximum(flown_steps - 1, 0)
     return last_step
 
@@ -305,18 +215,27 @@ def flown_twins(
         If a file of the twins' prepared knowledge is missing or damaged.
     """
     rows_flown = flown_rows(stored_values(group, "status"))
-    scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[rows_flown]
+    scenario_numbers = RecordedMembers(record).scenario_numbers(rows_flown)
     for number in np.unique(scenario_numbers).tolist():
-        knowledge_folder = folder / GROUPS / record["name"] / str(number)
-        scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(
-            knowledge_folder
-        )
+        knowledge_folder = _knowledge_folder(folder, record, number)
         rows = rows_flown[scenario_numbers == number]
-        yield TwinsOfScenario(rows, knowledge_folder, load_knowledge(knowledge_folder, scenario))
+        yield TwinsOfScenario(rows, knowledge_folder, _knowledge(folder, record, number))
 
 
-def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree") -> Float:
-    """Return the probability that each of B twins changes its control within `prediction_steps`.
+def _knowledge_folder(folder: Path, record: JsonRecord, scenario_number: int) -> Path:
+    """Return the folder with the prepared knowledge of a scenario of a group."""
+    return folder / GROUPS / str(record["name"]) / str(scenario_number)
+
+
+def _knowledge(folder: Path, record: JsonRecord, scenario_number: int) -> Knowledge:
+    """Return the knowledge of the twins of a scenario of a group."""
+    knowledge_folder = _knowledge_folder(folder, record, scenario_number)
+    scenario = Scenario.model_validate(record["scenarios"][scenario_number])
+    return load_knowledge(knowledge_folder, scenario.with_paths_from(knowledge_folder))
+
+
+class ControlForecast:
+    """How probably the twins of a group change their control, by the policies of their scenarios.
 
     Parameters
     ----------
@@ -324,34 +243,60 @@ def leaving_probabilities(folder: Path, record: JsonRecord, group: "xr.DataTree"
         The folder of the fleet.
     record : mapping
         The record of the group in `config.json`.
-    group : DataTree
-        The stored results of the group, with a row for each twin.
-
-    Returns
-    -------
-    (B,) array
-        The probabilities of `probability_of_leaving` after the last step; NaN for twins that have
-        not flown, and for twins whose observations no state of the model explains.
-
-    Raises
-    ------
-    RunFolderError
-        If a file of the twins' prepared knowledge is missing or damaged.
     """
-    twin_count = group.sizes["twin"]
-    at_last_step = (np.arange(twin_count), last_steps(group))
-    belief = stored_values(group, "filtered/last_probability").astype(np.float64)
-    control_in_force = stored_values(group, "observed/control_index")[at_last_step]
-    probability = np.full(twin_count, np.nan)
-    for scenario_twins in flown_twins(folder, record, group):
-        for control_index in np.unique(control_in_force[scenario_twins.rows]).tolist():
-            rows = scenario_twins.rows[control_in_force[scenario_twins.rows] == control_index]
-            probability[rows] = probability_of_leaving(
-                scenario_twins.knowledge, belief[rows], control_index
-            )
-    # `unexplained` is the filter's probability that no state explains the observations.
-    probability[stored_values(group, "notice/none_of_these")[at_last_step] > BELIEVED] = np.nan
-    return probability
+
+    def __init__(self, folder: Path, record: JsonRecord) -> None:
+        self._members = RecordedMembers(record)
+        # The twins of a block have one scenario, or each has its own.
+        self._knowledge = lru_cache(maxsize=1)(partial(_knowledge, folder, record))
+
+    def probabilities(self, group: "xr.DataTree", rows: slice) -> Float:
+        """Return the probability that each of B twins changes control within `prediction_steps`.
+
+        Parameters
+        ----------
+        group : DataTree
+            The stored results of the group, with a row for each twin.
+        rows : slice
+            The rows of the B twins.
+
+        Returns
+        -------
+        (B,) array
+            The probabilities of `probability_of_leaving` after the last step; NaN for twins that
+            have not flown, and for twins whose observations no state of the model explains.
+
+        Raises
+        ------
+        RunFolderError
+            If a file of the twins' prepared knowledge is missing or damaged.
+        """
+        status = stored_values(group, "status", rows)
+        at_last_step = (np.arange(len(status)), last_steps(group, rows))
+        belief = stored_values(group, "filtered/last_probability", rows).astype(np.float64)
+        control_in_force = stored_values(group, "observed/control_index", rows)[at_last_step]
+        row_numbers = np.arange(*rows.indices(group.sizes["twin"]))
+        scenario_numbers = self._members.scenario_numbers(row_numbers)
+        has_flown = np.zeros(len(status), dtype=bool)
+        has_flown[flown_rows(status)] = True
+        probability = np.full(len(status), np.nan)
+        for number in np.unique(scenario_numbers[has_flown]).tolist():
+            knowledge = self._knowledge(number)
+            has_scenario = has_flown & (scenario_numbers == number)
+            for control_index in np.unique(control_in_force[has_scenario]).tolist():
+                twins = has_scenario & (control_in_force == control_index)
+                probability[twins] = probability_of_leaving(knowledge, belief[twins], control_index)
+        # `unexplained` is the filter's probability that no state explains the observations.
+        is_unexplained = stored_values(group, "notice/none_of_these", rows)[at_last_step] > BELIEVED
+        probability[is_unexplained] = np.nan
+        return probability
+
+
+def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
+    """Return the outcomes of the twins of a group of the store."""
+    return Outcomes.from_blocks(
+        partial(stored_values, group, rows=rows) for rows in row_blocks(group)
+    )
 
 
 def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
@@ -360,11 +305,10 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
     The figures are means over the twins with their standard errors; a group without a flown twin
     has counts alone. Figures that need the true state are left out for real assets.
     """
-    status = stored_values(group, "status")
-    figures = _counts_of_twins(group)
-    if not len(flown_rows(status)):
+    figures, flown_count = _counts_of_twins(group)
+    if not flown_count:
         return figures
-    outcomes = Outcomes.from_store(group)
+    outcomes = outcomes_of_group(group)
     is_truth_known = not np.isnan(outcomes.bias[0].value)  # NaN for real assets
     if is_truth_known:
         if not np.isnan(outcomes.prompt_fallbacks.value):
@@ -386,29 +330,57 @@ def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
     return figures
 
 
+Figures = dict[str, dict[str, Estimated | int]]
+"""The figures of each group, by the name of the group and of the figure."""
+
+
+def figures_of_fleets(folders: Sequence[Path]) -> Figures:
+    """Return the figures of each group by name; of several folders, the name has the folder.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If a folder does not hold a fleet, or if its store cannot be read.
+    """
+    figures = {}
+    for folder in folders:
+        for name, group in open_groups(folder).items():
+            full_name = name if len(folders) == 1 else f"{folder}: {name}"
+            figures[full_name] = group_figures(group)
+    return figures
+
+
 def unit_of_states(group: "xr.DataTree") -> str:
     """Return the unit of the stored factors of the state; empty if they differ in it."""
     unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
     return "" if ", " in unit else unit
 
 
-def _counts_of_twins(group: "xr.DataTree") -> dict[str, Estimated | int]:
-    """Return the numbers of twins that flew, failed, ended early, or gave notices, by title."""
-    status = stored_values(group, "status")
+def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Estimated | int], int]:
+    """Return the numbers of twins by title, and the number of twins that have outcomes.
+
+    Counted are twins that flew, failed, ended early, or gave notices.
+    """
+    status_counts = np.zeros(max(FLOWN, FAILED, ENDED) + 1, dtype=np.int64)
+    alarmed = 0
+    left_gauge_out = 0
+    for rows in row_blocks(group):
+        status = stored_values(group, "status", rows)
+        status_counts += np.bincount(status, minlength=len(status_counts))
+        alarmed += int(np.sum(notice_counts(group, "alarm", rows) > 0))
+        left_gauge_out += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
     figures: dict[str, Estimated | int] = {
-        "twins": len(status),
-        "flown": int(np.sum(status == FLOWN)),
-        "failed in flight": int(np.sum(status == FAILED)),
+        "twins": int(status_counts.sum()),
+        "flown": int(status_counts[FLOWN]),
+        "failed in flight": int(status_counts[FAILED]),
     }
-    ended_early = int(np.sum(status == ENDED))
-    if ended_early:
-        figures["ended early"] = ended_early
+    if status_counts[ENDED]:
+        figures["ended early"] = int(status_counts[ENDED])
     if group.attrs.get("gives_notice"):
-        figures["raised an alarm"] = int(np.sum(notice_counts(group, "alarm") > 0))
-    left_gauge_out = int(np.sum(notice_counts(group, "gauge_left_out") > 0))
+        figures["raised an alarm"] = alarmed
     if left_gauge_out:
         figures["left a gauge out"] = left_gauge_out
-    return figures
+    return figures, int(status_counts[FLOWN] + status_counts[ENDED])
 
 
 class _PrintedFigure(NamedTuple):

@@ -1,43 +1,36 @@
 """The report of a fleet: health of its assets, assets to attend to next, lessons, failures.
 
 The page is made from the folder of the fleet alone, which may still be growing. Its size does not
-grow much with the number of assets: each has one cell of a map, and the tables have few rows.
+grow much with the number of assets: each has one cell of a map, of which there are ten thousand at
+most, and the tables have few rows.
 """
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float
 from reporting.files import atomic_write_text
 from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
-from twin_master.errors import FleetError, TwinMasterError
+from twin_master.errors import FleetError
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
+from twin_master.fleet.members import RecordedMembers
+from twin_master.fleet.overview import GroupOverview, overview_of_group
 from twin_master.fleet.page_figures import course_figure, map_figure
-from twin_master.fleet.reading import (
-    believed_means,
-    figure_rows,
-    group_figures,
-    leaving_probabilities,
-)
-from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
-from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows, open_group
-from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
+from twin_master.fleet.reading import figure_rows, group_figures, open_groups
+from twin_master.fleet.standing import Standing, standing_of_watched
+from twin_master.fleet.store import WITHIN
 from twin_master.fleet.watched_asset import counts_of, read_standing
 from twin_master.report.reading import PrintedFactor, printed_factors
-
-if TYPE_CHECKING:
-    import xarray as xr
-
+from twin_master.scenario.schema import Scenario
 
 WORDS = Words("twin_master.fleet")
 """The texts of the page."""
@@ -110,7 +103,7 @@ def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
     group_count = counted(len(fleet["groups"]), "group")
     if is_watched:  # the configuration of a watched fleet has no list of assets
         return f"{group_count}, seed {fleet['seed']}, watched"
-    asset_count = sum(len(group.get("members", ())) for group in fleet["groups"])
+    asset_count = sum(len(RecordedMembers(group)) for group in fleet["groups"])
     return f"{counted(asset_count, 'asset')} in {group_count}, seed {fleet['seed']}, flown"
 
 
@@ -118,32 +111,26 @@ def _add_flown_fleet(
     page: Page, folder: Path, records: Sequence[JsonObject], most_assets: int
 ) -> None:
     """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
-    groups = {record["name"]: open_group(folder, record["name"]) for record in records}
-    standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
-    page.add_paragraph(_opening(standings, list(groups.values())))
-    status = np.concatenate([stored_values(group, "status") for group in groups.values()])
+    groups = open_groups(folder)
+    overviews = [
+        overview_of_group(folder, record, groups[record["name"]], most_assets) for record in records
+    ]
+    page.add_paragraph(_opening(overviews))
+    asset_count = sum(overview.twin_count for overview in overviews)
     failures = endings_of(folder).failures
     if failures:
         page.add_notice(
-            f"{len(failures)} of {len(status)} assets failed in flight; their twins end there."
+            f"{len(failures)} of {asset_count} assets failed in flight; their twins end there."
         )
     _add_failures(page, failures, "fleet.json lists all of them once the fleet has flown.")
-    ended_early = int(np.sum(status == ENDED))
+    ended_early = sum(overview.ended_count for overview in overviews)
     if ended_early:
         page.add_notice(
-            f"{ended_early} of {len(status)} assets ended their simulation before the mission "
+            f"{ended_early} of {asset_count} assets ended their simulation before the mission "
             "was over; what they have flown counts."
         )
-    for record, standing in zip(records, standings, strict=True):
-        group = groups[record["name"]]
-        page.add_section(f"Group {record['name']}")
-        leaving = _leaving_or_explanation(page, folder, record, group)
-        if leaving is not None:
-            standing = replace(standing, leaving=leaving)
-        failed = int(np.sum(stored_values(group, "status") == FAILED))
-        _add_map(page, standing, failed)
-        _add_courses(page, standing, group)
-        _add_attention_table(page, standing, most_assets)
+    for overview in overviews:
+        _add_flown_group(page, overview)
     page.add_section("Results of the twins")
     figures = {name: group_figures(group) for name, group in groups.items()}
     WORDS.add_table(
@@ -152,77 +139,75 @@ def _add_flown_fleet(
     _add_lessons(page, folder)
 
 
-def _leaving_or_explanation(
-    page: Page, folder: Path, record: JsonRecord, group: "xr.DataTree"
-) -> Float | None:
-    """Return for each flown twin of a group the probability that its control changes soon.
-
-    The probabilities are those of `leaving_probabilities`. If they cannot be computed, add a
-    paragraph with the reason to the page, and return None.
-    """
-    try:
-        probabilities = leaving_probabilities(folder, record, group)
-    except TwinMasterError as error:
+def _add_flown_group(page: Page, overview: GroupOverview) -> None:
+    """Add the section of a group of a flown fleet."""
+    page.add_section(f"Group {overview.record['name']}")
+    if overview.leaving_unknown_because:
         page.add_paragraph(
-            in_one_line(f"It is not known which assets will soon change their control: {error}")
+            in_one_line(
+                "It is not known which assets will soon change their control: "
+                f"{overview.leaving_unknown_because}"
+            )
         )
-        return None
-    return probabilities[flown_rows(stored_values(group, "status"))]
+    scenario = overview.urgent.scenario
+    drawn = overview.drawn
+    sample = ""
+    if drawn.distance > 1:
+        sample = f"Of {overview.twin_count} assets, one in {drawn.distance} is drawn."
+    _add_map(page, scenario, np.concatenate(drawn.last_mean), drawn.failed_count, sample)
+    _add_courses(page, scenario, np.concatenate(drawn.mean), np.concatenate(drawn.state), sample)
+    has_alarms = overview.alarmed_count > 0
+    _add_attention_table(page, overview.urgent, overview.flown_count, has_alarms=has_alarms)
 
 
-def _opening(standings: Sequence[Standing], groups: "Sequence[xr.DataTree]") -> str:
+def _opening(overviews: Sequence[GroupOverview]) -> str:
     """Return the opening sentences: on flights, alarms, fallbacks and the most severe damage."""
-    asset_count = sum(group.sizes["twin"] for group in groups)
-    flown_count = sum(len(standing.names) for standing in standings)
+    asset_count = sum(overview.twin_count for overview in overviews)
+    flown_count = sum(overview.flown_count for overview in overviews)
+    step_word = overviews[0].urgent.scenario.mission.step_name
     sentences = [
         f"{flown_count} of {counted(asset_count, 'asset')} have flown.",
-        _alarm_sentence(standings[0].scenario.mission.step_name, groups),
-        _fallback_sentence(standings[0].scenario.mission.step_name, groups),
-        _damage_sentence(standings),
+        _alarm_sentence(step_word, overviews),
+        _fallback_sentence(step_word, overviews),
+        _damage_sentence(overviews),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
 
-def _alarm_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
+def _alarm_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> str:
     """Return the number of assets with an alarm and the first step of one; empty without alarms."""
-    alarm_column = NOTICE_KINDS.index("alarm")
-    first_alarm = np.concatenate(
-        [stored_values(group, "notice/first_step")[:, alarm_column] for group in groups]
-    )
-    steps = first_alarm[first_alarm >= 0]  # -1: the twin gave no alarm
-    if not len(steps):
+    steps = [overview.first_alarm for overview in overviews if overview.first_alarm is not None]
+    if not steps:
         return ""
-    return f"{counted(len(steps), 'asset')} raised an alarm, first in {step_word} {min(steps)}."
+    alarmed_count = sum(overview.alarmed_count for overview in overviews)
+    return f"{counted(alarmed_count, 'asset')} raised an alarm, first in {step_word} {min(steps)}."
 
 
-def _fallback_sentence(step_word: str, groups: "Sequence[xr.DataTree]") -> str:
+def _fallback_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> str:
     """Return the fraction of fallbacks within `WITHIN` steps; empty if none was called for."""
-    delay = np.concatenate([stored_values(group, "delay") for group in groups])
-    called_for_delays = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
-    if not len(called_for_delays):
+    called_for_count = sum(overview.prompt_fallbacks.trials for overview in overviews)
+    if not called_for_count:
         return ""
-    fraction_in_time = float(np.mean(called_for_delays <= WITHIN))
+    prompt_count = sum(overview.prompt_fallbacks.hits for overview in overviews)
+    fraction_in_time = prompt_count / called_for_count
     return (
-        f"In {counted(len(called_for_delays), 'asset')} the damage called for another control; "
+        f"In {counted(called_for_count, 'asset')} the damage called for another control; "
         f"the fallback came within {WITHIN} {step_word}s of it in {100 * fraction_in_time:.0f} %."
     )
 
 
-def _damage_sentence(standings: Sequence[Standing]) -> str:
+def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
     """Return a sentence on the most severely damaged asset; empty if no state is estimated."""
-    standings_with_state = [standing for standing in standings if standing.most_damaged is not None]
-    if not standings_with_state:
+    candidates = [overview.most_damaged for overview in overviews]
+    with_state = [candidate for candidate in candidates if candidate is not None]
+    if not with_state:
         return ""
-    worst_group = max(standings_with_state, key=lambda standing: np.nanmax(standing.severity))
-    number = worst_group.most_damaged
-    assert number is not None
+    worst = max(with_state, key=lambda candidate: float(candidate.severity[0]))
     states = []
-    for factor, mean in zip(
-        printed_factors(worst_group.scenario), worst_group.mean[number], strict=True
-    ):
+    for factor, mean in zip(printed_factors(worst.scenario), worst.mean[0], strict=True):
         states.append(f"{factor.title} {factor.scale * mean:.3g} {factor.unit}".rstrip())
-    name = worst_group.names[number]
-    return f"The asset with the most damage is {name} of {worst_group.group}: {', '.join(states)}."
+    name = worst.names[0]
+    return f"The asset with the most damage is {name} of {worst.group}: {', '.join(states)}."
 
 
 def _add_watched_fleet(
@@ -248,8 +233,11 @@ def _add_watched_fleet(
     for record in groups:
         page.add_section(f"Group {record['name']}")
         group_standing = standing_of_watched(record, decided)
-        _add_map(page, group_standing, failed=0)
-        _add_attention_table(page, group_standing, most_assets)
+        _add_map(page, group_standing.scenario, group_standing.mean, failed=0)
+        urgent = group_standing.of_assets(group_standing.attention_order[:most_assets])
+        has_alarms = bool(group_standing.alarms.any())
+        known_count = len(group_standing.names)
+        _add_attention_table(page, urgent, known_count, has_alarms=has_alarms)
 
 
 def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None:
@@ -282,25 +270,48 @@ def _add_lessons(page: Page, folder: Path) -> None:
         WORDS.add_table(page, "lessons", lesson_rows(json.loads(path.read_text())))
 
 
-def _add_map(page: Page, standing: Standing, failed: int) -> None:
-    """Add the map of the states of a group's assets; assets that failed in flight are grey."""
-    if not standing.names:
+def _add_map(page: Page, scenario: Scenario, mean: Float, failed: int, sample: str = "") -> None:
+    """Add the map of the states of a group's assets; assets that failed in flight are grey.
+
+    Parameters
+    ----------
+    page : Page
+        The page to which content is added.
+    scenario : Scenario
+        The scenario with F factors of the state.
+    mean : (B, F) array
+        The mean states after the last steps, in SI units.
+    failed : int
+        The number of assets that failed in flight.
+    sample : str
+        A sentence that says which of the assets are drawn, if not all are.
+    """
+    if not len(mean):
         page.add_paragraph("Nothing is known of its assets yet.")
         return
-    figure = map_figure(standing.scenario, standing.mean, failed)
+    figure = map_figure(scenario, mean, failed)
     failed_sentence = f"Grey: {failed} that failed in flight." if failed else ""
-    page.add_report_figure(WORDS.figure("map", figure, failed=failed_sentence))
+    more = f"{failed_sentence} {sample}".strip()
+    page.add_report_figure(WORDS.figure("map", figure, more=more))
 
 
-def _add_courses(page: Page, standing: Standing, group: "xr.DataTree") -> None:
-    """Add the figure of the assets' states over time, if any step has an estimated state."""
-    rows_flown = flown_rows(stored_values(group, "status"))
-    mean = believed_means(group)[rows_flown]
-    if standing.names and not np.isnan(mean).all():
-        figure = course_figure(
-            standing.scenario, mean, stored_values(group, "truth/state")[rows_flown]
-        )
-        page.add_report_figure(WORDS.figure("course", figure))
+def _add_courses(page: Page, scenario: Scenario, mean: Float, state: Float, sample: str) -> None:
+    """Add the figure of the assets' states over time, if any step has an estimated state.
+
+    Parameters
+    ----------
+    page : Page
+        The page to which content is added.
+    scenario : Scenario
+        The scenario with F factors of the state.
+    mean, state : (B, T, F) array
+        The believed mean states and the true states, in SI units.
+    sample : str
+        A sentence that says which of the assets are drawn, if not all are.
+    """
+    if not np.isnan(mean).all():
+        figure = course_figure(scenario, mean, state)
+        page.add_report_figure(WORDS.figure("course", figure, more=sample))
 
 
 class _AttentionTable(NamedTuple):
@@ -310,47 +321,29 @@ class _AttentionTable(NamedTuple):
     rows: list[list[str]]
 
 
-def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> None:
-    """Add the table of the assets that need attention first, of at most `most_assets` rows."""
-    if not standing.names:
+def _add_attention_table(
+    page: Page, urgent: Standing, asset_count: int, *, has_alarms: bool
+) -> None:
+    """Add the table of the assets that need attention first, of a number of known assets."""
+    if not urgent.names:
         return
-    order = _attention_order(standing)[:most_assets]
-    has_alarms = bool(standing.alarms.any())
-    table = _attention_table(standing, order, has_alarms=has_alarms)
-    mission = standing.scenario.mission
+    table = _attention_table(urgent, has_alarms=has_alarms)
+    mission = urgent.scenario.mission
     WORDS.add_table(
         page,
         "next",
         table.rows,
         more=table.columns,
         shown=len(table.rows),
-        assets=counted(len(standing.names), "asset"),
+        assets=counted(asset_count, "asset"),
         alarms="alarms, then by " if has_alarms else "",
         steps=f"{mission.prediction_steps} {mission.step_name}s",
         step=mission.step_name,
     )
 
 
-def _leaving_percentage(standing: Standing) -> Float:
-    """Return the probability of a change of control in whole percent, (B,); 0 if it is unknown."""
-    return np.asarray(np.rint(100.0 * np.nan_to_num(standing.leaving)))
-
-
-def _attention_order(standing: Standing) -> Index:
-    """Return the indices of the assets in the order in which they need attention.
-
-    The order is by the number of alarms, then by the probability of a change of control, then by
-    severity of damage. Assets without an estimated state count as the most damaged.
-    """
-    damage = np.nan_to_num(standing.severity, nan=np.inf)
-    # `lexsort` sorts by its last key first; minus signs give descending order.
-    return np.lexsort((-damage, -_leaving_percentage(standing), -standing.alarms))
-
-
-def _attention_table(
-    standing: Standing, order: Iterable[int], *, has_alarms: bool
-) -> _AttentionTable:
-    """Return the table of the assets with the given indices, in their order."""
+def _attention_table(standing: Standing, *, has_alarms: bool) -> _AttentionTable:
+    """Return the table of some assets, in their order."""
     factors = printed_factors(standing.scenario)
     columns = []
     for factor in factors:
@@ -358,9 +351,9 @@ def _attention_table(
     columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
     if has_alarms:
         columns.append(number_column("alarms"))
-    percentage = _leaving_percentage(standing)
+    percentage = standing.leaving_percentage
     rows = []
-    for number in order:
+    for number in range(len(standing.names)):
         is_leaving_known = not np.isnan(standing.leaving[number])
         row = [
             standing.names[number],

@@ -24,7 +24,7 @@ from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.fleet.checks import with_parameters
-from twin_master.fleet.plan import Member
+from twin_master.fleet.members import Member
 from twin_master.fleet.store import FAILED, stored_variables
 from twin_master.mission.loop import operate
 from twin_master.mission.parts import TwinParts

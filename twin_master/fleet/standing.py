@@ -3,16 +3,17 @@
 They are read from the store of a flown fleet, or from the records of a watched one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject, JsonRecord
+from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
 from twin_master.fleet.store import flown_rows
-from twin_master.fleet.store_layout import stored_values
+from twin_master.fleet.store_layout import TWIN_AXIS, stored_values
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -55,6 +56,49 @@ class Standing:
     alarms: Index
     leaving: Float
 
+    def of_assets(self, indices: Index) -> "Standing":
+        """Return the standing of some of the assets, in the order of the indices."""
+        numbers = indices.tolist()
+        return replace(
+            self,
+            names=[self.names[number] for number in numbers],
+            step=self.step[indices],
+            mean=self.mean[indices],
+            deviation=self.deviation[indices],
+            control=[self.control[number] for number in numbers],
+            alarms=self.alarms[indices],
+            leaving=self.leaving[indices],
+        )
+
+    def followed_by(self, others: "Standing") -> "Standing":
+        """Return the standing of these assets and of others of the same group."""
+        return replace(
+            self,
+            names=self.names + others.names,
+            step=np.concatenate([self.step, others.step]),
+            mean=np.concatenate([self.mean, others.mean]),
+            deviation=np.concatenate([self.deviation, others.deviation]),
+            control=self.control + others.control,
+            alarms=np.concatenate([self.alarms, others.alarms]),
+            leaving=np.concatenate([self.leaving, others.leaving]),
+        )
+
+    @property
+    def leaving_percentage(self) -> Float:
+        """The probability of a change of control in whole percent, (B,); 0 if it is unknown."""
+        return np.asarray(np.rint(100.0 * np.nan_to_num(self.leaving)))
+
+    @property
+    def attention_order(self) -> Index:
+        """The indices of the assets in the order in which they need attention, a (B,) array.
+
+        The order is by the number of alarms, then by the probability of a change of control, then
+        by severity of damage. Assets without an estimated state count as the most damaged.
+        """
+        damage = np.nan_to_num(self.severity, nan=np.inf)
+        # `lexsort` sorts by its last key first; minus signs give descending order.
+        return np.lexsort((-damage, -self.leaving_percentage, -self.alarms))
+
     @property
     def severity(self) -> Float:
         """The severity of the damage of each asset, a (B,) array."""
@@ -68,11 +112,10 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
-    """Return state, control and alarms of the flown twins of a group after their last steps.
-
-    The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
-    because they need the twins' model and policy, which the store does not hold.
+def standing_of_flown(
+    record: JsonRecord, group: "xr.DataTree", rows: slice, leaving: Float | None = None
+) -> Standing:
+    """Return state, control and alarms of the flown twins in some rows after their last steps.
 
     Parameters
     ----------
@@ -80,24 +123,29 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group, with a row for each twin.
+    rows : slice
+        The rows.
+    leaving : (B,) array, optional
+        The probability that each twin in the rows changes its control; NaN if left out.
     """
     # All scenarios of a group come from one scenario file, with equal states and controls.
     scenario = Scenario.model_validate(record["scenarios"][0])
-    rows_flown = flown_rows(stored_values(group, "status"))
-    last_step = last_steps(group)[rows_flown]
-    at_last_step = (rows_flown, last_step)
-    last_control = stored_values(group, "observed/control_index")[at_last_step]
-    names = [name for name, _seed, _scenario_number in record["members"]]
+    members = RecordedMembers(record)
+    first_row, _, distance = rows.indices(group.sizes[TWIN_AXIS])
+    flown = flown_rows(stored_values(group, "status", rows))
+    last_step = last_steps(group, rows)[flown]
+    at_last_step = (flown, last_step)
+    last_control = stored_values(group, "observed/control_index", rows)[at_last_step]
     return Standing(
         group=record["name"],
         scenario=scenario,
-        names=[names[row] for row in rows_flown],
+        names=[members.name(first_row + distance * row) for row in flown.tolist()],
         step=last_step,
-        mean=believed_means(group)[at_last_step],
-        deviation=stored_values(group, "filtered/standard_deviation")[at_last_step],
+        mean=believed_means(group, rows)[at_last_step],
+        deviation=stored_values(group, "filtered/standard_deviation", rows)[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
-        alarms=notice_counts(group, "alarm")[rows_flown],
-        leaving=np.full(len(rows_flown), np.nan),
+        alarms=notice_counts(group, "alarm", rows)[flown],
+        leaving=np.full(len(flown), np.nan) if leaving is None else leaving[flown],
     )
 
 

@@ -1,6 +1,6 @@
-"""The store of a fleet: arrays with a row for each twin, in chunks of one shard."""
+"""The store of a fleet, arrays with a row for each twin: its variables, and how it is opened."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,22 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import AnyArray, Float, Index
-from reporting.files import explained_write_errors
 from reporting.former_names import warn_of_former_names
 from reporting.json_file import JsonObject
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
-from twin_master.fleet.plan import Fleet, Group, Member
+from twin_master.fleet.members import Member, RecordedMembers
+from twin_master.fleet.store_address import address_of
 from twin_master.fleet.store_layout import (
     NOTICE_KINDS,
-    Coordinate,
-    coordinates_of_groups,
-    dimension_sizes,
+    TWIN_AXIS,
     former_names_used,
     in_present_layout,
     is_former_layout,
     observed_columns,
-    store_coordinates,
     stored_layout,
 )
 from twin_master.mission.preparation import Knowledge
@@ -36,7 +33,6 @@ from twin_master.store.summary import find_fallback
 
 if TYPE_CHECKING:
     import xarray as xr
-    import zarr
 
 
 CREDIBILITY = 0.9
@@ -273,10 +269,6 @@ def in_credible_set(
     return np.asarray(np.any(is_nearest & is_in_set, axis=1))
 
 
-STORE_NAME = "fleet.zarr"
-"""The folder of the store in the folder of a fleet."""
-
-
 def check_installed(*packages: str) -> None:
     """Check that packages of the extra `fleet` are installed.
 
@@ -292,7 +284,7 @@ def check_installed(*packages: str) -> None:
         )
 
 
-def open_group(folder: Path, group: str) -> "xr.DataTree":
+def open_group(folder: Path, group: str, *, names: bool = True) -> "xr.DataTree":
     """Open a group of assets in the store of a fleet.
 
     The arrays of the group are read from the disk when they are first used. If an earlier version
@@ -302,9 +294,11 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
     Parameters
     ----------
     folder : Path
-        The folder of the fleet, which holds the store.
+        The folder of the fleet.
     group : str
         The name of the group.
+    names : bool
+        Whether to read the names of the twins, which are in memory as long as the group is open.
 
     Raises
     ------
@@ -315,19 +309,28 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
     check_installed("zarr")
     import xarray as xr
 
+    config = fleet_config(folder)
+    record = _group_record(config, folder, group)
+    address = address_of(config["fleet"], folder)
+    address.check()
     # an error of zarr becomes a `FleetError`, whose message quotes it between two texts
-    message_start = f"{folder} holds no group {group} of a fleet ("
+    message_start = f"{address.remote or folder} holds no group {group} of a fleet ("
     with FleetError.instead_of(OSError, KeyError, ValueError, before=message_start, after=")."):
         tree: xr.DataTree = xr.open_datatree(
-            folder / STORE_NAME, engine="zarr", group=group, chunks=None, consolidated=False
+            address.for_zarr(),
+            engine="zarr",
+            group=group,
+            chunks=None,
+            consolidated=False,
+            drop_variables=[] if names else [TWIN_AXIS],
         )
     stored_group = tree.to_dataset()
     if is_former_layout(stored_group):
-        warn_of_former_names(f"{folder / STORE_NAME}", former_names_used(stored_group))
-        record = _group_record(folder, group)
+        warn_of_former_names(f"{address.for_zarr()}", former_names_used(stored_group))
         scenario = Scenario.model_validate(record["scenarios"][0])
-        names = [name for name, _seed, _scenario_number in record["members"]]
-        tree = in_present_layout(stored_group, scenario, names)
+        members = RecordedMembers(record)
+        all_names = [members.name(row) for row in range(len(members))] if names else None
+        tree = in_present_layout(stored_group, scenario, all_names)
     # A path with braces is a template, such as "{input}", whose arrays differ between groups.
     required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
     missing_paths = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
@@ -340,11 +343,13 @@ def open_group(folder: Path, group: str) -> "xr.DataTree":
     return tree
 
 
-def _group_record(folder: Path, group: str) -> JsonObject:
+def _group_record(config: JsonObject, folder: Path, group: str) -> JsonObject:
     """Return the record of a group in the configuration of a fleet."""
-    records: list[JsonObject] = fleet_config(folder)["fleet"]["groups"]
-    (record,) = (record for record in records if record["name"] == group)
-    return record
+    records: list[JsonObject] = config["fleet"]["groups"]
+    for record in records:
+        if record["name"] == group:
+            return record
+    raise FleetError(f"{folder} holds no group {group} of a fleet.")
 
 
 def _paths_of(tree: "xr.DataTree") -> set[str]:
@@ -354,82 +359,3 @@ def _paths_of(tree: "xr.DataTree") -> set[str]:
         for node in tree.subtree
         for name in node.data_vars
     }
-
-
-def create_store(folder: Path, fleet: Fleet) -> None:
-    """Create the arrays of a fleet's store, filled with the values of twins that have not flown."""
-    import zarr
-
-    with explained_write_errors(folder / STORE_NAME):
-        root = zarr.open_group(folder / STORE_NAME, mode="a", zarr_format=3)
-        for group in fleet.groups:
-            _create_group(root.require_group(group.name), group, fleet)
-
-
-def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
-    """Create the empty arrays and the coordinates of a group of assets in the store of a fleet.
-
-    The assets of one shard are one chunk of each array, so that a shard writes whole chunks.
-    """
-    scenario = group.scenarios[0]
-    twin_count = len(group.members)
-    sizes = dimension_sizes(scenario)
-    layout = stored_layout(scenario, list(group.parameter_spreads))
-    for path, variable in layout.items():
-        row_shape = tuple(sizes[axis] for axis in variable.axes)
-        zarr_group.create_array(
-            path,
-            shape=(twin_count, *row_shape),
-            chunks=(min(fleet.head.shard, twin_count), *row_shape),
-            dtype=variable.dtype,
-            fill_value=variable.fill_value,
-            dimension_names=("twin", *variable.axes),
-            attributes=variable.attributes,
-            overwrite=True,
-        )
-    all_coordinates = store_coordinates(scenario, [member.name for member in group.members])
-    for inner_group, coordinates in coordinates_of_groups(layout, all_coordinates).items():
-        _create_coordinates(zarr_group, inner_group, coordinates)
-    zarr_group.attrs.update(
-        {
-            "scenario": scenario.mission.name,
-            "fleet": fleet.head.name,
-            "fleet_seed": fleet.head.seed,
-            "factors": list(scenario.state_names),
-            "controls": list(scenario.control_names),
-            "step_name": scenario.mission.step_name,
-            "gives_notice": scenario.notice is not None,
-        }
-    )
-
-
-def _create_coordinates(
-    zarr_group: "zarr.Group", path: str, coordinates: Mapping[str, Coordinate]
-) -> None:
-    """Write the coordinates of one of the groups inside a group of the fleet.
-
-    Parameters
-    ----------
-    zarr_group : zarr.Group
-        The group of the fleet.
-    path : str
-        The path of the group inside it; empty for the group itself.
-    coordinates : mapping of str to Coordinate
-        The coordinates by their names.
-    """
-    inner_group = zarr_group.require_group(path) if path else zarr_group
-    for name, coordinate in coordinates.items():
-        values = coordinate.values
-        array = inner_group.create_array(
-            name,
-            shape=values.shape,
-            dtype="str" if values.dtype.kind == "U" else values.dtype,
-            dimension_names=(coordinate.axis,),
-            attributes=coordinate.attributes,
-            overwrite=True,
-        )
-        array[:] = values
-    # By the CF conventions this attribute names the coordinates that are not dimensions.
-    beside_dimensions = [name for name, entry in coordinates.items() if name != entry.axis]
-    if beside_dimensions:
-        inner_group.attrs["coordinates"] = " ".join(beside_dimensions)

@@ -23,6 +23,12 @@ if TYPE_CHECKING:
 NOTICE_KINDS = ("alarm", "gauge_left_out")
 """The kinds of notices that are kept of each twin."""
 
+BLOCK_TWINS = 256
+"""Twins that are read together at least, which is the usual number in a chunk of the store."""
+_VALUES_TOGETHER = 200_000
+"""Steps of twins that are read together at most, unless `BLOCK_TWINS` have more."""
+TWIN_AXIS = "twin"
+"""The dimension with a row for each twin, and the coordinate with their names."""
 _NO_CONTROL = -1
 """Value of `control_index` in steps that were not flown."""
 _NO_STEP = -1
@@ -169,19 +175,16 @@ def _fields_of_entries(
         yield {}
 
 
-def store_coordinates(scenario: Scenario, twins: Sequence[str]) -> dict[str, Coordinate]:
-    """Return the coordinates of the store of a group, by their names.
+def twin_coordinate(names: Sequence[str]) -> Coordinate:
+    """Return the coordinate with the names of twins."""
+    axis, unit, title = SCHEMA["fleet_coordinates"][TWIN_AXIS]
+    return Coordinate(axis, unit, title, np.array(names, dtype=np.dtypes.StringDType()))
 
-    Parameters
-    ----------
-    scenario : Scenario
-        The scenario of the group.
-    twins : sequence of str
-        The names of the twins.
-    """
+
+def store_coordinates(scenario: Scenario) -> dict[str, Coordinate]:
+    """Return the coordinates of the store of a group beside the names of twins, by their names."""
     observation = scenario.observation
     values: dict[str, ArrayLike] = {
-        "twin": list(twins),
         "step": np.arange(scenario.mission.steps),
         "sensor": np.arange(1, observation.count + 1),
         "region": scenario.state_names,
@@ -209,6 +212,9 @@ def coordinates_of_groups(
 ) -> dict[str, dict[str, Coordinate]]:
     """Return for each group of a store the coordinates of all axes that its variables have.
 
+    The names of the twins are not among them: the outermost group alone has them, and the groups
+    inside it inherit them, so that the store has a million names once.
+
     Parameters
     ----------
     layout : mapping of str to StoredVariable
@@ -224,7 +230,7 @@ def coordinates_of_groups(
     axes_of_group: dict[str, set[str]] = {}
     for path, variable in layout.items():
         group, _, _ = path.rpartition("/")
-        axes_of_group.setdefault(group, {"twin"}).update(variable.axes)
+        axes_of_group.setdefault(group, set()).update(variable.axes)
     return {
         group: {name: entry for name, entry in coordinates.items() if entry.axis in axes}
         for group, axes in axes_of_group.items()
@@ -250,17 +256,31 @@ def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
     return columns
 
 
-_ALL_ROWS = slice(None)
+ALL_ROWS = slice(None)
+"""All twins of a group."""
 
 
-def stored_values(group: "xr.DataTree", path: str, rows: slice = _ALL_ROWS) -> AnyArray:
+def stored_values(group: "xr.DataTree", path: str, rows: slice = ALL_ROWS) -> AnyArray:
     """Return the values of a variable in some rows of a group of a store, given its path."""
     variable = cast("xr.DataArray", group[path])
     values: AnyArray = np.asarray(variable[rows].values)
     return values
 
 
-def observation_rows(group: "xr.DataTree", scenario: Scenario, twins: slice = _ALL_ROWS) -> Float:
+def row_blocks(group: "xr.DataTree") -> Iterator[slice]:
+    """Yield the rows of a group of a store, block by block.
+
+    A fleet has more values than fit in memory; those of a block always do.
+    """
+    twin_count = group.sizes[TWIN_AXIS]
+    step_count = group["observed"].sizes["step"]
+    blocks_of_chunks = max(1, _VALUES_TOGETHER // (BLOCK_TWINS * step_count))
+    length = BLOCK_TWINS * blocks_of_chunks
+    for first_row in range(0, twin_count, length):
+        yield slice(first_row, min(first_row + length, twin_count))
+
+
+def observation_rows(group: "xr.DataTree", scenario: Scenario, twins: slice = ALL_ROWS) -> Float:
     """Return the rows of observations of some twins of a group, a (B, T, W) array.
 
     A row has the values of the sensors, the covariance of modes, and the readings of inspections.
@@ -278,7 +298,7 @@ def is_former_layout(dataset: "xr.Dataset") -> bool:
 
 
 def in_present_layout(
-    dataset: "xr.Dataset", scenario: Scenario, twins: Sequence[str]
+    dataset: "xr.Dataset", scenario: Scenario, twins: Sequence[str] | None
 ) -> "xr.DataTree":
     """Return a group of a store of an earlier version in the present layout.
 
@@ -288,8 +308,8 @@ def in_present_layout(
         The group, whose variables have their former names.
     scenario : Scenario
         The scenario of the group.
-    twins : sequence of str
-        The names of the twins.
+    twins : sequence of str or None
+        The names of the twins; None if they are not wanted.
     """
     import xarray as xr
 
@@ -324,7 +344,9 @@ def in_present_layout(
         entry.attrs = layout[path].attributes
         groups.setdefault(group, {})[name] = entry
     datasets = {}
-    coordinates = coordinates_of_groups(layout, store_coordinates(scenario, twins))
+    coordinates = coordinates_of_groups(layout, store_coordinates(scenario))
+    if twins is not None:
+        coordinates[""][TWIN_AXIS] = twin_coordinate(twins)
     for group, entries in groups.items():
         labels = {
             name: xr.Variable((coordinate.axis,), coordinate.values, coordinate.attributes)

@@ -18,7 +18,7 @@ from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
-from twin_master.fleet.configuration import group_folder
+from twin_master.fleet.configuration import fleet_config, group_folder
 from twin_master.fleet.evidence import (
     TransitionFamily,
     parameter_evidence,
@@ -27,6 +27,8 @@ from twin_master.fleet.evidence import (
     transition_evidence,
 )
 from twin_master.fleet.learn import learn_fleet, with_noise_factor
+from twin_master.fleet.outcomes import Estimated, Outcomes
+from twin_master.fleet.overview import overview_of_group
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import (
     HIGHEST,
@@ -37,14 +39,14 @@ from twin_master.fleet.posterior import (
     shared_posterior,
 )
 from twin_master.fleet.reading import (
-    Estimated,
-    Outcomes,
-    leaving_probabilities,
+    ControlForecast,
+    outcomes_of_group,
     probability_of_leaving,
     severity,
 )
 from twin_master.fleet.report import fleet_page, write_fleet_report
-from twin_master.fleet.store_layout import observation_rows
+from twin_master.fleet.row_file import RowFile
+from twin_master.fleet.store_layout import ALL_ROWS, observation_rows, row_blocks
 from twin_master.fleet.view import ATTENTION_ROWS
 from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
@@ -190,7 +192,7 @@ def test_a_population_is_what_a_dense_sum_says(members):
     """Of normal members, under a Student's prior of the spread."""
     nodes, blur, scale = np.linspace(0.94, 1.06, 61), 0.004, 0.01
     seen = 1.01 + np.hypot(0.01, blur) * np.random.default_rng(members).standard_normal(members)
-    found = population_posterior(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2, scale)
+    found = population_posterior(nodes, [-0.5 * ((nodes - seen[:, None]) / blur) ** 2], scale)
     mean, spread = np.linspace(0.94, 1.06, 401)[:, None], np.linspace(1e-5, 0.06, 400)
     density = sum(norm.logpdf(x, mean, np.hypot(spread, blur)) for x in seen) + t.logpdf(spread / scale, 4)
     weight = np.exp(density - density.max()) / np.exp(density - density.max()).sum()
@@ -256,20 +258,23 @@ def numbers_of(record: Any) -> list[float]:
 
 
 def test_a_fleet_that_is_read_by_blocks_teaches_what_the_whole_teaches(grown, learnt_by_fleet, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.learn.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.stored_observations.BLOCK_TWINS", 7)
     record = learn_fleet(grown[1])["groups"]["growing_damage"]
     np.testing.assert_allclose(numbers_of(record), numbers_of(learnt_by_fleet[0]), rtol=1e-9)
 
 
-def test_a_population_is_the_same_for_members_taken_a_few_at_a_time(monkeypatch):
+def test_a_population_is_the_same_for_members_taken_a_few_at_a_time(tmp_path):
     nodes = np.linspace(-1.0, 1.0, 31)
     log_evidence = -0.5 * ((nodes - np.random.default_rng(4).normal(0.0, 0.2, (23, 1))) / 0.1) ** 2
-    whole = population_posterior(nodes, log_evidence, 0.2)
-    monkeypatch.setattr("twin_master.fleet.posterior._MEMBERS_TOGETHER", 4)
-    parts = population_posterior(nodes, log_evidence, 0.2)
+    whole = population_posterior(nodes, [log_evidence], 0.2)
+    with RowFile(tmp_path, len(nodes), rows_together=4) as rows:
+        for first in range(0, 23, 5):
+            rows.append(log_evidence[first : first + 5])
+        assert [len(block) for block in rows] == [4, 4, 4, 4, 4, 3]
+        parts = population_posterior(nodes, rows, 0.2)
     for name in ("mean", "deviation"):
         expected = numbers_of(getattr(whole, name).summary)
-        np.testing.assert_allclose(numbers_of(getattr(parts, name).summary), expected, rtol=1e-9)
+        np.testing.assert_allclose(numbers_of(getattr(parts, name).summary), expected, rtol=1e-12)
 
 
 TRUE_MODULUS = {"soft": 0.99, "stiff": 1.02}
@@ -452,7 +457,7 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
     two = group.isel(twin=slice(2))
     control = two["observed/control_index"].values[:, -1]
     np.testing.assert_array_equal(
-        leaving_probabilities(tmp_path, record, two), [control[0] != 1, control[1] != 0]
+        ControlForecast(tmp_path, record).probabilities(two, ALL_ROWS), [control[0] != 1, control[1] != 0]
     )
 
 
@@ -555,6 +560,43 @@ def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
     )
     for words in (opening, "60 assets in 1 group", "The assets by health", "Assets that need attention next"):
         assert words in text
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let fleets be read by blocks of seven twins."""
+    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.store_layout._VALUES_TOGETHER", 1)
+
+
+def test_figures_of_a_fleet_that_is_read_by_blocks_are_those_of_the_whole(grown_group, small_blocks):
+    whole = Outcomes.from_store(grown_group.store)
+    assert len(list(row_blocks(grown_group.store))) == 9
+    parts = outcomes_of_group(grown_group.store)
+    np.testing.assert_allclose(flat(parts), flat(whole), rtol=1e-12)
+
+
+def flat(outcomes: Outcomes) -> list[float]:
+    """Return values and errors of all outcomes."""
+    single = [outcomes.prompt_fallbacks, outcomes.early_fallbacks, outcomes.log_evidence]
+    estimates = [*single, outcomes.credible_coverage, *outcomes.rms, *outcomes.bias]
+    return [number for estimate in estimates for number in (estimate.value, estimate.error)]
+
+
+def test_the_page_of_a_fleet_that_is_read_by_blocks_is_that_of_the_whole(grown_group, monkeypatch):
+    whole = fleet_page(grown_group.folder, ATTENTION_ROWS)
+    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.store_layout._VALUES_TOGETHER", 1)
+    assert fleet_page(grown_group.folder, ATTENTION_ROWS) == whole
+
+
+def test_the_figures_of_a_large_fleet_show_some_of_its_assets_and_say_so(grown_group, monkeypatch):
+    monkeypatch.setattr("twin_master.fleet.overview.DRAWN_ASSETS", 25)
+    record = fleet_config(grown_group.folder)["fleet"]["groups"][0]
+    overview = overview_of_group(grown_group.folder, record, grown_group.store, 5)
+    expected = grown_group.store["filtered/mean"].values[::3]
+    np.testing.assert_array_equal(np.concatenate(overview.drawn.mean), expected)
+    assert "Of 60 assets, one in 3 is drawn." in fleet_page(grown_group.folder, 5)
 
 
 def test_a_policy_of_one_control_is_never_left_or_at_once(grown_group):

@@ -29,8 +29,9 @@ from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.reading import leaving_probabilities
+from twin_master.fleet.reading import ControlForecast
 from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.store_layout import ALL_ROWS
 from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
 from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.fleet.watching import FleetWatch
@@ -388,9 +389,8 @@ def leaving_soon(fleet_file: Path, folder: Path) -> Any:
     """Fly the recordings of a fleet; return the folder, and how probably each asset leaves its control."""
     outcome = fly_fleet(load_fleet(fleet_file), folder, Engine(0))
     config = json.loads((outcome.folder / "config.json").read_text())
-    return outcome.folder, leaving_probabilities(
-        outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"]
-    )
+    forecast = ControlForecast(outcome.folder, config["fleet"]["groups"][0])
+    return outcome.folder, forecast.probabilities(open_fleet(folder)["north"], ALL_ROWS)
 
 
 def watched_records(fleet_file: Path, folder: Path) -> list[dict[str, Any]]:
