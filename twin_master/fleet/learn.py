@@ -222,13 +222,16 @@ def _lessons_of_groups(
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution of probabilities common to them.
 
-    They share one if several groups have learnt the same one or two probabilities to worsen.
+    They share one in this case: all groups have the same probabilities to worsen, these are at most
+    `_MOST_SHARED`, and several groups have learnt them.
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
-    names = next(iter(lessons.values())).family.names
-    have_same_probabilities = {lesson.family.names for lesson in lessons.values()} == {names}
-    if len(grids) > 1 and len(names) <= _MOST_SHARED and have_same_probabilities:
-        return _records_with_shared_distribution(lessons, grids, names)
+    distinct_names = {lesson.family.names for lesson in lessons.values()}
+    have_same_probabilities = len(distinct_names) == 1
+    if have_same_probabilities and len(grids) > 1:
+        (names,) = distinct_names
+        if len(names) <= _MOST_SHARED:
+            return _records_with_shared_distribution(lessons, grids, names)
     records = {}
     for name, lesson in lessons.items():
         records[name] = lesson.with_probabilities(lesson.marginals, lesson.flown_controls)
@@ -254,8 +257,8 @@ def _records_with_shared_distribution(
     return {"groups": records, "shared": shared_distribution}
 
 
-class _Piece(NamedTuple):
-    """The observations of some twins of one scenario in T steps.
+class _FlightBlock(NamedTuple):
+    """The observations of B twins of one scenario in T steps.
 
     Attributes
     ----------
@@ -281,24 +284,25 @@ class _StoredObservations:
         self._scenario = scenario
         self._block = lru_cache(maxsize=1)(self._read_block)
 
-    def pieces(self, rows: Index) -> Iterator[_Piece]:
+    def blocks(self, rows: Index) -> Iterator[_FlightBlock]:
         """Yield the observations of the twins in the rows of the store (B,), in ascending order."""
         for number in np.unique(rows // BLOCK_TWINS).tolist():
             rows_of_block = rows[rows // BLOCK_TWINS == number] - number * BLOCK_TWINS
             observed, control = self._block(number)
-            yield _Piece(observed[rows_of_block], control[rows_of_block])
+            yield _FlightBlock(observed[rows_of_block], control[rows_of_block])
 
-    def _read_block(self, number: int) -> _Piece:
+    def _read_block(self, number: int) -> _FlightBlock:
         """Return the observations of all twins of a block."""
         rows = slice(number * BLOCK_TWINS, (number + 1) * BLOCK_TWINS)
         control = stored_values(self._group, "observed/control_index", rows).astype(np.int64)
         # Steps that were not flown have the control -1. They have no observations, so that the
         # evidence does not depend on their control: the first control takes its place.
-        return _Piece(observation_rows(self._group, self._scenario, rows), np.maximum(control, 0))
+        observed = observation_rows(self._group, self._scenario, rows)
+        return _FlightBlock(observed, np.maximum(control, 0))
 
 
-class _Observations(NamedTuple):
-    """The observations of B twins of one scenario.
+class _Flights(NamedTuple):
+    """The flights of B twins of one scenario, whose observations are in the store.
 
     Attributes
     ----------
@@ -314,13 +318,13 @@ class _Observations(NamedTuple):
     store: _StoredObservations
     rows: Index
 
-    def first_twins(self, count: int) -> "_Observations":
-        """Return the observations of the first twins."""
+    def first_twins(self, count: int) -> "_Flights":
+        """Return the flights of the first twins."""
         return self._replace(rows=self.rows[:count])
 
-    def pieces(self) -> Iterator[_Piece]:
+    def blocks(self) -> Iterator[_FlightBlock]:
         """Yield the observations of the twins, some twins at a time."""
-        return self.store.pieces(self.rows)
+        return self.store.blocks(self.rows)
 
 
 def _learn_group(
@@ -342,15 +346,15 @@ def _learn_group(
     """
     scenario = twins_by_scenario[0].knowledge.scenario
     family = _transition_family(scenario)
-    observations = _observations(group, twins_by_scenario)
+    flights_by_scenario = _flights_by_scenario(group, twins_by_scenario)
     # With several scenarios each twin has its own calibration, and no common distribution of the
     # parameter is learnt.
     nodes = None
     if len(twins_by_scenario) == 1:
         nodes = _parameter_nodes(twins_by_scenario[0], is_real="recordings" in record)
-    noise = _noise_factor(observations, family, nodes)
-    explained = _explained_observations(observations, family, noise.mean)
-    twin_count = sum(len(part.rows) for part in explained)
+    noise = _noise_factor(flights_by_scenario, family, nodes)
+    explained = _explained_flights(flights_by_scenario, family, noise.mean)
+    twin_count = sum(len(flights.rows) for flights in explained)
     if not twin_count:
         raise FleetError(
             f"no state of the twins explains what was observed in group {record['name']}: nothing "
@@ -367,7 +371,8 @@ def _learn_group(
     if family.reason_fixed:
         lessons["transitions_kept_because"] = family.reason_fixed
     if nodes is not None:
-        lessons["population"] = _population(observations[0], family, grid, nodes, noise.mean)
+        flights = flights_by_scenario[0]
+        lessons["population"] = _population(flights, family, grid, nodes, noise.mean)
     flown_controls = _followed_controls(group, rows, scenario.control_names)
     return _GroupLessons(family, grid, flown_controls, lessons)
 
@@ -380,12 +385,12 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     return TransitionFamily.learnable(scenario)
 
 
-def _observations(
+def _flights_by_scenario(
     group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
-) -> list[_Observations]:
-    """Return the observations of the twins of a group that have flown, by scenario."""
+) -> list[_Flights]:
+    """Return the flights of the twins of a group that have flown, for each scenario."""
     store = _StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
-    return [_Observations(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
+    return [_Flights(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
 
 
 def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequence[str]) -> set[str]:
@@ -395,23 +400,23 @@ def _followed_controls(group: "xr.DataTree", rows: Index, control_names: Sequenc
     return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
 
 
-def _explained_observations(
-    observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
-) -> list[_Observations]:
-    """Return the observations of the twins that are possible under the model.
+def _explained_flights(
+    flights_by_scenario: Sequence[_Flights], family: TransitionFamily, noise_factor: float
+) -> list[_Flights]:
+    """Return the flights without the twins whose observations are impossible under the model.
 
     The likelihoods are computed with a factor on the assumed noise.
     """
     point = _with_all_transitions_possible(family.assumed)[None]
     explained = []
-    for part in observations:
-        sensor_model = with_noise_factor(part.knowledge.sensor_model, noise_factor)
+    for flights in flights_by_scenario:
+        sensor_model = with_noise_factor(flights.knowledge.sensor_model, noise_factor)
         is_explained = []
-        for observed, control in part.pieces():
+        for observed, control in flights.blocks():
             likelihood = scaled_likelihood(sensor_model, observed, control).values
-            evidence = transition_evidence(family, point, likelihood, control)
-            is_explained.append(np.isfinite(evidence[:, 0]))
-        explained.append(part._replace(rows=part.rows[np.concatenate(is_explained)]))
+            log_evidence = transition_evidence(family, point, likelihood, control)  # (twins, 1)
+            is_explained.append(np.isfinite(log_evidence[:, 0]))
+        explained.append(flights._replace(rows=flights.rows[np.concatenate(is_explained)]))
     return explained
 
 
@@ -425,23 +430,27 @@ def _with_all_transitions_possible(probability: Float) -> Float:
 
 
 def _probability_grid(
-    family: TransitionFamily, observations: Sequence[_Observations], noise_factor: float
+    family: TransitionFamily, flights_by_scenario: Sequence[_Flights], noise_factor: float
 ) -> LikelihoodGrid:
-    """Return the likelihood of the probabilities to worsen on a grid, given a group's twins.
+    """Return, on a grid, the likelihood of the probabilities with which a state worsens.
 
-    The likelihoods of the states are computed anew for each grid: those of many twins would not fit
-    in memory.
+    It is the likelihood given the observations of all twins of a group. `likelihood_grid` narrows
+    the grid and so calls `log_likelihood` several times. Each call reads the observations again and
+    computes the likelihoods of the states anew, because those of many twins do not fit in memory.
     """
     sensor_models = [
-        with_noise_factor(part.knowledge.sensor_model, noise_factor) for part in observations
+        with_noise_factor(flights.knowledge.sensor_model, noise_factor)
+        for flights in flights_by_scenario
     ]
 
     def log_likelihood(points: Float) -> Float:
+        """Return the log likelihood (P,) at P points (P, K) of K probabilities to worsen."""
         total = np.zeros(len(points))
-        for part, sensor_model in zip(observations, sensor_models, strict=True):
-            for observed, control in part.pieces():
+        for flights, sensor_model in zip(flights_by_scenario, sensor_models, strict=True):
+            for observed, control in flights.blocks():
                 likelihood = scaled_likelihood(sensor_model, observed, control).values
-                total += transition_evidence(family, points, likelihood, control).sum(axis=0)
+                log_evidence = transition_evidence(family, points, likelihood, control)
+                total += log_evidence.sum(axis=0)  # over the twins; the other axis is the points
         return total
 
     return likelihood_grid(log_likelihood, len(family.names))
@@ -526,7 +535,9 @@ def with_noise_factor(
 
 
 def _noise_factor(
-    observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
+    flights_by_scenario: Sequence[_Flights],
+    family: TransitionFamily,
+    nodes: _ParameterNodes | None,
 ) -> Distribution:
     """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
 
@@ -534,18 +545,16 @@ def _noise_factor(
     it in each step separately would attribute a part of the noise to the parameter. With nodes, the
     evidence of all steps is computed at each value first and averaged over the values then.
     """
-    observations_of_first_twins = [
-        part.first_twins(NOISE_TWINS) for part in observations[:NOISE_TWINS]
+    flights_of_first_twins = [
+        flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
     ]
 
     def log_likelihood(axes: Axes) -> Float:
-        factors = np.exp(axes[0])
-        return np.array(
-            [
-                _evidence_of_noise(observations_of_first_twins, family, nodes, float(factor))
-                for factor in factors
-            ]
-        )
+        log_evidence = [
+            _evidence_of_noise(flights_of_first_twins, family, nodes, factor)
+            for factor in np.exp(axes[0]).tolist()
+        ]
+        return np.array(log_evidence)
 
     largest_log_factor = np.log(LARGEST_NOISE)
     widest_axis = np.linspace(-largest_log_factor, largest_log_factor, NOISE_POINTS)
@@ -554,7 +563,7 @@ def _noise_factor(
 
 
 def _evidence_of_noise(
-    observations: Sequence[_Observations],
+    flights_by_scenario: Sequence[_Flights],
     family: TransitionFamily,
     nodes: _ParameterNodes | None,
     factor: float,
@@ -565,10 +574,10 @@ def _evidence_of_noise(
     """
     probability = _with_all_transitions_possible(family.assumed)
     total_log_evidence = 0.0
-    for part in observations:
+    for flights in flights_by_scenario:
         value_per_draw = None if nodes is None else nodes.predicted
-        model = with_noise_factor(part.knowledge.sensor_model, factor, value_per_draw)
-        for observed, control in part.pieces():
+        model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
+        for observed, control in flights.blocks():
             if nodes is None:
                 likelihood = scaled_likelihood(model, observed, control)
                 at_point = transition_evidence(
@@ -589,7 +598,7 @@ def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
 
 
 def _population(
-    observations: _Observations,
+    flights: _Flights,
     family: TransitionFamily,
     grid: LikelihoodGrid | None,
     nodes: _ParameterNodes,
@@ -599,8 +608,8 @@ def _population(
 
     Parameters
     ----------
-    observations : _Observations
-        The observations of the group.
+    flights : _Flights
+        The flights of the group, which has one scenario.
     family : TransitionFamily
         The transitions.
     grid : LikelihoodGrid or None
@@ -614,12 +623,12 @@ def _population(
     probability = family.assumed
     if grid is not None:
         probability = np.array([marginal.mean for marginal in grid.marginals])
-    draws = observations.knowledge.draws
-    model = with_noise_factor(observations.knowledge.sensor_model, noise_factor, nodes.predicted)
+    draws = flights.knowledge.draws
+    model = with_noise_factor(flights.knowledge.sensor_model, noise_factor, nodes.predicted)
     log_evidence = np.concatenate(
         [
             parameter_evidence(family, probability, model, observed, control)
-            for observed, control in observations.pieces()
+            for observed, control in flights.blocks()
         ]
     )
     population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)

@@ -32,7 +32,7 @@ from twin_master.fleet.reading import (
 from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
 from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows, open_group
 from twin_master.fleet.store_layout import NOTICE_KINDS, stored_values
-from twin_master.fleet.watched_asset import counts_of, read_standing
+from twin_master.fleet.watched_asset import read_standing, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def _add_flown_fleet(
     for record, standing in zip(records, standings, strict=True):
         group = groups[record["name"]]
         page.add_section(f"Group {record['name']}")
-        leaving = _leaving_or_explanation(page, folder, record, group)
-        if leaving is not None:
-            standing = replace(standing, leaving=leaving)
+        leaving_probability = _leaving_or_explanation(page, folder, record, group)
+        if leaving_probability is not None:
+            standing = replace(standing, leaving_probability=leaving_probability)
         failed = int(np.sum(stored_values(group, "status") == FAILED))
         _add_map(page, standing, failed)
         _add_courses(page, standing, group)
@@ -174,10 +174,11 @@ def _opening(standings: Sequence[Standing], groups: "Sequence[xr.DataTree]") -> 
     """Return the opening sentences: on flights, alarms, fallbacks and the most severe damage."""
     asset_count = sum(group.sizes["twin"] for group in groups)
     flown_count = sum(len(standing.names) for standing in standings)
+    step_word = standings[0].scenario.mission.step_name
     sentences = [
         f"{flown_count} of {counted(asset_count, 'asset')} have flown.",
-        _alarm_sentence(standings[0].scenario.mission.step_name, groups),
-        _fallback_sentence(standings[0].scenario.mission.step_name, groups),
+        _alarm_sentence(step_word, groups),
+        _fallback_sentence(step_word, groups),
         _damage_sentence(standings),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
@@ -233,7 +234,8 @@ def _add_watched_fleet(
     assets = standing["assets"]
     failures = standing["failures"]
     decided = {name: asset for name, asset in assets.items() if asset["last"] is not None}
-    page.add_highlights([(str(count), title) for title, count in counts_of(standing).items()])
+    counts = watched_fleet_counts(standing)
+    page.add_highlights([(str(count), title) for title, count in counts.items()])
     if failures:
         asset_count = counted(len(assets | failures), "asset")
         page.add_notice(f"{len(failures)} of {asset_count} are not watched.")
@@ -333,7 +335,7 @@ def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> No
 
 def _leaving_percentage(standing: Standing) -> Float:
     """Return the probability of a change of control in whole percent, (B,); 0 if it is unknown."""
-    return np.asarray(np.rint(100.0 * np.nan_to_num(standing.leaving)))
+    return np.asarray(np.rint(100.0 * np.nan_to_num(standing.leaving_probability)))
 
 
 def _attention_order(standing: Standing) -> Index:
@@ -361,7 +363,7 @@ def _attention_table(
     percentage = _leaving_percentage(standing)
     rows = []
     for number in order:
-        is_leaving_known = not np.isnan(standing.leaving[number])
+        is_leaving_known = not np.isnan(standing.leaving_probability[number])
         row = [
             standing.names[number],
             str(standing.step[number]),

@@ -40,7 +40,7 @@ class Standing:
         The control in force.
     alarms : (B,) array
         The number of alarms.
-    leaving : (B,) array
+    leaving_probability : (B,) array
         The probability that the control changes within the scenario's `prediction_steps`; NaN if
         it is not known.
     """
@@ -53,7 +53,7 @@ class Standing:
     deviation: Float
     control: list[str]
     alarms: Index
-    leaving: Float
+    leaving_probability: Float
 
     @property
     def severity(self) -> Float:
@@ -68,7 +68,7 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
+def standing_of_flown(group_record: JsonRecord, group: "xr.DataTree") -> Standing:
     """Return state, control and alarms of the flown twins of a group after their last steps.
 
     The probabilities of leaving a control are NaN here: `leaving_probabilities` computes them,
@@ -76,20 +76,19 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
 
     Parameters
     ----------
-    record : mapping
+    group_record : mapping
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group, with a row for each twin.
     """
-    # All scenarios of a group come from one scenario file, with equal states and controls.
-    scenario = Scenario.model_validate(record["scenarios"][0])
+    scenario = _scenario_of_group(group_record)
     rows_flown = flown_rows(stored_values(group, "status"))
     last_step = last_steps(group)[rows_flown]
     at_last_step = (rows_flown, last_step)
     last_control = stored_values(group, "observed/control_index")[at_last_step]
-    names = [name for name, _seed, _scenario_number in record["members"]]
+    names = [name for name, _seed, _scenario_number in group_record["members"]]
     return Standing(
-        group=record["name"],
+        group=group_record["name"],
         scenario=scenario,
         names=[names[row] for row in rows_flown],
         step=last_step,
@@ -97,41 +96,60 @@ def standing_of_flown(record: JsonRecord, group: "xr.DataTree") -> Standing:
         deviation=stored_values(group, "filtered/standard_deviation")[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm")[rows_flown],
-        leaving=np.full(len(rows_flown), np.nan),
+        leaving_probability=np.full(len(rows_flown), np.nan),
     )
 
 
-def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
+def standing_of_watched(group_record: JsonRecord, decided_assets: JsonRecord) -> Standing:
     """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
     ----------
-    record : mapping
+    group_record : mapping
         The record of the group in `config.json`.
-    assets : mapping
-        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them;
-        each must have a last decision.
+    decided_assets : mapping
+        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them. The
+        twin of each must have decided at least once: `last` of its record is the last decision.
     """
-    scenario = Scenario.model_validate(record["scenarios"][0])
-    prefix = f"{record['name']}/"
-    names = [name for name in assets if name.startswith(prefix)]
-    records = [assets[name] for name in names]
-    decisions = [asset["last"] for asset in records]
-    healths = [decision["health"] for decision in decisions]
+    scenario = _scenario_of_group(group_record)
+    prefix = f"{group_record['name']}/"
+    names = []
+    asset_records = []
+    for name_with_group, asset_record in decided_assets.items():
+        if name_with_group.startswith(prefix):
+            names.append(name_with_group.removeprefix(prefix))
+            asset_records.append(asset_record)
+
+    decisions = [asset_record["last"] for asset_record in asset_records]
+    moments_by_asset = [decision["health"] for decision in decisions]
+    alarms = [asset_record["alarms"] for asset_record in asset_records]
+    # None where it is not known, which becomes NaN
+    leaving_probability = [asset_record["leaving"] for asset_record in asset_records]
     return Standing(
-        group=record["name"],
+        group=group_record["name"],
         scenario=scenario,
-        names=[name.removeprefix(prefix) for name in names],
+        names=names,
         step=np.array([decision["step"] for decision in decisions]),
-        mean=_moments_of_states(scenario, healths, "mean"),
-        deviation=_moments_of_states(scenario, healths, "standard_deviation"),
+        mean=_moments_of_states(scenario, moments_by_asset, "mean"),
+        deviation=_moments_of_states(scenario, moments_by_asset, "standard_deviation"),
         control=[decision["control"] for decision in decisions],
-        alarms=np.array([asset["alarms"] for asset in records], np.int64),
-        leaving=np.array([asset["leaving"] for asset in records], np.float64),
+        alarms=np.array(alarms, np.int64),
+        leaving_probability=np.array(leaving_probability, np.float64),
     )
 
 
-def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
+def _scenario_of_group(group_record: JsonRecord) -> Scenario:
+    """Return a scenario whose states and controls hold for all assets of a group.
+
+    All scenarios of a group come from one scenario file, and differ only in what it lets differ
+    from asset to asset, so that the first one is taken.
+    """
+    return Scenario.model_validate(group_record["scenarios"][0])
+
+
+def _moments_of_states(
+    scenario: Scenario, moments_by_asset: list[JsonObject], moment: str
+) -> Float:
     """Return a moment of each state factor of each asset, a (B, F) array.
 
     It is NaN where the record has None.
@@ -140,12 +158,12 @@ def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: st
     ----------
     scenario : Scenario
         The scenario, which names the factors.
-    healths : list of dict
-        For each asset, the moments of each factor by the factor's name.
+    moments_by_asset : list of dict
+        For each asset, the moments of each state factor by the factor's name.
     moment : str
         The key of the moment: "mean" or "standard_deviation".
     """
     rows = []
-    for health in healths:
-        rows.append([health[name][moment] for name in scenario.state_names])
+    for moments in moments_by_asset:
+        rows.append([moments[name][moment] for name in scenario.state_names])
     return np.array(rows, np.float64)
