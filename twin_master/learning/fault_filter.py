@@ -102,7 +102,7 @@ class FaultFilter:
             gains=self.gains,
             gain_deviations=settings.gauge_gain * np.array(_GAIN_DEVIATIONS),
             free_gain_deviation=settings.all_gain,
-            degrees=settings.noise_degrees,
+            degrees_of_freedom=settings.noise_degrees,
         )
         self.log_gauge_prior = self._log_gauge_prior()
         # Given that a fault begins, it is free gains or a gauge with equal probability.
