@@ -118,7 +118,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._control = 0
         self._last_observation: Float = np.empty(0)
         self._last_info: Info = {}
-        values = self.scenario.observation.count + len(self.scenario.readings)
+        values = self.scenario.observation.count + len(self.scenario.inspection_readings)
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (values,), np.float64)
 

@@ -207,9 +207,9 @@ def _heading(standing: Standing) -> str:
     standing : mapping
         The last records of all watched assets, from `read_standing`.
     """
-    from twin_master.fleet.watched_asset import counts_of
+    from twin_master.fleet.watched_asset import watched_fleet_counts
 
-    counts = counts_of(standing)
+    counts = watched_fleet_counts(standing)
     phrases = [
         counted(counts["assets"], "asset"),
         counted(counts["steps"], "step"),

@@ -248,7 +248,7 @@ class Kind(AssetSection):
             "[uav_twin.assets]\ndesign = misfit:Kind",
             KIND.format("design"),
             "scenario check level_turns",
-            "in the package misfit 1.0 has the kind 'design', which uav-twin has itself",
+            "in the package misfit 1.0 has the kind 'design', which uav-twin itself defines",
         ),
         (
             "[uav_twin.beliefs]\nrod = misfit:Kind",

@@ -150,11 +150,12 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
     (S, U, G) array
         The G observed values, by state and control.
     """
-    table = []
+    observations_by_state = []
     for levels in states.tolist():
         health = dict(zip(scenario.state_names, levels, strict=True))
-        table.append([predict(control.values, health) for control in scenario.control])
-    return np.array(table)
+        observations_by_control = [predict(control.values, health) for control in scenario.control]
+        observations_by_state.append(observations_by_control)
+    return np.array(observations_by_state)
 
 
 def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> Float:
@@ -518,11 +519,24 @@ class WatchedSource:
 
 
 def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
-    """Return the contents of files by the paths of their copies inside a run folder.
+    """Read the files that a run folder is to hold copies of.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        The files, by the paths that their copies get inside the run folder.
+
+    Returns
+    -------
+    dict of str to bytes
+        The contents of the files, by the same paths.
 
     Raises
     ------
     MissionInputError
         If a file cannot be read.
     """
-    return {copy: read_bytes(path, MissionInputError) for copy, path in files.items()}
+    content_of_copy = {}
+    for path_of_copy, path in files.items():
+        content_of_copy[path_of_copy] = read_bytes(path, MissionInputError)
+    return content_of_copy

@@ -354,18 +354,20 @@ class FmuSource(AssetSource):
     def _warn_of_unset_inputs(self, asset: FmiAsset) -> None:
         """Warn of inputs of an FMU that stay at their start values in the whole mission.
 
-        The FMU of a design is left out: each of its inputs that nobody sets is a force of zero.
+        An FMU that uav-twin packed from a design of a wing or structure is skipped: its unset
+        inputs are forces at their start value zero, which is right.
         """
-        if packed_design_hash(asset.description.path):
+        if _is_packed_from_design(asset.description.path):
             return
-        given_names = {
-            "control": self._scenario.control[0].values,
+        # Every control has values for the same inputs, so that the first one names all of them.
+        inputs_with_values = {
+            "control": self._scenario.control[0].values.keys(),
             "health": self._scenario.state_names,
-            "load": self.section.load,
+            "load": self.section.load.keys(),
         }
-        unset = unset_inputs_sentence(asset.description, asset.binding, given_names)
-        if unset:
-            _logger.warning("%s", unset)
+        warning = unset_inputs_sentence(asset.description, asset.binding, inputs_with_values)
+        if warning:
+            _logger.warning("%s", warning)
 
     def _warn_of_undeclared_units(self, asset: FmiAsset) -> None:
         """Warn of variables of which only the binding states a unit, such as degC."""
@@ -513,6 +515,11 @@ class FmuSource(AssetSource):
             session.close()
             raise
         return FmuAsset(session, observation, self.section.load, truth_outputs)
+
+
+def _is_packed_from_design(fmu: Path) -> bool:
+    """Return whether uav-twin packed an FMU from a design, whose hash such an FMU records."""
+    return packed_design_hash(fmu) != ""
 
 
 def _check_calibrated_units(binding: Binding, calibration: "CalibrationRecord") -> None:

@@ -404,19 +404,22 @@ class ReducedModelSource(NamedStructure):
         OutsideModelError
             If a state, control or draw is outside the ranges of the model.
         """
-        controls = self._scenario.control
-        shape = (len(draws.values), len(model.states.coordinates), len(controls))
-        inputs = self._inputs_of_all_cases(draws, model.states.coordinates)
+        draw_count = len(draws.values)
+        state_count = len(model.states.coordinates)
+        control_count = len(self._scenario.control)
+        inputs = self._inputs_of_all_cases(draws, model.states.coordinates)  # (E S U, V)
         if not self._observes_modes:
             outputs = self.prepared_model.static_outputs(inputs)
-            return outputs[:, self._observed_outputs].reshape(*shape, -1)
-        # Compute modes for the first control only: they do not depend on it.
-        first_control = 0
-        inputs_of_first_control = inputs.reshape(*shape, -1)[:, :, first_control]
-        rows = inputs_of_first_control.reshape(-1, inputs.shape[1])
-        features = np.array([self._observed_features(row) for row in rows])
-        features = features.reshape(*shape[:2], 1, -1)
-        return np.repeat(features, len(controls), axis=2)
+            observed = outputs[:, self._observed_outputs]  # (E S U, G)
+            return observed.reshape(draw_count, state_count, control_count, -1)
+
+        # Modes are computed under control 0 only, because they do not depend on the control.
+        input_count = inputs.shape[1]
+        inputs_by_case = inputs.reshape(draw_count, state_count, control_count, input_count)
+        inputs_of_control_0 = inputs_by_case[:, :, 0].reshape(-1, input_count)  # (E S, V)
+        features = np.array([self._observed_features(row) for row in inputs_of_control_0])
+        features_of_control_0 = features.reshape(draw_count, state_count, 1, -1)
+        return np.repeat(features_of_control_0, control_count, axis=2)
 
     def _inputs_of_all_cases(self, draws: ParameterDraws, states: Float) -> Float:
         """Return the V model inputs for all combinations of draw, state and control.

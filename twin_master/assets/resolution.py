@@ -15,7 +15,12 @@ from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource,
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError
-from twin_master.network.transition import NUMBER, TRANSITION_COPIES, check_fits, transition_bytes
+from twin_master.network.transition import (
+    BYTES_OF_NUMBER,
+    TRANSITION_COPIES,
+    check_fits,
+    transition_bytes,
+)
 from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
@@ -252,8 +257,8 @@ def scenario_bytes(scenario: Scenario) -> dict[str, float]:
         transition_bytes(len(factor.levels), control_count) for factor in scenario.state
     ]
     predictions = f"{draw_count} draws of {sensor_count} sensors in {state_count} states"
-    prediction_size = NUMBER * draw_count * state_count * control_count * sensor_count
-    step_size = NUMBER * (state_count + sensor_count)
+    prediction_size = BYTES_OF_NUMBER * draw_count * state_count * control_count * sensor_count
+    step_size = BYTES_OF_NUMBER * (state_count + sensor_count)
     return {
         f"the transitions of {transitions}": TRANSITION_COPIES * sum(transition_sizes),
         predictions: _PREDICTION_COPIES * prediction_size,

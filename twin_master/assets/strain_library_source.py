@@ -306,9 +306,10 @@ class StrainLibrarySource(AssetSource):
         InvalidModelError
             If a level of the scenario is not a level of the library.
         """
-        states = [tuple(state) for state in model.states.coordinates]
-        rows = [self._library.states.index(state) for state in states]
-        strain_of_states = self._library.strain_per_draw[:, rows]
+        # The library may have more states and controls than the scenario, and in another order.
+        library_states = self._library.states
+        state_indices = [library_states.index(tuple(levels)) for levels in model.states.coordinates]
+        strain_of_states = self._library.strain_per_draw[:, state_indices]
         return strain_of_states[:, :, self._control_indices]
 
     def open(self) -> Asset:

@@ -195,15 +195,19 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
     connectors = [Connector(variable, "input") for variable in inputs]
     connectors += [Connector(variable, "output") for variable in outputs]
     connectors += [Connector(variable, "parameter") for variable in parameters]
+
+    # Each connector of the system is connected to the variable of its name in the component.
     connections = []
     for variable in (*inputs, *parameters):
-        system_end = Endpoint("", variable)
-        connections.append(Connection(system_end, Endpoint(component_name, variable)))
+        system_end, component_end = Endpoint("", variable), Endpoint(component_name, variable)
+        connections.append(Connection(system_end, component_end))
     for variable in outputs:
-        system_end = Endpoint("", variable)
-        connections.append(Connection(Endpoint(component_name, variable), system_end))
-    components = (Component(component_name, fmu),)
-    return Wiring(SystemStructure(name, components, tuple(connectors), tuple(connections)))
+        system_end, component_end = Endpoint("", variable), Endpoint(component_name, variable)
+        connections.append(Connection(component_end, system_end))
+
+    component = Component(component_name, fmu)
+    structure = SystemStructure(name, (component,), tuple(connectors), tuple(connections))
+    return Wiring(structure)
 
 
 def _with_unbound_parameters(

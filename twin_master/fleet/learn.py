@@ -226,13 +226,16 @@ def _lessons_of_groups(
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution of probabilities common to them.
 
-    They share one if several groups have learnt the same one or two probabilities to worsen.
+    They share one in this case: all groups have the same probabilities to worsen, these are at most
+    `_MOST_SHARED`, and several groups have learnt them.
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
-    names = next(iter(lessons.values())).family.names
-    have_same_probabilities = {lesson.family.names for lesson in lessons.values()} == {names}
-    if len(grids) > 1 and len(names) <= _MOST_SHARED and have_same_probabilities:
-        return _records_with_shared_distribution(lessons, grids, names)
+    distinct_names = {lesson.family.names for lesson in lessons.values()}
+    have_same_probabilities = len(distinct_names) == 1
+    if have_same_probabilities and len(grids) > 1:
+        (names,) = distinct_names
+        if len(names) <= _MOST_SHARED:
+            return _records_with_shared_distribution(lessons, grids, names)
     records = {}
     for name, lesson in lessons.items():
         records[name] = lesson.with_probabilities(lesson.marginals, lesson.flown_controls)
@@ -258,8 +261,8 @@ def _records_with_shared_distribution(
     return {"groups": records, "shared": shared_distribution}
 
 
-class _Observations(NamedTuple):
-    """The observations of B twins of one scenario.
+class _Flights(NamedTuple):
+    """The flights of B twins of one scenario, whose observations are in the store.
 
     Attributes
     ----------
@@ -275,13 +278,13 @@ class _Observations(NamedTuple):
     store: StoredObservations
     rows: Index
 
-    def first_twins(self, count: int) -> "_Observations":
-        """Return the observations of the first twins."""
+    def first_twins(self, count: int) -> "_Flights":
+        """Return the flights of the first twins."""
         return self._replace(rows=self.rows[:count])
 
-    def pieces(self) -> Iterator[ObservedTwins]:
+    def blocks(self) -> Iterator[ObservedTwins]:
         """Yield the observations of the twins, some twins at a time."""
-        return self.store.pieces(self.rows)
+        return self.store.blocks(self.rows)
 
 
 def _learn_group(
@@ -308,15 +311,15 @@ def _learn_group(
     """
     scenario = twins_by_scenario[0].knowledge.scenario
     family = _transition_family(scenario)
-    observations = _observations(group, twins_by_scenario)
+    flights_by_scenario = _flights_by_scenario(group, twins_by_scenario)
     # With several scenarios each twin has its own calibration, and no common distribution of the
     # parameter is learnt.
     nodes = None
     if len(twins_by_scenario) == 1:
         nodes = _parameter_nodes(twins_by_scenario[0], is_real="recordings" in record)
-    noise = _noise_factor(observations, family, nodes)
-    explained = _explained_observations(observations, family, noise.mean)
-    twin_count = sum(len(part.rows) for part in explained)
+    noise = _noise_factor(flights_by_scenario, family, nodes)
+    explained = _explained_flights(flights_by_scenario, family, noise.mean)
+    twin_count = sum(len(flights.rows) for flights in explained)
     if not twin_count:
         raise FleetError(
             f"no state of the twins explains what was observed in group {record['name']}: nothing "
@@ -335,7 +338,7 @@ def _learn_group(
         lessons["transitions_kept_because"] = family.reason_fixed
     if nodes is not None:
         lessons["population"] = _population(
-            folder, observations[0], family, grid, nodes, noise.mean
+            folder, flights_by_scenario[0], family, grid, nodes, noise.mean
         )
     return _GroupLessons(family, grid, counts.followed_controls, lessons)
 
@@ -348,12 +351,12 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     return TransitionFamily.learnable(scenario)
 
 
-def _observations(
+def _flights_by_scenario(
     group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
-) -> list[_Observations]:
-    """Return the observations of the twins of a group that have flown, by scenario."""
+) -> list[_Flights]:
+    """Return the flights of the twins of a group that have flown, for each scenario."""
     store = StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
-    return [_Observations(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
+    return [_Flights(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
 
 
 class _GroupCounts(NamedTuple):
@@ -385,23 +388,23 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
     return _GroupCounts(alarmed, followed_controls)
 
 
-def _explained_observations(
-    observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
-) -> list[_Observations]:
-    """Return the observations of the twins that are possible under the model.
+def _explained_flights(
+    flights_by_scenario: Sequence[_Flights], family: TransitionFamily, noise_factor: float
+) -> list[_Flights]:
+    """Return the flights without the twins whose observations are impossible under the model.
 
     The likelihoods are computed with a factor on the assumed noise.
     """
     point = _with_all_transitions_possible(family.assumed)[None]
     explained = []
-    for part in observations:
-        sensor_model = with_noise_factor(part.knowledge.sensor_model, noise_factor)
+    for flights in flights_by_scenario:
+        sensor_model = with_noise_factor(flights.knowledge.sensor_model, noise_factor)
         is_explained = []
-        for observed, control in part.pieces():
+        for observed, control in flights.blocks():
             likelihood = scaled_likelihood(sensor_model, observed, control).values
-            evidence = transition_evidence(family, point, likelihood, control)
-            is_explained.append(np.isfinite(evidence[:, 0]))
-        explained.append(part._replace(rows=part.rows[np.concatenate(is_explained)]))
+            log_evidence = transition_evidence(family, point, likelihood, control)  # (twins, 1)
+            is_explained.append(np.isfinite(log_evidence[:, 0]))
+        explained.append(flights._replace(rows=flights.rows[np.concatenate(is_explained)]))
     return explained
 
 
@@ -415,23 +418,27 @@ def _with_all_transitions_possible(probability: Float) -> Float:
 
 
 def _probability_grid(
-    family: TransitionFamily, observations: Sequence[_Observations], noise_factor: float
+    family: TransitionFamily, flights_by_scenario: Sequence[_Flights], noise_factor: float
 ) -> LikelihoodGrid:
-    """Return the likelihood of the probabilities to worsen on a grid, given a group's twins.
+    """Return, on a grid, the likelihood of the probabilities with which a state worsens.
 
-    The likelihoods of the states are computed anew for each grid: those of many twins would not fit
-    in memory.
+    It is the likelihood given the observations of all twins of a group. `likelihood_grid` narrows
+    the grid and so calls `log_likelihood` several times. Each call reads the observations again and
+    computes the likelihoods of the states anew, because those of many twins do not fit in memory.
     """
     sensor_models = [
-        with_noise_factor(part.knowledge.sensor_model, noise_factor) for part in observations
+        with_noise_factor(flights.knowledge.sensor_model, noise_factor)
+        for flights in flights_by_scenario
     ]
 
     def log_likelihood(points: Float) -> Float:
+        """Return the log likelihood (P,) at P points (P, K) of K probabilities to worsen."""
         total = np.zeros(len(points))
-        for part, sensor_model in zip(observations, sensor_models, strict=True):
-            for observed, control in part.pieces():
+        for flights, sensor_model in zip(flights_by_scenario, sensor_models, strict=True):
+            for observed, control in flights.blocks():
                 likelihood = scaled_likelihood(sensor_model, observed, control).values
-                total += transition_evidence(family, points, likelihood, control).sum(axis=0)
+                log_evidence = transition_evidence(family, points, likelihood, control)
+                total += log_evidence.sum(axis=0)  # over the twins; the other axis is the points
         return total
 
     return likelihood_grid(log_likelihood, len(family.names))
@@ -516,7 +523,9 @@ def with_noise_factor(
 
 
 def _noise_factor(
-    observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
+    flights_by_scenario: Sequence[_Flights],
+    family: TransitionFamily,
+    nodes: _ParameterNodes | None,
 ) -> Distribution:
     """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
 
@@ -524,18 +533,16 @@ def _noise_factor(
     it in each step separately would attribute a part of the noise to the parameter. With nodes, the
     evidence of all steps is computed at each value first and averaged over the values then.
     """
-    observations_of_first_twins = [
-        part.first_twins(NOISE_TWINS) for part in observations[:NOISE_TWINS]
+    flights_of_first_twins = [
+        flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
     ]
 
     def log_likelihood(axes: Axes) -> Float:
-        factors = np.exp(axes[0])
-        return np.array(
-            [
-                _evidence_of_noise(observations_of_first_twins, family, nodes, float(factor))
-                for factor in factors
-            ]
-        )
+        log_evidence = [
+            _evidence_of_noise(flights_of_first_twins, family, nodes, factor)
+            for factor in np.exp(axes[0]).tolist()
+        ]
+        return np.array(log_evidence)
 
     largest_log_factor = np.log(LARGEST_NOISE)
     widest_axis = np.linspace(-largest_log_factor, largest_log_factor, NOISE_POINTS)
@@ -544,7 +551,7 @@ def _noise_factor(
 
 
 def _evidence_of_noise(
-    observations: Sequence[_Observations],
+    flights_by_scenario: Sequence[_Flights],
     family: TransitionFamily,
     nodes: _ParameterNodes | None,
     factor: float,
@@ -555,10 +562,10 @@ def _evidence_of_noise(
     """
     probability = _with_all_transitions_possible(family.assumed)
     total_log_evidence = 0.0
-    for part in observations:
+    for flights in flights_by_scenario:
         value_per_draw = None if nodes is None else nodes.predicted
-        model = with_noise_factor(part.knowledge.sensor_model, factor, value_per_draw)
-        for observed, control in part.pieces():
+        model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
+        for observed, control in flights.blocks():
             if nodes is None:
                 likelihood = scaled_likelihood(model, observed, control)
                 at_point = transition_evidence(
@@ -580,7 +587,7 @@ def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
 
 def _population(
     folder: Path,
-    observations: _Observations,
+    flights: _Flights,
     family: TransitionFamily,
     grid: LikelihoodGrid | None,
     nodes: _ParameterNodes,
@@ -595,8 +602,8 @@ def _population(
     ----------
     folder : Path
         The folder of the fleet, which has room for the temporary file.
-    observations : _Observations
-        The observations of the group.
+    flights : _Flights
+        The flights of the group, which has one scenario.
     family : TransitionFamily
         The transitions.
     grid : LikelihoodGrid or None
@@ -610,10 +617,10 @@ def _population(
     probability = family.assumed
     if grid is not None:
         probability = np.array([marginal.mean for marginal in grid.marginals])
-    draws = observations.knowledge.draws
-    model = with_noise_factor(observations.knowledge.sensor_model, noise_factor, nodes.predicted)
+    draws = flights.knowledge.draws
+    model = with_noise_factor(flights.knowledge.sensor_model, noise_factor, nodes.predicted)
     with RowFile(folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER) as log_evidence:
-        for observed, control in observations.pieces():
+        for observed, control in flights.blocks():
             log_evidence.append(parameter_evidence(family, probability, model, observed, control))
         population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
     return {

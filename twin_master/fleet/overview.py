@@ -178,5 +178,5 @@ def overview_of_group(
         overview.drawn.add(group, rows, standing)
     if overview.leaving_unknown_because:
         urgent = overview.urgent
-        overview.urgent = replace(urgent, leaving=np.full(len(urgent.names), np.nan))
+        overview.urgent = replace(urgent, leaving_probability=np.full(len(urgent.names), np.nan))
     return overview

@@ -283,24 +283,31 @@ def marginal_distributions(
 
 
 def likelihood_grid(log_likelihood: Callable[[Float], Float], count: int) -> LikelihoodGrid:
-    """Return a grid that resolves the posterior of K probabilities under a uniform prior.
+    """Return the likelihood of K probabilities on a grid that resolves their posterior.
+
+    The prior is uniform in the probabilities. The axes of the grid are log odds.
 
     Parameters
     ----------
     log_likelihood : callable
-        Returns the log likelihood (P,) at points (P, K).
+        Returns the log likelihood (P,) at P points (P, K), which hold probabilities.
     count : int
         The number K of probabilities, from 1 to 4.
     """
-    shape = (GRID_POINTS[count],) * count
+    points_per_axis = GRID_POINTS[count]
+    grid_shape = (points_per_axis,) * count
 
-    def log_density(axes: Axes) -> Float:
-        points = np.array(list(product(*axes)))
-        return log_likelihood(logistic(points)).reshape(shape) + _log_uniform_prior(axes)
+    def log_posterior(axes: Axes) -> Float:
+        """Return the log posterior density of the log odds at all points of a grid."""
+        log_odds_of_points = np.array(list(product(*axes)))  # (P, K), the last axis varies fastest
+        log_likelihood_of_points = log_likelihood(logistic(log_odds_of_points))  # (P,)
+        return log_likelihood_of_points.reshape(grid_shape) + _log_uniform_prior(axes)
 
-    axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), GRID_POINTS[count])
-    axes, values = resolve_density(log_density, (axis,) * count)
-    return LikelihoodGrid(axes, values - _log_uniform_prior(axes))
+    lowest_log_odds = logit(np.array(LOWEST))
+    highest_log_odds = logit(np.array(HIGHEST))
+    widest_axis = np.linspace(lowest_log_odds, highest_log_odds, points_per_axis)
+    axes, log_density = resolve_density(log_posterior, (widest_axis,) * count)
+    return LikelihoodGrid(axes, log_density - _log_uniform_prior(axes))
 
 
 @dataclass(frozen=True)
@@ -467,16 +474,30 @@ def _hyperparameter_records(marginals: Sequence[Distribution]) -> list[dict[str,
 
 
 def _interpolated_likelihood(grid: LikelihoodGrid, axes: Axes) -> Float:
-    """Interpolate a likelihood to finer axes, and return normalised weights, (P, P) or (P, 1)."""
+    """Interpolate the log likelihood of a group to finer axes, and return normalised weights.
+
+    Parameters
+    ----------
+    grid : LikelihoodGrid
+        The likelihood of one or two probabilities on a grid.
+    axes : tuple of (P,) array
+        The finer axes, log odds, with P = `SHARED_POINTS` points each.
+
+    Returns
+    -------
+    (P, P) or, for one probability, (P, 1) array
+        The weight of each point.
+    """
     from scipy.interpolate import RegularGridInterpolator
 
     # Large negative logarithms, where the likelihood is practically 0, would make the cubic spline
     # oscillate: cut them off.
-    log_likelihood = grid.log_likelihood - grid.log_likelihood.max()
-    log_likelihood = np.maximum(log_likelihood, LEAST_LOG_LIKELIHOOD)
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    interpolate = RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")
-    return cell_probabilities(interpolate(points)).reshape(SHARED_POINTS, -1)
+    relative_log_likelihood = grid.log_likelihood - grid.log_likelihood.max()
+    cut_log_likelihood = np.maximum(relative_log_likelihood, LEAST_LOG_LIKELIHOOD)
+    interpolate = RegularGridInterpolator(grid.axes, cut_log_likelihood, method="cubic")
+    fine_points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    weights = cell_probabilities(interpolate(fine_points))
+    return weights.reshape(SHARED_POINTS, -1)
 
 
 @dataclass(frozen=True)

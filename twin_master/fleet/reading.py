@@ -125,12 +125,12 @@ def severity(scenario: Scenario, mean: ArrayLike) -> Float:
     (...) array
         The severities.
     """
-    lowest = np.array([factor.levels[0] for factor in scenario.state])
-    highest = np.array([factor.levels[-1] for factor in scenario.state])
-    has_one_level = highest == lowest
-    length = np.where(has_one_level, 1.0, highest - lowest)  # one level: avoids 0 / 0
-    position = (np.asarray(mean) - lowest) / length
-    return np.asarray(position.sum(axis=-1))
+    lowest_level = np.array([factor.levels[0] for factor in scenario.state])  # (F,)
+    highest_level = np.array([factor.levels[-1] for factor in scenario.state])  # (F,)
+    level_range = highest_level - lowest_level
+    divisor = np.where(level_range == 0.0, 1.0, level_range)  # a factor with one level counts 0
+    severity_of_factor = (np.asarray(mean) - lowest_level) / divisor  # (..., F)
+    return np.asarray(severity_of_factor.sum(axis=-1))
 
 
 def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) -> Float:

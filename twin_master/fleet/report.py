@@ -28,7 +28,7 @@ from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import figure_rows, group_figures, open_groups
 from twin_master.fleet.standing import Standing, standing_of_watched
 from twin_master.fleet.store import WITHIN
-from twin_master.fleet.watched_asset import counts_of, read_standing
+from twin_master.fleet.watched_asset import read_standing, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
 from twin_master.scenario.schema import Scenario
 
@@ -218,7 +218,8 @@ def _add_watched_fleet(
     assets = standing["assets"]
     failures = standing["failures"]
     decided = {name: asset for name, asset in assets.items() if asset["last"] is not None}
-    page.add_highlights([(str(count), title) for title, count in counts_of(standing).items()])
+    counts = watched_fleet_counts(standing)
+    page.add_highlights([(str(count), title) for title, count in counts.items()])
     if failures:
         asset_count = counted(len(assets | failures), "asset")
         page.add_notice(f"{len(failures)} of {asset_count} are not watched.")
@@ -354,7 +355,7 @@ def _attention_table(standing: Standing, *, has_alarms: bool) -> _AttentionTable
     percentage = standing.leaving_percentage
     rows = []
     for number in range(len(standing.names)):
-        is_leaving_known = not np.isnan(standing.leaving[number])
+        is_leaving_known = not np.isnan(standing.leaving_probability[number])
         row = [
             standing.names[number],
             str(standing.step[number]),

@@ -41,7 +41,7 @@ class Standing:
         The control in force.
     alarms : (B,) array
         The number of alarms.
-    leaving : (B,) array
+    leaving_probability : (B,) array
         The probability that the control changes within the scenario's `prediction_steps`; NaN if
         it is not known.
     """
@@ -54,7 +54,7 @@ class Standing:
     deviation: Float
     control: list[str]
     alarms: Index
-    leaving: Float
+    leaving_probability: Float
 
     def of_assets(self, indices: Index) -> "Standing":
         """Return the standing of some of the assets, in the order of the indices."""
@@ -67,7 +67,7 @@ class Standing:
             deviation=self.deviation[indices],
             control=[self.control[number] for number in numbers],
             alarms=self.alarms[indices],
-            leaving=self.leaving[indices],
+            leaving_probability=self.leaving_probability[indices],
         )
 
     def followed_by(self, others: "Standing") -> "Standing":
@@ -80,13 +80,15 @@ class Standing:
             deviation=np.concatenate([self.deviation, others.deviation]),
             control=self.control + others.control,
             alarms=np.concatenate([self.alarms, others.alarms]),
-            leaving=np.concatenate([self.leaving, others.leaving]),
+            leaving_probability=np.concatenate(
+                [self.leaving_probability, others.leaving_probability]
+            ),
         )
 
     @property
     def leaving_percentage(self) -> Float:
         """The probability of a change of control in whole percent, (B,); 0 if it is unknown."""
-        return np.asarray(np.rint(100.0 * np.nan_to_num(self.leaving)))
+        return np.asarray(np.rint(100.0 * np.nan_to_num(self.leaving_probability)))
 
     @property
     def attention_order(self) -> Index:
@@ -113,31 +115,36 @@ class Standing:
 
 
 def standing_of_flown(
-    record: JsonRecord, group: "xr.DataTree", rows: slice, leaving: Float | None = None
+    group_record: JsonRecord,
+    group: "xr.DataTree",
+    rows: slice,
+    leaving_probability: Float | None = None,
 ) -> Standing:
     """Return state, control and alarms of the flown twins in some rows after their last steps.
 
     Parameters
     ----------
-    record : mapping
+    group_record : mapping
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group, with a row for each twin.
     rows : slice
         The rows.
-    leaving : (B,) array, optional
+    leaving_probability : (B,) array, optional
         The probability that each twin in the rows changes its control; NaN if left out.
     """
-    # All scenarios of a group come from one scenario file, with equal states and controls.
-    scenario = Scenario.model_validate(record["scenarios"][0])
-    members = RecordedMembers(record)
+    scenario = _scenario_of_group(group_record)
+    members = RecordedMembers(group_record)
     first_row, _, distance = rows.indices(group.sizes[TWIN_AXIS])
-    flown = flown_rows(stored_values(group, "status", rows))
+    status = stored_values(group, "status", rows)
+    flown = flown_rows(status)
+    if leaving_probability is None:
+        leaving_probability = np.full(len(status), np.nan)
     last_step = last_steps(group, rows)[flown]
     at_last_step = (flown, last_step)
     last_control = stored_values(group, "observed/control_index", rows)[at_last_step]
     return Standing(
-        group=record["name"],
+        group=group_record["name"],
         scenario=scenario,
         names=[members.name(first_row + distance * row) for row in flown.tolist()],
         step=last_step,
@@ -145,41 +152,60 @@ def standing_of_flown(
         deviation=stored_values(group, "filtered/standard_deviation", rows)[at_last_step],
         control=[scenario.control_names[index] for index in last_control],
         alarms=notice_counts(group, "alarm", rows)[flown],
-        leaving=np.full(len(flown), np.nan) if leaving is None else leaving[flown],
+        leaving_probability=leaving_probability[flown],
     )
 
 
-def standing_of_watched(record: JsonRecord, assets: JsonRecord) -> Standing:
+def standing_of_watched(group_record: JsonRecord, decided_assets: JsonRecord) -> Standing:
     """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
     ----------
-    record : mapping
+    group_record : mapping
         The record of the group in `config.json`.
-    assets : mapping
-        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them;
-        each must have a last decision.
+    decided_assets : mapping
+        The records of the assets of all groups by GROUP/NAME, as `read_standing` returns them. The
+        twin of each must have decided at least once: `last` of its record is the last decision.
     """
-    scenario = Scenario.model_validate(record["scenarios"][0])
-    prefix = f"{record['name']}/"
-    names = [name for name in assets if name.startswith(prefix)]
-    records = [assets[name] for name in names]
-    decisions = [asset["last"] for asset in records]
-    healths = [decision["health"] for decision in decisions]
+    scenario = _scenario_of_group(group_record)
+    prefix = f"{group_record['name']}/"
+    names = []
+    asset_records = []
+    for name_with_group, asset_record in decided_assets.items():
+        if name_with_group.startswith(prefix):
+            names.append(name_with_group.removeprefix(prefix))
+            asset_records.append(asset_record)
+
+    decisions = [asset_record["last"] for asset_record in asset_records]
+    moments_by_asset = [decision["health"] for decision in decisions]
+    alarms = [asset_record["alarms"] for asset_record in asset_records]
+    # None where it is not known, which becomes NaN
+    leaving_probability = [asset_record["leaving"] for asset_record in asset_records]
     return Standing(
-        group=record["name"],
+        group=group_record["name"],
         scenario=scenario,
-        names=[name.removeprefix(prefix) for name in names],
+        names=names,
         step=np.array([decision["step"] for decision in decisions]),
-        mean=_moments_of_states(scenario, healths, "mean"),
-        deviation=_moments_of_states(scenario, healths, "standard_deviation"),
+        mean=_moments_of_states(scenario, moments_by_asset, "mean"),
+        deviation=_moments_of_states(scenario, moments_by_asset, "standard_deviation"),
         control=[decision["control"] for decision in decisions],
-        alarms=np.array([asset["alarms"] for asset in records], np.int64),
-        leaving=np.array([asset["leaving"] for asset in records], np.float64),
+        alarms=np.array(alarms, np.int64),
+        leaving_probability=np.array(leaving_probability, np.float64),
     )
 
 
-def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: str) -> Float:
+def _scenario_of_group(group_record: JsonRecord) -> Scenario:
+    """Return a scenario whose states and controls hold for all assets of a group.
+
+    All scenarios of a group come from one scenario file, and differ only in what it lets differ
+    from asset to asset, so that the first one is taken.
+    """
+    return Scenario.model_validate(group_record["scenarios"][0])
+
+
+def _moments_of_states(
+    scenario: Scenario, moments_by_asset: list[JsonObject], moment: str
+) -> Float:
     """Return a moment of each state factor of each asset, a (B, F) array.
 
     It is NaN where the record has None.
@@ -188,12 +214,12 @@ def _moments_of_states(scenario: Scenario, healths: list[JsonObject], moment: st
     ----------
     scenario : Scenario
         The scenario, which names the factors.
-    healths : list of dict
-        For each asset, the moments of each factor by the factor's name.
+    moments_by_asset : list of dict
+        For each asset, the moments of each state factor by the factor's name.
     moment : str
         The key of the moment: "mean" or "standard_deviation".
     """
     rows = []
-    for health in healths:
-        rows.append([health[name][moment] for name in scenario.state_names])
+    for moments in moments_by_asset:
+        rows.append([moments[name][moment] for name in scenario.state_names])
     return np.array(rows, np.float64)

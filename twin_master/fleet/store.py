@@ -176,10 +176,10 @@ def _notices(flights: Flights) -> _Notices:
 
 
 class Fallbacks(NamedTuple):
-    """Fallbacks of B twins: changes from the first control to a gentler one because of damage.
+    """Fallbacks of B twins: changes from the initial control to a gentler one because of damage.
 
     A fallback is called for once the true state reaches a level at which the policy leaves the
-    first control.
+    initial control, that of the first step.
 
     Attributes
     ----------
@@ -217,13 +217,13 @@ def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
             flights.control_index[twin, :steps_flown],
             true_state[:steps_flown],
         )
-        if fallback.switch_state is not None:
-            early[twin] = fallback.early_step is not None
-        if fallback.called_for_step is None:
+        if fallback.switch_factor is not None:
+            early[twin] = fallback.early_change_step is not None
+        if fallback.step_at_switch_level is None:
             continue
         if fallback.delay is not None:
             delay[twin] = fallback.delay
-        elif steps_flown - fallback.called_for_step > WITHIN:
+        elif steps_flown - fallback.step_at_switch_level > WITHIN:
             delay[twin] = np.inf
     return Fallbacks(delay, early)
 

@@ -166,7 +166,7 @@ def _fields_of_entries(
 ) -> Iterator[dict[str, str]]:
     """Yield for each variable that one row of the schema describes the values of its fields."""
     if "{reading}" in template:
-        for reading in scenario.readings:
+        for reading in scenario.inspection_readings:
             yield {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
     elif "{parameter}" in template:
         for parameter in parameters:
@@ -251,7 +251,7 @@ def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
     if observation.modes is not None:
         covariance = slice(observation.count, observation.width)
         columns[f"observed/{observation.role}_covariance"] = covariance
-    for number, reading in enumerate(scenario.readings):
+    for number, reading in enumerate(scenario.inspection_readings):
         columns[f"observed/{reading.name}"] = observation.width + number
     return columns
 

@@ -41,7 +41,7 @@ class StoredObservations:
         self._scenario = scenario
         self._block = lru_cache(maxsize=1)(self._read_block)
 
-    def pieces(self, rows: Index) -> Iterator[ObservedTwins]:
+    def blocks(self, rows: Index) -> Iterator[ObservedTwins]:
         """Yield the observations of the twins in the rows of the store (B,), in ascending order."""
         for number in np.unique(rows // BLOCK_TWINS).tolist():
             rows_of_block = rows[rows // BLOCK_TWINS == number] - number * BLOCK_TWINS

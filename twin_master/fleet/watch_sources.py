@@ -259,12 +259,14 @@ class TopicSource:
 
     def _heartbeat(self) -> dict[str, object]:
         """Return the status of the watch, which the session publishes at regular intervals."""
+        # A topic has no watch until one is attached to it.
         watches = [topic.watch for topic in self._topics.values() if topic.watch is not None]
+        quiet_watches = [watch for watch in watches if watch.is_quiet]
         return {
             "state": "watching",
             "assets": len(watches),
             "steps": sum(watch.twin.steps for watch in watches),
-            "quiet": sum(watch.is_quiet for watch in watches),
+            "quiet": len(quiet_watches),
             "lag": len(self._session.unread),
             "refused": sum(watch.intake.counts.rejected for watch in watches),
         }

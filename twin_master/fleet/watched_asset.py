@@ -49,21 +49,25 @@ def read_standing(folder: Path) -> JsonObject:
     return with_present_names(standing, {"assets.*.last.turn": "step"}, str(path), FleetError)
 
 
-def counts_of(standing: JsonRecord) -> dict[str, int]:
-    """Return the numbers of assets, steps, alarms, refused messages and failures.
+def watched_fleet_counts(standing: JsonRecord) -> dict[str, int]:
+    """Return the numbers of a watched fleet by their titles: assets, steps, alarms and others.
 
     Parameters
     ----------
     standing : mapping
-        The record of the asset, from `read_standing`.
+        The records of all assets, from `read_standing`.
     """
-    assets = standing["assets"].values()
-    decisions = [asset["last"] for asset in assets if asset["last"] is not None]
+    asset_records = standing["assets"].values()
+    steps = 0
+    for asset_record in asset_records:
+        last_decision = asset_record["last"]
+        if last_decision is not None:  # else the asset is before its first step
+            steps += last_decision["step"] + 1  # steps are counted from 0
     return {
-        "assets": len(assets),
-        "steps": sum(decision["step"] + 1 for decision in decisions),
-        "alarms": sum(asset["alarms"] for asset in assets),
-        "messages refused": sum(asset["refused"] for asset in assets),
+        "assets": len(asset_records),
+        "steps": steps,
+        "alarms": sum(asset_record["alarms"] for asset_record in asset_records),
+        "messages refused": sum(asset_record["refused"] for asset_record in asset_records),
         "not watched": len(standing["failures"]),
     }
 

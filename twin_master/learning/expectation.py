@@ -32,7 +32,7 @@ class Expectation:
     ----------
     mean, standard_deviation, lower, upper : (..., G) array
         Moments of the values without noise, and their quantiles of 2.5 and 97.5 %, SI.
-    noise : (..., G) array
+    noise_standard_deviation : (..., G) array
         The standard deviation of noise and model error, SI.
     reward_mean, reward_standard_deviation : (..., 3) array
         Moments of the rewards, in the order of `REWARD_NAMES`.
@@ -42,7 +42,7 @@ class Expectation:
     standard_deviation: Float
     lower: Float
     upper: Float
-    noise: Float
+    noise_standard_deviation: Float
     reward_mean: Float
     reward_standard_deviation: Float
 
@@ -81,7 +81,7 @@ def expectation_of_draws(
         standard_deviation=standard_deviation,
         lower=lower,
         upper=upper,
-        noise=sensor_model.noise(joint, rows),
+        noise_standard_deviation=sensor_model.noise(joint, rows),
         reward_mean=reward_mean,
         reward_standard_deviation=reward_standard_deviation,
     )
@@ -348,7 +348,7 @@ class LearntExpectation:
             standard_deviation=np.sqrt(variance),
             lower=lower + center,
             upper=upper + center,
-            noise=self._expected_noise(hypotheses, weight, controls),
+            noise_standard_deviation=self._expected_noise(hypotheses, weight, controls),
             reward_mean=reward_mean,
             reward_standard_deviation=reward_standard_deviation,
         )

@@ -66,29 +66,29 @@ def correct_beliefs(
     log_density = np.empty(pairs)
     for twin in range(twins):
         # Each hypothesis has learnt noise scales of its own. They enter the constant of Student's
-        # density: 1 / sqrt(degrees + squares) for each gauge.
+        # density: 1 / sqrt(degrees of freedom + squares) for each gauge.
         log_scale_ratio = 0.0
         for g in range(gauges):
             observation.present[g] = not np.isnan(observations.readings[twin, g])
-            degrees = priors.degrees + observation_count[twin, g]
-            observation.degrees_after[g] = degrees + 1.0
-            model_squares[g] = priors.degrees + beliefs.model_squares[twin, g]
-            precision[g] = min(degrees / model_squares[g], 1.0)
+            degrees_of_freedom = priors.degrees_of_freedom + observation_count[twin, g]
+            observation.degrees_after[g] = degrees_of_freedom + 1.0
+            model_squares[g] = priors.degrees_of_freedom + beliefs.model_squares[twin, g]
+            precision[g] = min(degrees_of_freedom / model_squares[g], 1.0)
             if observation.present[g]:
-                recovered_squares = priors.degrees + beliefs.recovered_squares[twin, g]
+                recovered_squares = priors.degrees_of_freedom + beliefs.recovered_squares[twin, g]
                 log_scale_ratio += np.log(model_squares[g] / recovered_squares)
         standardize(predictions, observations, twin, precision, observation)
 
         log_evidence.recovered[twin] = 0.5 * log_scale_ratio + update_sound_gauges(
             observation,
-            priors.degrees,
+            priors.degrees_of_freedom,
             beliefs.recovered[twin],
             beliefs.recovered_squares[twin],
             log_density,
         )
         log_evidence.model[twin] = update_sound_gauges(
             observation,
-            priors.degrees,
+            priors.degrees_of_freedom,
             beliefs.model[twin],
             beliefs.model_squares[twin],
             log_density,

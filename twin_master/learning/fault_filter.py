@@ -102,7 +102,7 @@ class FaultFilter:
             gains=self.gains,
             gain_deviations=settings.gauge_gain * np.array(_GAIN_DEVIATIONS),
             free_gain_deviation=settings.all_gain,
-            degrees=settings.noise_degrees,
+            degrees_of_freedom=settings.noise_degrees,
         )
         self.log_gauge_prior = self._log_gauge_prior()
         # Given that a fault begins, it is free gains or a gauge with equal probability.
@@ -407,27 +407,33 @@ class FaultFilter:
 
 
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
-    """Choose draws evenly over the whole range, each with the probability of the draws around it.
+    """Choose at most `MOST_DRAWS` draws, evenly over the whole range of their values.
 
-    The chosen draws are evenly spaced: a true value in a wide gap between two of them would look
-    like a fault.
+    They are chosen evenly and not by probability, because a true value in a wide gap between two
+    chosen draws would look like a fault.
 
     Parameters
     ----------
     draws, weight : (E,) array
-        The value and the probability of each draw.
+        The value of the parameter in each of E draws, and the probability of the draw.
 
     Returns
     -------
-    chosen_draws : (E',) array
+    chosen_draws : (C,) array
         The indices of the chosen draws.
-    chosen_weight : (E',) array
+    chosen_weight : (C,) array
         For each chosen draw, the total probability of the draws that are nearest to it.
     """
-    order = np.argsort(draws, kind="stable")
-    grid = np.linspace(draws[order[0]], draws[order[-1]], MOST_DRAWS)
-    nearest_to_grid = [order[np.argmin(np.abs(draws[order] - value))] for value in grid]
-    chosen_draws = np.unique(nearest_to_grid)
-    nearest_chosen = np.argmin(np.abs(draws[:, None] - draws[chosen_draws]), axis=1)
+    rising_order = np.argsort(draws, kind="stable")  # stable: the first of equal draws
+    rising_values = draws[rising_order]
+    even_values = np.linspace(rising_values[0], rising_values[-1], MOST_DRAWS)
+    nearest_draws = []
+    for even_value in even_values:
+        nearest = np.argmin(np.abs(rising_values - even_value))
+        nearest_draws.append(rising_order[nearest])
+    chosen_draws = np.unique(nearest_draws)  # a draw may be the nearest to several even values
+
+    distance = np.abs(draws[:, None] - draws[chosen_draws])  # (E, C)
+    nearest_chosen = np.argmin(distance, axis=1)  # (E,)
     chosen_weight = np.bincount(nearest_chosen, weight, minlength=len(chosen_draws))
     return chosen_draws, np.asarray(chosen_weight / chosen_weight.sum(), dtype=np.float64)

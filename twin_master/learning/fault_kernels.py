@@ -81,14 +81,14 @@ class FaultPriors(NamedTuple):
         The gain errors of single gauges, and their prior standard deviations.
     free_gain_deviation : float
         The prior standard deviation of a free gain.
-    degrees : float
+    degrees_of_freedom : float
         The degrees of freedom of the prior of the noise scale.
     """
 
     gains: Float
     gain_deviations: Float
     free_gain_deviation: float
-    degrees: float
+    degrees_of_freedom: float
 
 
 class FreeGainStatistics(NamedTuple):
@@ -494,9 +494,9 @@ def _add_log_density_of_residuals(
     for g in range(len(observation.present)):
         if not observation.present[g]:
             continue
-        degrees = observation.degrees_after[g]
+        degrees_of_freedom = observation.degrees_after[g]
         is_full = gauges_in_product == _GAUGES_OF_A_PRODUCT
-        if gauges_in_product > 0 and (is_full or degrees != degrees_of_product):
+        if gauges_in_product > 0 and (is_full or degrees_of_freedom != degrees_of_product):
             for i in range(pairs):
                 log_density[i] -= 0.5 * degrees_of_product * np.log(product[i])
                 product[i] = 1.0
@@ -506,7 +506,7 @@ def _add_log_density_of_residuals(
         for i in range(pairs):
             product[i] *= 1.0 + residual[i] * residual[i] * inverse
         gauges_in_product += 1
-        degrees_of_product = degrees
+        degrees_of_product = degrees_of_freedom
     for i in range(pairs):
         log_density[i] -= 0.5 * degrees_of_product * np.log(product[i])
 
@@ -514,7 +514,7 @@ def _add_log_density_of_residuals(
 @compiled
 def update_sound_gauges(
     observation: StandardizedObservation,
-    degrees: float,
+    degrees_of_freedom: float,
     belief: Float,
     squares: Float,
     log_density: Float,
@@ -525,7 +525,7 @@ def update_sound_gauges(
     ----------
     observation : StandardizedObservation
         The observation.
-    degrees : float
+    degrees_of_freedom : float
         The degrees of freedom of the prior of the noise scale.
     belief : (N,) array
         The belief; updated in place.
@@ -539,7 +539,7 @@ def update_sound_gauges(
         log_density[i] = observation.log_density[i]
     scale_squares = np.empty(len(squares))
     for g in range(len(squares)):
-        scale_squares[g] = degrees + squares[g]
+        scale_squares[g] = degrees_of_freedom + squares[g]
     _add_log_density_of_residuals(observation, scale_squares, log_density)
 
     # Exponents are taken relative to the largest one of the pairs that count. Those of other pairs

@@ -53,7 +53,7 @@ class GaugeWithFreeGain(NamedTuple):
         The probability that it has.
     fitted_gain, gain_variance : float
         The learnt gain over its prior standard deviation, and its variance.
-    degrees : float
+    degrees_of_freedom : float
         Twice the power of the density.
     model_squares, fixed_squares, free_squares : float
         Degrees of freedom plus the sum of squares: under the model, and without and with a gain.
@@ -63,7 +63,7 @@ class GaugeWithFreeGain(NamedTuple):
     free_probability: float
     fitted_gain: float
     gain_variance: float
-    degrees: float
+    degrees_of_freedom: float
     model_squares: float
     fixed_squares: float
     free_squares: float
@@ -151,8 +151,8 @@ def mix_densities(
         base_free[j] = kernel[j] * gauge.free_squares * variance * variance * inverse
         power_free[j] = free_kernel * inverse
         base_fixed[j] = kernel[j] * gauge.fixed_squares / fixed_kernel
-    multiply_by_power(base_free, gauge.degrees, power_free)
-    multiply_by_power(base_fixed, gauge.degrees, power_fixed)
+    multiply_by_power(base_free, gauge.degrees_of_freedom, power_free)
+    multiply_by_power(base_fixed, gauge.degrees_of_freedom, power_fixed)
     constant_free = gauge.free_probability * np.sqrt(gauge.model_squares / gauge.free_squares)
     constant_fixed = np.sqrt(gauge.model_squares / gauge.fixed_squares)
     constant_fixed *= 1.0 - gauge.free_probability
@@ -180,6 +180,7 @@ def mix_densities_in_logs(
     log_free_constant += 0.5 * np.log(gauge.model_squares / gauge.free_squares)
     log_fixed_constant = np.log1p(-gauge.free_probability)
     log_fixed_constant += 0.5 * np.log(gauge.model_squares / gauge.fixed_squares)
+    power = 0.5 * gauge.degrees_of_freedom  # of the kernels of Student's density
     for j in range(len(log_mixture)):
         x = pairs.x[g, j]
         innovation = x - pairs.c[g, j] * gauge.fitted_gain
@@ -187,9 +188,9 @@ def mix_densities_in_logs(
         free_kernel = 1.0 + innovation * innovation / (gauge.free_squares * variance)
         fixed_kernel = 1.0 + x * x / gauge.fixed_squares
         kernel = pairs.kernel[g, j]
-        log_free = log_free_constant + 0.5 * gauge.degrees * np.log(kernel / free_kernel)
+        log_free = log_free_constant + power * np.log(kernel / free_kernel)
         log_free -= 0.5 * np.log(variance)
-        log_fixed = log_fixed_constant + 0.5 * gauge.degrees * np.log(kernel / fixed_kernel)
+        log_fixed = log_fixed_constant + power * np.log(kernel / fixed_kernel)
         log_mixture[j] = np.logaddexp(log_free, log_fixed)
         free_part[j] = np.exp(log_free - log_mixture[j])
 
@@ -290,8 +291,8 @@ def _gauge_with_free_gain(
         gain_variance,
         observation.degrees_after[gauge],
         model.scale_squares[gauge],
-        priors.degrees + statistics.fixed_squares[twin, gauge],
-        priors.degrees + statistics.free_squares[twin, gauge],
+        priors.degrees_of_freedom + statistics.fixed_squares[twin, gauge],
+        priors.degrees_of_freedom + statistics.free_squares[twin, gauge],
     )
 
 

@@ -84,8 +84,8 @@ def weigh_gauge_faults(
 
     The density is that of the model, with that of the faulty gauge exchanged. It is relative to the
     density of the model without that gauge at the reference pair: the density of the model times
-    (kernel / kernel of the fault)^(degrees / 2), over the root of the variance, where the kernel of
-    the model is divided by its value at the reference pair.
+    kernel / kernel of the fault, to the power of half the degrees of freedom, over the root of the
+    variance, where the kernel of the model is divided by its value at the reference pair.
 
     The compiler vectorises loops that write to arrays of this function only.
 
@@ -226,7 +226,7 @@ def _gauge_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeFaul
         faults.gain_deviation[r] = priors.gain_deviations[r % gains]
         faults.fitted_gain[r] = min(max(gain_variance * beliefs.gauge_sum_cx[twin, r], -1.0), 1.0)
         faults.gain_variance[r] = gain_variance
-        faults.scale_squares[r] = priors.degrees + beliefs.gauge_squares[twin, r]
+        faults.scale_squares[r] = priors.degrees_of_freedom + beliefs.gauge_squares[twin, r]
     return faults
 
 

@@ -217,7 +217,7 @@ class GaugeWatch:
     ) -> None:
         """Append a notice for each twin that follows another hypothesis than before."""
         hypothesis, probability = hypothesis_weights.most_probable_hypothesis(
-            state.weights, gauges=state.left_out.shape[1]
+            state.weights, gauge_count=state.left_out.shape[1]
         )
         has_changed = (probability > 0.5) & (hypothesis != state.followed_hypothesis)
         for twin in np.flatnonzero(has_changed).tolist():

@@ -30,6 +30,8 @@ MODEL = 0
 """Index of the model among the current log weights."""
 RECOVERED = 1
 """Index of the hypothesis that there was a fault and the gauges are right again."""
+SOUND_HYPOTHESES = slice(RECOVERED + 1)
+"""The hypotheses under which the gauges are right: the model, and "recovered"."""
 FREE_GAINS = 2
 """Index of the fault that several gauges have unknown gains."""
 FAULTS = slice(2, None)
@@ -328,47 +330,46 @@ def list_hypotheses(
     gauge_names : tuple of str
         The names of the G faults of the gauges, such as "gauge 5 off".
     """
-    gauges = len(gauge_names)
-    (probability,) = np.exp(weights.current)
-    (log_hidden,) = weights.hidden
-    showing_probability = probability[GAUGE_FAULTS].reshape(gauges, -1)
-    hidden_probability = np.exp(log_hidden[GAUGES_OF_FAULTS]).reshape(gauges, -1)
-    gauge_probability = (showing_probability + hidden_probability).sum(axis=1)
-    states = beliefs.model.shape[1]
-    recovered_belief = beliefs.recovered.reshape(states, -1).sum(axis=1)
+    gauge_count = len(gauge_names)
+    (probability,) = np.exp(weights.current)  # (3 + G K,)
+    (log_hidden,) = weights.hidden  # (1 + G K,)
+    showing_probability = probability[GAUGE_FAULTS].reshape(gauge_count, -1)  # (G, K)
+    hidden_probability = np.exp(log_hidden[GAUGES_OF_FAULTS]).reshape(gauge_count, -1)  # (G, K)
+    gauge_probability = (showing_probability + hidden_probability).sum(axis=1)  # (G,)
+    state_count = beliefs.model.shape[1]
+    recovered_belief = beliefs.recovered.reshape(state_count, -1).sum(axis=1)  # (S,)
 
-    # The gauges are right: under the model, or after a fault has ended.
-    sound_probability = probability[: RECOVERED + 1].sum()
-    belief = beliefs.model[0]
+    # The gauges are right: the mixture of the model's belief and of that after a fault has ended.
+    sound_probability = probability[SOUND_HYPOTHESES].sum()
+    sound_belief = beliefs.model[0]
     if probability[RECOVERED] > 0.0:
-        belief = (
-            probability[MODEL] * belief + probability[RECOVERED] * recovered_belief
-        ) / sound_probability
-    hypotheses = [Hypothesis("model", float(sound_probability), belief)]
+        joint = probability[MODEL] * sound_belief + probability[RECOVERED] * recovered_belief
+        sound_belief = joint / sound_probability
+    hypotheses = [Hypothesis("model", float(sound_probability), sound_belief)]
 
-    draws = beliefs.recovered.shape[1] // states
-    belief_of_gauge = beliefs.gauge.reshape(states, draws, gauges, -1)
+    # A gauge is off: the mixture of the fault where it shows, with each gain error, and of the
+    # fault where it is hidden, which predicts the same as "recovered".
+    draw_count = beliefs.recovered.shape[1] // state_count
+    # (S, E, G, K)
+    belief_of_fault = beliefs.gauge.reshape(state_count, draw_count, gauge_count, -1)
     for g in np.flatnonzero(gauge_probability >= _LEAST_REPORTED).tolist():
-        showing_belief = np.einsum(
-            "k,sek->s", showing_probability[g], belief_of_gauge[:, :, g]
-        )  # over gains, draws
-        belief = showing_belief + hidden_probability[g].sum() * recovered_belief
-        hypotheses.append(
-            Hypothesis(gauge_names[g], float(gauge_probability[g]), belief / belief.sum())
-        )
+        showing_joint = np.einsum("k,sek->s", showing_probability[g], belief_of_fault[:, :, g])
+        joint = showing_joint + hidden_probability[g].sum() * recovered_belief
+        belief = joint / joint.sum()
+        hypotheses.append(Hypothesis(gauge_names[g], float(gauge_probability[g]), belief))
     none_of_these = float(weights.free_gains_probability[0])
     hypotheses.append(Hypothesis("none of these", none_of_these, None))
     return tuple(hypotheses)
 
 
-def most_probable_hypothesis(weights: HypothesisWeights, gauges: int) -> tuple[Index, Float]:
+def most_probable_hypothesis(weights: HypothesisWeights, gauge_count: int) -> tuple[Index, Float]:
     """Return the most probable hypothesis of each of B twins, and its probability.
 
     Parameters
     ----------
     weights : HypothesisWeights
         The log weights of B twins.
-    gauges : int
+    gauge_count : int
         The number G of gauges.
 
     Returns
@@ -378,9 +379,18 @@ def most_probable_hypothesis(weights: HypothesisWeights, gauges: int) -> tuple[I
     probability : (B,) array
         Its probability.
     """
-    sound = np.exp(weights.current[:, : RECOVERED + 1]).sum(axis=1)
-    gauge = weights.gauge_fault_probability.reshape(len(sound), gauges, -1).sum(axis=2)
-    probability = np.column_stack([sound, gauge, weights.free_gains_probability])
-    hypothesis = np.argmax(probability, axis=1)
-    largest = np.take_along_axis(probability, hypothesis[:, None], axis=1)[:, 0]
-    return np.where(hypothesis > gauges, -1, hypothesis), largest
+    twin_count = len(weights.current)
+    # The gauges are right under the model, and also after a fault has ended.
+    sound_probability = np.exp(weights.current[:, SOUND_HYPOTHESES]).sum(axis=1)  # (B,)
+    fault_probability = weights.gauge_fault_probability.reshape(twin_count, gauge_count, -1)
+    gauge_probability = fault_probability.sum(axis=2)  # over the gain errors: (B, G)
+
+    # One column for each hypothesis: the model, gauges 1 to G, free gains.
+    probability = np.column_stack(
+        [sound_probability, gauge_probability, weights.free_gains_probability]
+    )
+    column = np.argmax(probability, axis=1)
+    largest_probability = np.take_along_axis(probability, column[:, None], axis=1)[:, 0]
+    column_of_free_gains = gauge_count + 1
+    hypothesis = np.where(column == column_of_free_gains, -1, column)
+    return hypothesis, largest_probability

@@ -7,8 +7,11 @@ its weight is its evidence:
     p(D_t, k | o_0..o_t) ~
         p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
 
-which is exact. The offset, gain and noise scale of a gauge, given the hypothesis, are learnt by a
-`GaugeRegression`.
+which is exact: D_t is the state in step t, o_t the observation, and T_k the transitions. The
+offset, gain and noise scale of a gauge, given the hypothesis, are learnt by a `GaugeRegression`.
+
+The axes of arrays are n or T steps, K hypotheses, E draws of the parameter, S states, U controls
+and G gauges.
 """
 
 from collections.abc import Mapping, Sequence
@@ -116,37 +119,38 @@ class LearningFilter:
         self.parameter = None if draws is None else ParameterDraws(*draws)
         self._name = name
         self._units = sensor_units or ("1",) * sensor_model.sensor_count
-        self._factors = np.array(list(transitions))
+        self._transition_factors = np.array(list(transitions))
 
         # Hypothesis k is draw k % E with factor k // E. The transitions of all factors stand one
-        # after the other as further controls, so that one loop advances all hypotheses.
+        # after the other as further controls, so that one loop advances all hypotheses: control u
+        # of a hypothesis is the row u + `_control_offset` of the stacked tables.
         factor_count = len(transitions)
         blocks_by_factor = [transition.blocks for transition in transitions.values()]
         stacked_blocks = tuple(
             np.concatenate(blocks) for blocks in zip(*blocks_by_factor, strict=True)
         )
         self._transition = TransitionModel(stacked_blocks)
-        self._draw: Index = np.tile(np.arange(sensor_model.draw_count), factor_count)
+        self._draw_of_hypothesis: Index = np.tile(np.arange(sensor_model.draw_count), factor_count)
         factor_index: Index = np.repeat(np.arange(factor_count), sensor_model.draw_count)
-        self._first_control = factor_index * len(model.controls)
+        self._control_offset: Index = factor_index * len(model.controls)  # (K,)
 
         prior_weight = np.tile(sensor_model.draw_weight / factor_count, factor_count)
         with np.errstate(divide="ignore"):
-            self._log_weight: Float = np.log(prior_weight)
+            self._log_prior_weight: Float = np.log(prior_weight)
         self._inverse_deviation = 1.0 / sensor_model.independent_standard_deviation
         self._gauges = GaugeRegression(
             offset_deviation=np.full(sensor_model.sensor_count, settings.gauge_offset, np.float64),
             gain_deviation=np.full(sensor_model.sensor_count, settings.gauge_gain, np.float64),
-            degrees=settings.noise_degrees if settings.noise else 0.0,
+            degrees_of_freedom=settings.noise_degrees if settings.noise else 0.0,
         )
 
     @property
     def prior(self) -> Mapping[str, Learnt]:
         """The prior of each learnt quantity, by name."""
         sensors = self.sensor_model.sensor_count
-        weight = np.exp(self._log_weight)
-        statistics = np.zeros((len(weight), sensors, SUM_COUNT))
-        return self._learnt_quantities(weight, statistics, np.zeros(sensors))
+        weight = np.exp(self._log_prior_weight)
+        regression_sums = np.zeros((len(weight), sensors, SUM_COUNT))
+        return self._learnt_quantities(weight, regression_sums, np.zeros(sensors))
 
     def step(
         self, before: Carried | None, observation: Float, control_index: int, step: int
@@ -158,7 +162,7 @@ class LearningFilter:
         `gauge_offset[g]` for the sensors g from 1.
         """
         sensor_values, other_log_density = self.sensor_model.split_observation(observation)
-        forecast, statistics, count = self._forecast(before)
+        forecast, regression_sums, count = self._forecast(before)
 
         # Correct the belief by the sensors, and by the rest of the observation.
         inverse_deviation = self._inverse_deviation[:, control_index]
@@ -167,9 +171,11 @@ class LearningFilter:
             control_index,
             self.sensor_model.value_per_draw[:, :, control_index],
         )
-        readings = GaugeReadings(sensor_values, self._draw, best_fit.value, inverse_deviation)
-        log_belief = forecast + other_log_density + best_fit.log_density[self._draw]
-        log_belief += self._gauges.log_density(readings, statistics, count)
+        readings = GaugeReadings(
+            sensor_values, self._draw_of_hypothesis, best_fit.value, inverse_deviation
+        )
+        log_belief = forecast + other_log_density + best_fit.log_density[self._draw_of_hypothesis]
+        log_belief += self._gauges.log_density(readings, regression_sums, count)
 
         # Normalise it.
         largest = float(log_belief.max())
@@ -186,17 +192,17 @@ class LearningFilter:
         if self._gauges.learns:
             predictive_scale = inverse_deviation * np.sqrt(best_fit.one_minus_leverage)
             readings = GaugeReadings(
-                sensor_values, self._draw, best_fit.value_by_others, predictive_scale
+                sensor_values, self._draw_of_hypothesis, best_fit.value_by_others, predictive_scale
             )
-            statistics = statistics + self._gauges.expected_products(readings, log_belief)
+            regression_sums = regression_sums + self._gauges.expected_products(readings, log_belief)
         count = count + ~np.isnan(sensor_values)
-        arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
+        arrays = {"log_belief": log_belief, "statistics": regression_sums, "count": count}
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
             filtered=joint_belief.sum(axis=0),
             log_evidence=log_evidence,
             carried=Carried(control_index, arrays),
-            learnt=self._learnt_quantities(joint_belief.sum(axis=1), statistics, count),
+            learnt=self._learnt_quantities(joint_belief.sum(axis=1), regression_sums, count),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -213,12 +219,13 @@ class LearningFilter:
         """
         if before is None:
             sensors = self.sensor_model.sensor_count
-            statistics = np.zeros((len(self._draw), sensors, SUM_COUNT))
-            return self._log_weight[:, None] + self.model.log_prior, statistics, np.zeros(sensors)
-        control = self._first_control + before.control_index
-        forecast = log_forecast(self._transition, control, before.arrays["log_belief"])
-        if self.parameter is None:
-            forecast = self._restore_draw_weights(forecast)
+            regression_sums = np.zeros((len(self._draw_of_hypothesis), sensors, SUM_COUNT))
+            log_joint_prior = self._log_prior_weight[:, None] + self.model.log_prior
+            return log_joint_prior, regression_sums, np.zeros(sensors)
+        stacked_control = self._control_offset + before.control_index
+        forecast = log_forecast(self._transition, stacked_control, before.arrays["log_belief"])
+        if self.parameter is None:  # the parameter is not learnt
+            forecast = self._with_prior_draw_weights(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
     def hypotheses(self, carried: Carried, weight: Float | None = None) -> StaticHypotheses:
@@ -252,7 +259,7 @@ class LearningFilter:
         gain_variance = gain_deviation**2 * fit.gain_variance
         return StaticHypotheses(
             weight=weight[considered],
-            draw=self._draw[considered],
+            draw=self._draw_of_hypothesis[considered],
             offset=offset_deviation * fit.offset,
             gain=gain_deviation * fit.gain,
             offset_variance=squared_noise_scale * offset_variance,
@@ -262,50 +269,70 @@ class LearningFilter:
         )
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
+        """Return the smoothed beliefs p(D_i | o_0..o_t) of n steps i, the last being t: (n, S)."""
         return np.asarray(self.smoothed_hypotheses(carried).sum(axis=1))
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_i, k | o_0..o_t) for the steps i of `carried`, which end at t: (n, K, S)."""
-        result = np.zeros((len(carried), len(self._draw), self.model.states.size))
-        if not len(carried):
-            return result
-        log_belief = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
-        if self.parameter is None and len(self._draw) > 1:
-            log_belief = np.stack([self._restore_draw_weights(row) for row in log_belief])
+        """Return the smoothed joint belief over static hypotheses and states.
 
-        # The belief of each hypothesis is smoothed by itself. Hypotheses do not change in time, so
-        # that their smoothed weights are those after the last step.
-        weight = np.exp(log_belief[-1]).sum(axis=1)
-        possible_hypotheses = np.flatnonzero(weight > 0.0)
-        log_given_hypothesis = log_belief[:, possible_hypotheses] - logsumexp(
-            log_belief[:, possible_hypotheses], axis=2, keepdims=True
-        )
-        step_controls = np.array([step.control_index for step in carried])
-        control = self._first_control[possible_hypotheses, None] + step_controls
-        log_given_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
-        smoothed_beliefs = smooth_many(
-            self._transition, control, np.exp(log_given_hypothesis), log_given_hypothesis
-        )
-        result[:, possible_hypotheses] = weight[
-            possible_hypotheses, None
-        ] * smoothed_beliefs.swapaxes(0, 1)
-        return result
+        Parameters
+        ----------
+        carried : sequence of Carried
+            The arrays that the filter carried on from n steps, the last of which is step t.
 
-    def _restore_draw_weights(self, log_belief: Float) -> Float:
-        """Give the draws of a log belief (hypotheses, states) their prior weights again.
-
-        The weights of the transition factors stay as they are.
+        Returns
+        -------
+        (n, K, S) array
+            p(D_i, k | o_0..o_t) for each step i, hypothesis k and state D_i.
         """
-        factor_count = len(self._factors)
+        step_count = len(carried)
+        hypothesis_count = len(self._draw_of_hypothesis)
+        smoothed_joint = np.zeros((step_count, hypothesis_count, self.model.states.size))
+        if step_count == 0:
+            return smoothed_joint
+        log_belief = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
+        if self.parameter is None and hypothesis_count > 1:
+            # The parameter is not learnt: its draws are averaged anew in each step, so that what a
+            # step says about the draws must not weigh in other steps.
+            log_belief = np.stack(
+                [self._with_prior_draw_weights(belief_of_step) for belief_of_step in log_belief]
+            )
+
+        # Hypotheses do not change in time, so their smoothed weights are those after the last step.
+        # The belief over states is smoothed separately under each hypothesis that is possible.
+        weight = np.exp(log_belief[-1]).sum(axis=1)  # (K,)
+        possible = np.flatnonzero(weight > 0.0)
+        log_joint = log_belief[:, possible]
+        log_given_hypothesis = log_joint - logsumexp(log_joint, axis=2, keepdims=True)
+
+        # `smooth_many` takes a row for each hypothesis, not for each step: beliefs (K, n, S).
+        log_by_hypothesis = np.ascontiguousarray(log_given_hypothesis.swapaxes(0, 1))
+        control_of_step = np.array([step.control_index for step in carried])  # (n,)
+        stacked_control = self._control_offset[possible, None] + control_of_step  # (K, n)
+        smoothed_by_hypothesis = smooth_many(
+            self._transition, stacked_control, np.exp(log_by_hypothesis), log_by_hypothesis
+        )
+        smoothed_joint[:, possible] = weight[possible, None] * smoothed_by_hypothesis.swapaxes(0, 1)
+        return smoothed_joint
+
+    def _with_prior_draw_weights(self, log_belief: Float) -> Float:
+        """Return a log belief (K, S) in which the draws have their prior weights again.
+
+        This averages over the draws anew. The belief over states given a transition factor becomes
+        the same for all draws; the weights of the transition factors stay as they are.
+        """
+        factor_count = len(self._transition_factors)
         by_factor = log_belief.reshape(factor_count, -1, log_belief.shape[1])  # (factors, E, S)
         draw_count = by_factor.shape[1]
-        log_factor_belief = np.repeat(np.logaddexp.reduce(by_factor, axis=1), draw_count, axis=0)
-        # `_log_weight` holds p(draw) / (number of factors); times that number it is p(draw).
-        return np.asarray(log_factor_belief + self._log_weight[:, None] + np.log(factor_count))
+        log_belief_of_factor = np.logaddexp.reduce(by_factor, axis=1)
+        log_factor_belief = np.repeat(log_belief_of_factor, draw_count, axis=0)  # (K, S)
+        # The prior weight of a hypothesis is p(draw) / (number of factors).
+        return np.asarray(
+            log_factor_belief + self._log_prior_weight[:, None] + np.log(factor_count)
+        )
 
     def _learnt_quantities(
-        self, weight: Float, statistics: Float, count: Float
+        self, weight: Float, regression_sums: Float, count: Float
     ) -> Mapping[str, Learnt]:
         """Return the posterior of each learnt quantity by name.
 
@@ -318,7 +345,7 @@ class LearningFilter:
         count : (G,) array
             The number of observations of each sensor.
         """
-        factor_count = len(self._factors)
+        factor_count = len(self._transition_factors)
         by_factor = weight.reshape(factor_count, -1)  # (factors, E)
         result: dict[str, Learnt] = {}
         if self.parameter is not None:
@@ -328,11 +355,11 @@ class LearningFilter:
         if factor_count > 1:
             prior = np.full(factor_count, 1.0 / factor_count)
             result["transition_factor"] = posterior_of_draws(
-                self._factors, prior, by_factor.sum(axis=1)
+                self._transition_factors, prior, by_factor.sum(axis=1)
             )
         if self._gauges.learns:
-            fit = self._gauges.fit(statistics)
-            if self._gauges.degrees > 0.0:
+            fit = self._gauges.fit(regression_sums)
+            if self._gauges.learns_noise:
                 result |= self._learnt_noise_scales(weight, fit, count)
             result |= self._learnt_offsets_and_gains(weight, fit, count)
         return result
@@ -358,9 +385,9 @@ class LearningFilter:
         dict of str to Learnt
             The posteriors by `noise_scale[g]`, with the gauges g counted from 1.
         """
-        degrees = self._gauges.degrees
-        shape = 0.5 * (degrees + count)  # (G,)
-        rate = 0.5 * (degrees + fit.residual_squares)  # (K, G)
+        degrees_of_freedom = self._gauges.degrees_of_freedom
+        shape = 0.5 * (degrees_of_freedom + count)  # (G,)
+        rate = 0.5 * (degrees_of_freedom + fit.sum_of_squares)  # (K, G)
         mean_rate = weight @ rate
         low_level, high_level = INTERVAL
         # The squared scale is the rate over a gamma variate. So the lower bound of the scale

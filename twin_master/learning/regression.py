@@ -1,7 +1,7 @@
 """The conjugate regression of each gauge: its offset, its gain error and its noise scale.
 
     o_g = h_g(D_t, k) (1 + gain_g) + offset_g + lambda_g sigma_g noise,
-    lambda_g² ~ inverse gamma(degrees / 2, degrees / 2),
+    lambda_g² ~ inverse gamma(nu / 2, nu / 2), with nu degrees of freedom,
     offset_g, gain_g | lambda_g ~ N(0, lambda_g² times their prior variance),
 
 so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section
@@ -15,6 +15,8 @@ In all formulas of this module a gauge is measured in units of its assumed noise
     c = prior standard deviation of the gain error times the prediction / sigma,
 
 so that x = a u + c v + lambda noise, and the coefficients u and v have the prior N(0, lambda²).
+
+The axes of arrays are K hypotheses, E draws of the calibrated parameter, S states and G gauges.
 """
 
 from dataclasses import dataclass
@@ -89,9 +91,9 @@ class GaugeFit(NamedTuple):
         Posterior means.
     offset_variance, covariance, gain_variance : (K, G) array
         Posterior covariance of the two.
-    residual_squares : (K, G) array
-        The squared residuals of the fit plus the squared coefficients, which the prior adds as in
-        a ridge regression.
+    sum_of_squares : (K, G) array
+        The sum of the squared residuals of the fit over all observations, plus the squared
+        coefficients, which the prior adds as in a ridge regression.
     """
 
     offset: Float
@@ -99,7 +101,7 @@ class GaugeFit(NamedTuple):
     offset_variance: Float
     covariance: Float
     gain_variance: Float
-    residual_squares: Float
+    sum_of_squares: Float
 
 
 @dataclass(frozen=True)
@@ -112,13 +114,13 @@ class GaugeRegression:
         Prior standard deviation of the offset, SI; a gauge with 0 learns no offset.
     gain_deviation : (G,) array
         Prior standard deviation of the gain error, dimensionless; a gauge with 0 learns no gain.
-    degrees : float
+    degrees_of_freedom : float
         Degrees of freedom of the prior of the noise scale; with 0 the noise is as assumed.
     """
 
     offset_deviation: Float
     gain_deviation: Float
-    degrees: float
+    degrees_of_freedom: float
 
     @property
     def learns(self) -> bool:
@@ -126,11 +128,16 @@ class GaugeRegression:
         learns_coefficients = np.any(self.gain_deviation > 0.0) or np.any(
             self.offset_deviation > 0.0
         )
-        return self.degrees > 0.0 or bool(learns_coefficients)
+        return self.learns_noise or bool(learns_coefficients)
 
-    def fit(self, statistics: Float) -> GaugeFit:
+    @property
+    def learns_noise(self) -> bool:
+        """Whether the noise scales are learnt; if not, each of them is one."""
+        return self.degrees_of_freedom > 0.0
+
+    def fit(self, regression_sums: Float) -> GaugeFit:
         """Return the posterior of offset and gain, given the sums (K, G, 6) of a regression."""
-        sums = RegressionSums.view(statistics)
+        sums = RegressionSums.view(regression_sums)
         # Invert the precision matrix [[1 + aa, ac], [ac, 1 + cc]].
         offset_precision = 1.0 + sums.aa
         gain_precision = 1.0 + sums.cc
@@ -138,14 +145,14 @@ class GaugeRegression:
 
         offset = (gain_precision * sums.ax - sums.ac * sums.cx) / determinant
         gain = (offset_precision * sums.cx - sums.ac * sums.ax) / determinant
-        residual_squares = np.maximum(sums.xx - sums.ax * offset - sums.cx * gain, 0.0)
+        sum_of_squares = np.maximum(sums.xx - sums.ax * offset - sums.cx * gain, 0.0)
         fields = [
             offset,
             gain,
             gain_precision / determinant,
             -sums.ac / determinant,
             offset_precision / determinant,
-            residual_squares,
+            sum_of_squares,
         ]
         # The fields are views of one array, as the sums are. A mean over hypotheses of such a view
         # is summed by NumPy, not by a library of linear algebra whose last bits may differ.
@@ -161,51 +168,65 @@ class GaugeRegression:
         count : (G,) array
             The number of observations of each gauge.
         """
-        if not self.degrees > 0.0:
-            return np.ones_like(fit.residual_squares)
+        if not self.learns_noise:
+            return np.ones_like(fit.sum_of_squares)
         # The mean of an inverse gamma distribution exists above two degrees of freedom; with fewer
         # the divisor is kept at one.
-        degrees_above_two = np.maximum(self.degrees + count - 2.0, 1.0)
-        return np.asarray((self.degrees + fit.residual_squares) / degrees_above_two)
+        degrees_above_two = np.maximum(self.degrees_of_freedom + count - 2.0, 1.0)
+        return np.asarray((self.degrees_of_freedom + fit.sum_of_squares) / degrees_above_two)
 
-    def log_density(self, readings: GaugeReadings, statistics: Float, count: Float) -> Float:
-        """Return the log predictive density of an observation in each state: (K, S).
+    def log_density(self, readings: GaugeReadings, regression_sums: Float, count: Float) -> Float:
+        """Return the log predictive density of an observation in each state.
+
+        The density is the product of those of the gauges that are present. That of a gauge is
+        Student's, or normal if the noise scale is not learnt.
 
         Parameters
         ----------
         readings : GaugeReadings
-            The observation and its predictions.
-        statistics : (K, G, 6) array
-            The sums of the regressions over earlier observations.
+            The observation of G gauges, and its predictions in S states.
+        regression_sums : (K, G, 6) array
+            The sums of the regressions over earlier observations, given each of K hypotheses, in
+            the order of the fields of `RegressionSums`.
         count : (G,) array
             The number of earlier observations of each gauge.
+
+        Returns
+        -------
+        (K, S) array
+            The log density of values in SI.
         """
-        is_present = ~np.isnan(readings.observation)
-        fit = self.fit(statistics)
-        # The factors of the density that do not depend on the state. The density is Student's, or
-        # normal if the noise scale is not learnt.
-        log_constant: Float = np.full(len(is_present), -0.5 * np.log(2.0 * np.pi))
-        if self.degrees > 0.0:
-            power = 0.5 * (self.degrees + count + 1.0)
+        is_present = ~np.isnan(readings.observation)  # (G,)
+        fit = self.fit(regression_sums)  # each field (K, G)
+        hypothesis_count = len(readings.draw)
+        state_count = readings.prediction.shape[1]
+        log_density = np.empty((hypothesis_count, state_count))
+
+        # Terms that do not depend on the state: the constant of each gauge's density.
+        log_constant: Float
+        if self.learns_noise:
+            power = 0.5 * (self.degrees_of_freedom + count + 1.0)  # (G,)
+            scale_squares = self.degrees_of_freedom + fit.sum_of_squares  # (K, G)
             log_constant = gammaln(power) - gammaln(power - 0.5)
-            log_constant = log_constant - 0.5 * np.log(
-                np.pi * (self.degrees + fit.residual_squares)
-            )
-        result = np.empty((len(readings.draw), readings.prediction.shape[1]))
-        result[:] = np.sum(log_constant, axis=-1, where=is_present)[..., None]
-        result += np.log(readings.inverse_deviation[:, is_present]).sum(axis=1)
-        # The factors that do. The loop is faster on contiguous arrays.
-        contiguous_fit = GaugeFit._make(map(np.ascontiguousarray, fit))
+            log_constant = log_constant - 0.5 * np.log(np.pi * scale_squares)  # (K, G)
+            log_density[:] = np.sum(log_constant, axis=1, where=is_present)[:, None]
+        else:
+            log_constant = np.full(len(is_present), -0.5 * np.log(2.0 * np.pi))  # (G,)
+            log_density[:] = np.sum(log_constant, where=is_present)
+
+        # Terms that depend on the state: the conversion from units of noise to SI, and the kernels.
+        log_density += np.log(readings.inverse_deviation[:, is_present]).sum(axis=1)
+        contiguous_fit = GaugeFit._make(map(np.ascontiguousarray, fit))  # faster in the loop
         _add_log_densities(
             readings,
             self.offset_deviation,
             self.gain_deviation,
             contiguous_fit,
-            self.degrees,
+            self.degrees_of_freedom,
             count,
-            result,
+            log_density,
         )
-        return result
+        return log_density
 
     def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
         """Return the terms that an observation adds to the six sums of each gauge's regression.
@@ -249,13 +270,13 @@ def _add_log_densities(
     offset_deviation: Float,
     gain_deviation: Float,
     fit: GaugeFit,
-    degrees: float,
+    degrees_of_freedom: float,
     count: Float,
     result: Float,
 ) -> None:
-    """Add to `result` (K, S) the log factors of the predictive density that depend on the state.
+    """Add to `result` (K, S) the kernels of the log predictive density, which depend on the state.
 
-    K is the number of hypotheses, S that of states. For a gauge, x is the standardised residual
+    For a gauge, x is the standardised residual
     after the fitted offset and gain are subtracted, and a and c are the changes of its standardised
     value by one prior standard deviation of offset and gain.
 
@@ -287,7 +308,9 @@ def _add_log_densities(
                     + a * (a * fit.offset_variance[k, g] + 2.0 * c * fit.covariance[k, g])
                     + c * c * fit.gain_variance[k, g]
                 )
-                power = 0.5 * (degrees + count[g] + 1.0) if degrees > 0.0 else 0.0
+                power = 0.0  # of a normal density, which has no kernel to multiply
+                if degrees_of_freedom > 0.0:
+                    power = 0.5 * (degrees_of_freedom + count[g] + 1.0)
                 too_large = kernel_product > LARGEST_PRODUCT or variance_product > LARGEST_PRODUCT
                 if power != product_power or too_large:
                     log_density -= product_power * np.log(kernel_product) + 0.5 * np.log(
@@ -297,9 +320,9 @@ def _add_log_densities(
                     variance_product = 1.0
                     product_power = power
                 variance_product *= variance
-                if degrees > 0.0:
-                    scaled_variance = (degrees + fit.residual_squares[k, g]) * variance
-                    kernel_product *= 1.0 + x * x / scaled_variance
+                if degrees_of_freedom > 0.0:
+                    scale_squares = degrees_of_freedom + fit.sum_of_squares[k, g]
+                    kernel_product *= 1.0 + x * x / (scale_squares * variance)
                 else:
                     log_density -= 0.5 * x * x / variance
             log_kernels = product_power * np.log(kernel_product)

@@ -37,7 +37,7 @@ from twin_master.assets.library_source import (
 from twin_master.errors import MissionInputError, check_names
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.sampler import GridSampler
-from twin_master.network.transition import NUMBER, check_fits
+from twin_master.network.transition import BYTES_OF_NUMBER, check_fits
 
 PLAN_NAME = "grid.json"
 """File in the folder of blocks: the grid and the hashes on which the library depends."""
@@ -229,7 +229,7 @@ def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
     warn_without_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
     sensor_count: int = sensors.stop - sensors.start
-    size = _COPIES_IN_MEMORY * NUMBER * sensor_count * grid.size
+    size = _COPIES_IN_MEMORY * BYTES_OF_NUMBER * sensor_count * grid.size
     check_fits(
         {f"{sensor_count} sensors at {grid.size} points": size},
         "take fewer levels, draws or controls",

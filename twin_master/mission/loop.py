@@ -141,10 +141,11 @@ def fly(
         for step in operate(twin, plant, *sinks):
             history.add(step)
             stage.advance(detail=scenario.control_names[step.twin_step.control_index])
-    if plant.ended:
-        history.ended = early_end_sentence(scenario, twin.steps, plant.ended)
-        history.notices.append((twin.steps - 1, Notice("ended", history.ended)))
-        _logger.info("%s", history.ended)
+    if plant.reason_of_end:
+        sentence = early_end_sentence(scenario, twin.steps, plant.reason_of_end)
+        history.sentence_of_early_end = sentence
+        history.notices.append((twin.steps - 1, Notice("ended", sentence)))
+        _logger.info("%s", sentence)
     return history
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
@@ -145,7 +146,9 @@ def share_beyond_limit(
 def encode_policy(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> bytes:
     """Return the content of a policy file.
 
-    A policy (S, U) is an NPY file; one on the belief is an NPZ file that also names its controls.
+    A policy by states is an NPY file with one array (S, U). A policy on the belief is an NPZ
+    archive with an array for each field of `BeliefPolicy`, and `controls`, the names of its
+    controls.
     """
     content = io.BytesIO()
     if isinstance(policy, BeliefPolicy):
@@ -156,7 +159,7 @@ def encode_policy(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> by
 
 
 def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
-    """Return the policy in a file, for the states and controls of a model.
+    """Return the policy in a file of `encode_policy`, for the states and controls of a model.
 
     Raises
     ------
@@ -165,28 +168,43 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
     """
     try:
         content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            return model.policy(content)
-        with content:
-            policy = BeliefPolicy.from_arrays(content)
-            controls = tuple(content["controls"].tolist())
+        if isinstance(content, np.ndarray):  # NPY: a policy by states (S, U)
+            return model.policy(content)  # refuses another shape
+        stored_policy = _read_belief_policy(content)  # NPZ
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        reason: object = error
-        if "pickle" in str(error):
+        # AttributeError: the archive holds a member that is not an array.
+        reason = str(error)
+        if "pickle" in reason:
             # NumPy takes an unknown file for pickled Python objects, and its message advises to
             # allow these, which would be unsafe.
             reason = "it is neither NPY nor NPZ"
         raise PlanningError(
             f"{path} is not a policy such as `uav-twin plan --out` writes ({reason}): give such a "
-            "file, or fly a run again whose copy is damaged"
+            "file, or repeat the run if its copy of the policy is damaged"
         ) from None
-    states = policy.vectors.shape[1]
-    if controls != model.controls or states != model.states.size:
+    if stored_policy.controls != model.controls or stored_policy.state_count != model.states.size:
         raise PlanningError(
-            f"{path} is for {states} states and the controls {comma_list(controls)}, and the "
-            f"scenario has {model.states.size} and {comma_list(model.controls)}: plan it anew"
+            f"{path} is for {stored_policy.state_count} states and the controls "
+            f"{comma_list(stored_policy.controls)}, and the scenario has {model.states.size} and "
+            f"{comma_list(model.controls)}: plan it anew"
         )
-    return policy
+    return stored_policy.policy
+
+
+class _StoredBeliefPolicy(NamedTuple):
+    """A policy on the belief, and the states and controls that it was planned for."""
+
+    policy: BeliefPolicy
+    state_count: int
+    controls: tuple[str, ...]
+
+
+def _read_belief_policy(archive: NpzFile) -> _StoredBeliefPolicy:
+    """Return the policy on the belief in an NPZ archive, and close the archive."""
+    with archive:
+        policy = BeliefPolicy.from_arrays(archive)
+        controls = tuple(archive["controls"].tolist())
+    return _StoredBeliefPolicy(policy, policy.vectors.shape[1], controls)
 
 
 @dataclass(frozen=True)
@@ -249,7 +267,7 @@ def compare_simple_rules(
         return np.asarray(np.argmax(belief @ plan.action_value, axis=1))
 
     def inspect_every(period: int) -> Decide:
-        inspecting_control = scenario.readings[0][0]
+        inspecting_control = scenario.inspection_readings[0].control_index
 
         def rule(belief: Float, filtered_belief: Float, step: int) -> Index:
             if step % period == 0:
@@ -259,7 +277,7 @@ def compare_simple_rules(
         return rule
 
     rules: dict[str, Decide] = {"mode of the policy by states": mode_of_policy, "QMDP": qmdp}
-    if scenario.readings:
+    if scenario.inspection_readings:
         for period in INSPECTION_PERIODS:
             name = f"inspection every {period} {scenario.mission.step_name}s"
             rules[name] = inspect_every(period)

@@ -103,29 +103,36 @@ class Knowledge:
     def sensor_model(self) -> GaussianSensorModel:
         """The sensors: their predicted values in each state, and the assumed noise.
 
-        If the user has given a sensor model, it is that one. Otherwise the class is that for
-        identified modes, whose observations contain a covariance; that for inspections, if an
-        action of the twin reads the state; or plain Gaussian sensors.
+        The first of these cases that holds decides:
+
+        - If the user has given a sensor model, it is used.
+        - If the observations are identified modes, an `IdentifiedSensorModel`, because they contain
+          a covariance of their own.
+        - If an action of the twin inspects the state, an `InspectedSensorModel`.
+        - Otherwise a `GaussianSensorModel`.
         """
         if self.parts.sensor_model is not None:
-            return self.parts.make_sensor_model(replace(self, parts=NO_PARTS))
-        section = self.scenario.observation
-        sensor_model_class: Callable[..., GaussianSensorModel] = GaussianSensorModel
-        if section.modes is not None:
-            sensor_model_class = IdentifiedSensorModel
-        elif self.scenario.readings:
-            sensor_model_class = _inspected_sensor_model(self.scenario, self.model)
-        # The change of each sensor within the interval of values that a state stands for.
+            # A user's sensor model may be made from that of the scenario. So it gets knowledge
+            # without parts, whose sensor model is one of the other cases.
+            knowledge_of_scenario = replace(self, parts=NO_PARTS)
+            return self.parts.make_sensor_model(knowledge_of_scenario)
+        observation = self.scenario.observation
+        make_sensor_model: Callable[..., GaussianSensorModel] = GaussianSensorModel
+        if observation.modes is not None:
+            make_sensor_model = IdentifiedSensorModel
+        elif self.scenario.inspection_readings:
+            make_sensor_model = _inspected_sensor_model(self.scenario, self.model)
+        # With `between_levels` a state stands for an interval of values, within which its sensors
+        # change; without it, for the values at its levels alone.
         change_within_interval = None
-        if section.between_levels:
-            change_within_interval = self.model.states.change_within_interval(
-                self.predicted.mean(axis=0)
-            )
-        return sensor_model_class(
+        if observation.between_levels:
+            mean_of_draws = self.predicted.mean(axis=0)  # (S, U, G)
+            change_within_interval = self.model.states.change_within_interval(mean_of_draws)
+        return make_sensor_model(
             self.predicted,
-            section.standard_deviation,
-            average=section.average_over_draws,
-            model_error=section.model_error,
+            observation.standard_deviation,
+            average=observation.average_over_draws,
+            model_error=observation.model_error,
             interval=change_within_interval,
         )
 
@@ -367,9 +374,10 @@ def _inspected_sensor_model(
 
     An inspection reads one factor of the state, with noise of a stated standard deviation.
     """
-    controls = np.array([control for control, _state, _name, _deviation in scenario.readings])
-    factors = np.array([state for _control, state, _name, _deviation in scenario.readings])
-    deviations = np.array([deviation for _control, _state, _name, deviation in scenario.readings])
+    readings = scenario.inspection_readings
+    controls = np.array([reading.control_index for reading in readings])
+    factors = np.array([reading.state_index for reading in readings])
+    deviations = np.array([reading.standard_deviation for reading in readings])
     coordinates = model.states.coordinates  # (S, F)
     within_level = np.zeros_like(coordinates)
     if scenario.observation.between_levels:

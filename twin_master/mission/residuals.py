@@ -107,7 +107,7 @@ def residual_summary(
                 expected_in_steps(span_history, knowledge, span_history.filtered, is_smoothed=False)
             )
     expectation = concatenate_expectations(expectations)
-    residual = (history.observed - expectation.mean) / expectation.noise
+    residual = (history.observed - expectation.mean) / expectation.noise_standard_deviation
     return {
         "rms_residual": float(np.sqrt(np.nanmean(residual**2))),
         "log_evidence": float(np.sum(history.log_evidence)),

@@ -4,7 +4,10 @@ The information of a set of sensors is the expected logarithm of the posterior p
 true state over its prior probability. The expectation is over simulated readings, with all states
 equally probable. Effects that move all sensors together (a damage between two levels, the
 calibrated parameter) count as common, not as independent noise. A structure may have candidates
-in addition to the gauges of its file.
+in addition to the gauges of its file. Each gauge is a sensor; a scenario names sensors by their
+numbers from 1.
+
+The axes of arrays are N drawn readings, S states, G sensors and F common effects.
 """
 
 import itertools
@@ -112,24 +115,30 @@ class DrawnReadings:
 
         The standardised readings of the set have the covariance I + L Lᵀ in each state, where L
         (sensors, F) are the loadings. Its inverse and determinant follow from the small matrix
-        C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma:
+        C = I + Lᵀ L (F, F), by the Woodbury identity and the determinant lemma, for residuals r:
         rᵀ (I + L Lᵀ)⁻¹ r = rᵀ r - (Lᵀ r)ᵀ C⁻¹ (Lᵀ r), and det(I + L Lᵀ) = det C.
 
         The constant -log(2 pi) / 2 of each sensor is left out: it is the same in all states, so
         that it cancels in the ratio of posterior to prior.
         """
         chosen_sensors = list(sensors)
+        # The sums over the chosen sensors. The first axis of the terms is that of the sensors.
         terms = self._terms
-        squared_distance = terms.squared_residual[chosen_sensors].sum(axis=0)  # rᵀ r, (N, S)
-        projection = terms.loading_residual[chosen_sensors].sum(axis=0)  # Lᵀ r, (S, N, F)
-        small_matrix = terms.loading_product[chosen_sensors].sum(axis=0)  # Lᵀ L, (S, F, F)
-        small_matrix = small_matrix + np.eye(projection.shape[-1])
+        squared_residual = terms.squared_residual[chosen_sensors].sum(axis=0)  # rᵀ r, (N, S)
+        loading_residual = terms.loading_residual[chosen_sensors].sum(axis=0)  # Lᵀ r, (S, N, F)
+        loading_product = terms.loading_product[chosen_sensors].sum(axis=0)  # Lᵀ L, (S, F, F)
 
-        weighted_projection = np.matmul(projection, np.linalg.inv(small_matrix))
-        squared_distance -= np.sum(weighted_projection * projection, axis=-1).T
-        log_density = -0.5 * (squared_distance + np.linalg.slogdet(small_matrix)[1])
-        log_density -= self.log_deviation[:, chosen_sensors].sum(axis=1)
-        return np.asarray(log_density)
+        # Squared distance rᵀ (I + L Lᵀ)⁻¹ r of each reading from each state, and log determinant.
+        small_matrix = loading_product + np.eye(loading_product.shape[-1])  # C, (S, F, F)
+        inverse = np.linalg.inv(small_matrix)
+        weighted = np.matmul(loading_residual, inverse)  # (Lᵀ r)ᵀ C⁻¹, (S, N, F)
+        explained_by_effects = np.sum(weighted * loading_residual, axis=-1)  # (S, N)
+        squared_distance = squared_residual - explained_by_effects.T  # (N, S)
+        log_determinant = np.linalg.slogdet(small_matrix)[1]  # (S,)
+
+        # The log deviations convert the density of standardised readings to SI.
+        log_scale = self.log_deviation[:, chosen_sensors].sum(axis=1)  # (S,)
+        return np.asarray(-0.5 * (squared_distance + log_determinant) - log_scale)
 
 
 def draw_readings(knowledge: Knowledge) -> tuple[DrawnReadings, ...]:
@@ -390,7 +399,7 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
     except InvalidDesignError as error:
         raise InvalidDesignError(f"--candidates {candidates}: {error}") from error
     extended_belief = belief.model_copy(update={"structure": str(extended_file)})
-    return _with_sensors(
+    return _with_all_gauges(
         scenario.model_copy(update={"belief": extended_belief}),
         declared_gauges=[gauge.name for gauge in design.gauge],
         all_gauges=[gauge.name for gauge in extended_design.gauge],
@@ -427,31 +436,36 @@ def _append_gauges(structure_file: Path, gauges: Sequence[Gauge]) -> None:
                 text.write(f"{key} = {json.dumps(value)}\n")
 
 
-def _with_sensors(
+def _with_all_gauges(
     scenario: Scenario, declared_gauges: Sequence[str], all_gauges: Sequence[str]
 ) -> Scenario:
-    """Return the scenario with all gauges as sensors; its reward for health keeps its weight.
+    """Return the scenario with all gauges of its structure as sensors.
 
-    The reward for health still depends on the gauges that it depended on. The tables of learning
-    and of notices are removed, because their settings hold for the declared gauges alone.
+    The reward for health still reads the same gauges. The tables `learning` and `notice` are
+    removed, because their settings hold for the declared gauges alone.
 
     Parameters
     ----------
     scenario : Scenario
         The scenario, with the declared gauges as sensors.
-    declared_gauges, all_gauges : sequence of str
-        The names of the gauges before and after the candidates were added.
+    declared_gauges : sequence of str
+        The names of the gauges of the user's structure, in the order of the sensors.
+    all_gauges : sequence of str
+        Their names after candidate gauges were added to compare them, in the new order.
     """
     observation = scenario.observation
     titles = dict(zip(declared_gauges, observation.titles or declared_gauges, strict=True))
+
+    # The scenario names the sensors of the reward by their numbers from 1. A candidate may stand
+    # before a declared gauge, so that a gauge may have another number now.
     health_sensors = scenario.rewards.health_sensors
     if health_sensors == "all":
         health_sensors = tuple(range(1, len(declared_gauges) + 1))
-    # Sensors are named by their numbers from 1, which the new gauges shift.
     new_health_sensors = []
     for number in health_sensors:
         gauge = declared_gauges[number - 1]
         new_health_sensors.append(all_gauges.index(gauge) + 1)
+
     new_observation = {
         "count": len(all_gauges),
         "titles": tuple(titles.get(gauge, gauge) for gauge in all_gauges),

@@ -93,19 +93,19 @@ class Flights:
 
     @classmethod
     def concatenate(cls, flights: Sequence["Flights"]) -> "Flights":
-        """Return the flights of several formations as those of one."""
+        """Return the flights of several formations as those of one, formation after formation."""
         if len(flights) == 1:
-            return flights[0]
+            return flights[0]  # without a copy of its arrays
         return cls(
-            observation_rows=np.concatenate([part.observation_rows for part in flights]),
-            control_index=np.concatenate([part.control_index for part in flights]),
-            state=np.concatenate([part.state for part in flights]),
-            filtered=np.concatenate([part.filtered for part in flights]),
-            log_evidence=np.concatenate([part.log_evidence for part in flights]),
-            unexplained=np.concatenate([part.unexplained for part in flights]),
-            failure=list(chain.from_iterable(part.failure for part in flights)),
-            ended=list(chain.from_iterable(part.ended for part in flights)),
-            notices=list(chain.from_iterable(part.notices for part in flights)),
+            observation_rows=np.concatenate([formation.observation_rows for formation in flights]),
+            control_index=np.concatenate([formation.control_index for formation in flights]),
+            state=np.concatenate([formation.state for formation in flights]),
+            filtered=np.concatenate([formation.filtered for formation in flights]),
+            log_evidence=np.concatenate([formation.log_evidence for formation in flights]),
+            unexplained=np.concatenate([formation.unexplained for formation in flights]),
+            failure=list(chain.from_iterable(formation.failure for formation in flights)),
+            ended=list(chain.from_iterable(formation.ended for formation in flights)),
+            notices=list(chain.from_iterable(formation.notices for formation in flights)),
         )
 
     def store_history(self, twin: int, history: History) -> None:
@@ -119,7 +119,7 @@ class Flights:
             self.unexplained[twin, :steps_flown] = history.unexplained
         if history.simulated:
             self.state[twin, :steps_flown] = history.state
-        self.ended[twin] = history.ended
+        self.ended[twin] = history.sentence_of_early_end
         self.notices[twin] = history.notices
 
 
@@ -314,8 +314,9 @@ class _Formation:
         self._ends_mission = np.array(
             [scenario.ends(index) for index in range(len(scenario.control))]
         )
-        inspecting_controls = {control for control, _state, _name, _deviation in scenario.readings}
-        self._inspecting_controls = sorted(inspecting_controls)
+        self._inspecting_controls = sorted(
+            {reading.control_index for reading in scenario.inspection_readings}
+        )
         self._watch = gauge_watch_of(knowledge.estimator)
         self._watch_state: WatchState | None = None
 
@@ -484,5 +485,5 @@ def fly_one_by_one(
         except FLIGHT_ERRORS as error:
             flights.failure[number] = str(error)
         flights.store_history(number, history)
-        previous_ended_well = not flights.failure[number] and not history.ended
+        previous_ended_well = not flights.failure[number] and not history.sentence_of_early_end
     return flights

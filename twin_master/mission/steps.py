@@ -113,7 +113,7 @@ class History:
         The notices to the operator, each with the number of its step.
     resumed_at : int
         The number of steps that an earlier process flew.
-    ended : str
+    sentence_of_early_end : str
         How the asset ended the mission before its last step; empty if it did not.
     observation_rows : (T, G + I) array
         All observed values, NaN where nothing was received; `observed` and `readings` are its
@@ -132,7 +132,7 @@ class History:
     steps: list[MissionStep] = field(default_factory=list)
     notices: list[tuple[int, Notice]] = field(default_factory=list)
     resumed_at: int = 0
-    ended: str = ""
+    sentence_of_early_end: str = ""
 
     observation_rows = _StackedAttribute("reading.observed")
     control_index = _StackedAttribute("twin_step.control_index")
@@ -266,11 +266,11 @@ class Truth:
         self.drift: Float = np.zeros((steps, sensors))
         self.status: NDArray[np.int8] = np.zeros((steps, sensors), dtype=np.int8)
         self._apply_faults(scenario)
-        self._inspections = scenario.readings
+        self._inspections = scenario.inspection_readings
         standard_noise = generator(seed, "inspection").standard_normal(
             (steps, len(self._inspections))
         )
-        deviations = [deviation for _control, _state, _name, deviation in self._inspections]
+        deviations = [reading.standard_deviation for reading in self._inspections]
         self.reading_noise: Float = standard_noise * deviations
         self.in_asset = scenario.truth.kind == "asset"
         is_scripted = scenario.truth.kind == "scripted"
@@ -362,9 +362,9 @@ class Truth:
             The readings with noise, SI; NaN if the control does not ask for the inspection.
         """
         columns = []
-        for inspecting_control, factor, _name, _deviation in self._inspections:
-            is_asked_for = control == inspecting_control
-            columns.append(np.where(is_asked_for, state[..., factor], np.nan))
+        for reading in self._inspections:
+            is_asked_for = control == reading.control_index
+            columns.append(np.where(is_asked_for, state[..., reading.state_index], np.nan))
         # The shape is given because there may be no inspections.
         by_inspection = np.reshape(columns, (len(columns), *state.shape[:-1]))
         return np.asarray(np.moveaxis(by_inspection, 0, -1) + self.reading_noise[step])
@@ -479,8 +479,8 @@ class Plant:
     ----------
     step : int
         The number of steps flown.
-    ended : str
-        How the mission ended before its last step; empty if it did not.
+    reason_of_end : str
+        Why the mission ended before its last step, as a sentence; empty if it did not.
     """
 
     def __init__(self, scenario: Scenario, truth: Truth, asset: Asset) -> None:
@@ -489,25 +489,39 @@ class Plant:
         self._asset = asset
         self._state: Float | None = None
         self.step = 0
-        self.ended = ""
+        self.reason_of_end = ""
 
     def read(self, twin: Twin) -> Reading | None:
         """Fly the next step and return its observation; None at the end of the mission.
 
-        This is `Source.read` of a simulated asset.
+        This is `Source.read` of a simulated asset. The mission ends in three cases:
+
+        - All its steps are flown.
+        - The twin has decided on an action that ends it.
+        - The FMU has ended its simulation.
+
+        In the last two cases `reason_of_end` becomes a sentence.
+
+        Raises
+        ------
+        FmuEndedError
+            If the FMU ends its simulation in the first step.
+        MissionInputError
+            As `fly_step`.
         """
-        if twin.steps == self._scenario.mission.steps:
+        steps_done = twin.steps
+        if steps_done == self._scenario.mission.steps:
             return None
-        previous_control = twin.control_of(twin.steps - 1) if twin.steps else None
+        previous_control = twin.control_of(steps_done - 1) if steps_done > 0 else None
         if previous_control is not None and self._scenario.ends(previous_control):
-            self.ended = sentence_of_ending_action(self._scenario, previous_control)
+            self.reason_of_end = sentence_of_ending_action(self._scenario, previous_control)
             return None
         try:
             return self.fly_step(twin.proposed_control, previous_control)
         except FmuEndedError as error:
-            if twin.steps == 0:
-                raise
-            self.ended = error.sentence
+            if steps_done == 0:
+                raise  # a mission without a single step is an error, and no early end
+            self.reason_of_end = error.sentence
             return None
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:

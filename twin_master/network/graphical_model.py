@@ -169,14 +169,15 @@ class StateSpace:
             by the straight line that fits the table best; zero for a factor of one level.
         """
         table = np.asarray(table, dtype=np.float64)
-        grid = table.reshape(*self.shape, *table.shape[1:])
-        changes = []
-        for axis, factor in enumerate(self.factors):
-            levels_last = np.moveaxis(grid, axis, -1)
+        # The axis of joint states becomes one axis for the levels of each factor.
+        table_by_levels = table.reshape(*self.shape, *table.shape[1:])
+        change_of_factors = []
+        for factor_axis, factor in enumerate(self.factors):
+            levels_last = np.moveaxis(table_by_levels, factor_axis, -1)
             change = _change_within_interval(levels_last, factor.levels)
-            change_in_place = np.moveaxis(change, -1, axis)
-            changes.append(change_in_place.reshape(table.shape))
-        return np.stack(changes, axis=-1)
+            change_by_levels = np.moveaxis(change, -1, factor_axis)
+            change_of_factors.append(change_by_levels.reshape(table.shape))
+        return np.stack(change_of_factors, axis=-1)
 
     def marginal(self, belief: ArrayLike, name: str) -> Float:
         """Return the marginal of the factor `name`: (..., S) -> (..., levels of that factor).
@@ -191,37 +192,42 @@ class StateSpace:
                 f"no factor is named {name!r}; there are {', '.join(self.names)}"
             )
         belief = np.asarray(belief, dtype=np.float64)
-        joint = belief.reshape(*belief.shape[:-1], *self.shape)
+        belief_by_levels = belief.reshape(*belief.shape[:-1], *self.shape)
+        # The axes of the factors are the last ones, counted from the end by negative numbers.
         factor_count = len(self.shape)
-        factor_axis = self.names.index(name)
-        other_axes = tuple(
-            axis - factor_count for axis in range(factor_count) if axis != factor_axis
-        )
-        return np.asarray(joint.sum(axis=other_axes))
+        summed_axes = []
+        for factor_index, factor_name in enumerate(self.names):
+            if factor_name != name:
+                summed_axes.append(factor_index - factor_count)
+        return np.asarray(belief_by_levels.sum(axis=tuple(summed_axes)))
 
 
 def _change_within_interval(values: Float, levels: tuple[float, ...]) -> Float:
     """Return the change (..., L) of values (..., L) at one standard deviation off each level.
 
-    The true value x is uniform between half a step below the level and half a step above it. With
-    the value v at the level and slopes on either side, the least-squares slope through the level is
-    the ratio of the integrals of x (v(x) - v) and of x². Times the root mean square of x that gives
-    the change.
+    The distance x of the true value from the level is uniform between half a step below and half a
+    step above. With the value v at the level and slopes on either side, the least-squares slope
+    through the level is m / q, where m is the integral of x (v(x) - v), and q that of x². The
+    change is this slope times the root mean square of x, which is sqrt(q / w) in an interval of
+    width w: m / sqrt(q w).
+
+    A step h to a neighbour, over which the value changes by d, contributes its nearer half: h² d to
+    24 m, h³ to 24 q, and h to 2 w.
     """
-    step = np.pad(np.diff(levels), 1)  # no neighbour beyond an end: no interval there
+    # The steps between levels, (L + 1,), and the differences of the values over them, (..., L + 1):
+    # zero beyond the first and the last level, which have no neighbour there.
+    step = np.pad(np.diff(levels), 1)
     no_padding = [(0, 0)] * (values.ndim - 1)
     difference = np.pad(np.diff(values), [*no_padding, (1, 1)])
-    # Integral over a half step h/2 with slope d/h: d h² / 24; of x²: h³ / 24.
-    # With m the integral of x (v(x) - v), q that of x², and w the width of the interval, the change
-    # is m / q sqrt(q / w) = m / sqrt(q w), where 24 m = sum h² d, 24 q = sum h³, 2 w = sum h.
     moment = step**2 * difference
     step_below = step[:-1]
     step_above = step[1:]
     sum_of_steps = step_above + step_below
     sum_of_cubes = step_above**3 + step_below**3
     sum_of_moments = moment[..., 1:] + moment[..., :-1]
+    # m / sqrt(q w) = (sum h² d / 24) / sqrt((sum h³ / 24) (sum h / 2))
     divisor = np.sqrt(12.0 * sum_of_steps * sum_of_cubes)
-    safe_divisor = np.where(divisor > 0.0, divisor, 1.0)
+    safe_divisor = np.where(divisor > 0.0, divisor, 1.0)  # a factor of one level does not change
     return np.asarray(sum_of_moments / safe_divisor)
 
 

@@ -59,7 +59,7 @@ class IntervalFit:
 
 
 class _DensityTerms(NamedTuple):
-    """Terms of the density that all observations by the same sensors under one control share.
+    """Terms that densities of observations with the same present sensors and control share.
 
     The kernel `log_densities` has the formula.
 
@@ -362,42 +362,68 @@ class GaussianSensorModel(QuantityModel):
             self._add_log_densities(observations, control, is_present, result)
             return result
         # The average inside the product over sensors: each sensor is averaged by itself, eq. (32).
-        for is_sensor in np.eye(self.sensor_count, dtype=bool):
-            self._add_log_densities(observations, control, is_sensor & is_present, result)
+        for is_averaged_sensor in np.eye(self.sensor_count, dtype=bool):
+            is_counted = is_averaged_sensor & is_present
+            self._add_log_densities(observations, control, is_counted, result)
         return result
 
     def _add_log_densities(
         self, observations: Float, control: Index, is_present: NDArray[np.bool_], result: Float
     ) -> None:
-        """Add the log densities of observations (T, G) by the present sensors (T, G) to `result`.
+        """Add to `result` the log density of each observation, over its present sensors only.
 
-        Steps with the same control and the same sensors are computed together.
+        Steps with the same control and the same present sensors are computed together.
+
+        Parameters
+        ----------
+        observations : (T, G) array
+            The sensor values, SI.
+        control : (T,) array
+            The control in force in each step.
+        is_present : (T, G) array of bool
+            Whether a sensor counts in a step.
+        result : (T, S, draws) array
+            The log densities, for each draw or, with a last axis of length 1, their average.
         """
-        # The row of truth values as bytes is a key of a dictionary.
-        present_bytes = is_present.view(f"V{self.sensor_count}").squeeze(axis=1).tolist()
-        rows_by_control_and_sensors: dict[tuple[int, bytes], list[int]] = {}
-        for row, control_and_sensors in enumerate(
-            zip(control.tolist(), present_bytes, strict=True)
-        ):
-            rows_by_control_and_sensors.setdefault(control_and_sensors, []).append(row)
-        for (one_control, sensors), rows in rows_by_control_and_sensors.items():
-            result[rows] += self._log_densities_by_same_sensors(
-                observations[rows], one_control, sensors, result.shape[-1]
+        # The row of `is_present` is a key as bytes, because an array cannot be a key.
+        steps_by_group: dict[tuple[int, bytes], list[int]] = {}
+        for step, control_in_force in enumerate(control.tolist()):
+            group = (control_in_force, is_present[step].tobytes())
+            steps_by_group.setdefault(group, []).append(step)
+        for (control_in_force, present_key), steps in steps_by_group.items():
+            result[steps] += self._log_densities_of_same_sensors(
+                observations[steps], control_in_force, present_key, result.shape[-1]
             )
 
-    def _log_densities_by_same_sensors(
-        self, observations: Float, control: int, present_bytes: bytes, draws: int
+    def _log_densities_of_same_sensors(
+        self, observations: Float, control: int, present_key: bytes, draws: int
     ) -> Float:
-        """Return the log densities (T, S, draws) of observations by the same sensors.
+        """Return log densities of steps with the same control and the same present sensors.
 
-        The terms of the last such sensors are kept, because they are mostly the same in the next
-        step.
+        The terms that they share are kept for each control until other sensors are present: mostly
+        the same sensors are present in the next step.
+
+        Parameters
+        ----------
+        observations : (N, G) array
+            The sensor values in N steps, SI; those of absent sensors are ignored.
+        control : int
+            The control in force.
+        present_key : bytes
+            Whether each sensor is present, as the bytes of an array of bool (G,).
+        draws : int
+            The number E of draws for the density of each draw; 1 for their average.
+
+        Returns
+        -------
+        (N, S, draws) array
+            The log densities of values in SI.
         """
-        is_present = np.frombuffer(present_bytes, dtype=bool)
-        last_present, terms = self._last_terms.get(control, (b"", None))
-        if terms is None or last_present != present_bytes:
+        is_present = np.frombuffer(present_key, dtype=bool)
+        last_key, terms = self._last_terms.get(control, (b"", None))
+        if terms is None or last_key != present_key:
             terms = self._density_terms(control, is_present)
-            self._last_terms[control] = (present_bytes, terms)
+            self._last_terms[control] = (present_key, terms)
         draw_offset = terms.draw_offset
         if draws == 1:
             draw_offset = draw_offset - self._log_weight  # the sum over draws is weighted
@@ -416,7 +442,7 @@ class GaussianSensorModel(QuantityModel):
         return result
 
     def _density_terms(self, control: int, is_present: NDArray[np.bool_]) -> _DensityTerms:
-        """Return the terms that all observations by the same sensors share.
+        """Return the terms that all observations with the same present sensors share.
 
         In units of noise the covariance is C = 1 + V V', with V (G, F) the changes within the
         interval. By Woodbury's identity its inverse is 1 - I' I, where I = L^-1 V' are the interval

@@ -24,14 +24,15 @@ from twin_master.network.kernels import PredecessorLists
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
-NUMBER = 8
-"""Bytes of a number."""
+BYTES_OF_NUMBER = 8
+"""Size of a number in double precision [bytes]."""
 TRANSITION_COPIES = 3
 """Copies of a joint table while it is built: of each control, of all of them, and the checked."""
-JOINT_NON_ZEROS = 512
-"""Largest number of non-zero transitions of a control for which one joint table is used.
+MAX_JOINT_NON_ZEROS = 512
+"""Largest number of non-zero transitions of a control for which one joint table is kept.
 
-With so few, a transition takes some microseconds."""
+With so few, the loop over one table is faster than one loop for each factor: a transition takes
+some microseconds."""
 
 
 def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
@@ -163,7 +164,7 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
 
 def transition_bytes(states: int, controls: int) -> float:
     """Return the size of a table of transitions of S states under U controls, (U, S, S) [bytes]."""
-    return float(NUMBER * controls * states * states)
+    return float(BYTES_OF_NUMBER * controls * states * states)
 
 
 def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
@@ -249,29 +250,40 @@ class TransitionModel:
         Raises
         ------
         InvalidModelError
-            If a table is not a square matrix of transitions, or if the controls have other states.
+            If a table is not a square, row-stochastic matrix, if there are no factors, or if the
+            factors differ in number or size between controls.
         """
-        checked = []
+        tables_by_control = []
         for control, factor_tables in enumerate(tables):
-            row = [
-                stochastic_matrix(table, name=f"transition of control {control}, factor {factor}")
-                for factor, table in enumerate(factor_tables)
+            checked_tables = [
+                stochastic_matrix(table, name=f"transition of control {control}, factor {index}")
+                for index, table in enumerate(factor_tables)
             ]
-            checked.append(row)
-        shapes = {tuple(table.shape for table in row) for row in checked}
-        are_same = len(shapes) == 1 and all(shapes)
-        are_square = all(_is_square(shape) for row in shapes for shape in row)
-        if not are_same or not are_square:
+            tables_by_control.append(checked_tables)
+
+        # All controls need the same shapes: one tuple of shapes, with an entry for each factor.
+        distinct_shapes = {
+            tuple(table.shape for table in control_tables) for control_tables in tables_by_control
+        }
+        have_same_shapes = len(distinct_shapes) == 1
+        have_factors = all(len(shapes) > 0 for shapes in distinct_shapes)
+        are_square = all(_is_square(shape) for shapes in distinct_shapes for shape in shapes)
+        if not (have_same_shapes and have_factors and are_square):
             raise InvalidModelError(
                 "expected for every control a square table for each factor, of the same states, "
-                f"got shapes {sorted(shapes)}"
+                f"got shapes {sorted(distinct_shapes)}"
             )
-        factors = [np.stack(factor) for factor in zip(*checked, strict=True)]  # (U, L, L) each
-        non_zeros = [np.count_nonzero(factor, axis=(1, 2)) for factor in factors]
-        joint_non_zeros = np.prod(non_zeros, axis=0, dtype=np.float64).max()
-        if joint_non_zeros <= JOINT_NON_ZEROS:
-            return cls((_joint_table(factors),))
-        return cls(tuple(factors))
+
+        tables_by_factor = zip(*tables_by_control, strict=True)
+        blocks = [np.stack(control_tables) for control_tables in tables_by_factor]  # (U, L, L)
+        # The non-zeros of a Kronecker product are the product of those of its factors.
+        non_zeros = [np.count_nonzero(block, axis=(1, 2)) for block in blocks]  # (U,) of each
+        joint_non_zeros = np.prod(non_zeros, axis=0, dtype=np.float64)  # (U,)
+        # A joint table with few non-zeros has the shortest loops. A larger one takes much more
+        # memory and time than the factors, each of which is applied along its own axis.
+        if joint_non_zeros.max() <= MAX_JOINT_NON_ZEROS:
+            return cls((_joint_table(blocks),))
+        return cls(tuple(blocks))
 
     @property
     def shape(self) -> tuple[int, int, int]:

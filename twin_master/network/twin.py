@@ -53,7 +53,7 @@ _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
 """Pattern of the former name `turns` of arrays in saved states, with or without a prefix."""
 
 
-def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
+def factor_tables(scenario: Scenario, leaving_factor: float = 1.0) -> dict[str, dict[str, Float]]:
     """Return the transitions of each factor under each control, with the repairs by actions.
 
     The result has a table (levels, levels) by the name of the control and that of the factor.
@@ -62,14 +62,14 @@ def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[st
     ----------
     scenario : Scenario
         The scenario of the mission, checked.
-    leaving : float
+    leaving_factor : float
         The factor on the probabilities of each factor of the state to leave a level.
     """
     tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
-    if leaving != 1.0:
+    if leaving_factor != 1.0:
         for control_tables in tables.values():
             for name, table in control_tables.items():
-                control_tables[name] = leaving_table(table, leaving)
+                control_tables[name] = leaving_table(table, leaving_factor)
     for action in scenario.action:
         action_tables = tables[action.name]
         for name in action.repairs:
@@ -90,7 +90,7 @@ def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
     return tables
 
 
-def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> GraphicalModel:
+def build_graphical_model(scenario: Scenario, leaving_factor: float = 1.0) -> GraphicalModel:
     """Return states, controls, prior and transitions of a scenario.
 
     Kapteyn et al. 2021, eqs. (28)-(29): the factors of the state change independently given the
@@ -100,7 +100,7 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
     ----------
     scenario : Scenario
         The scenario of the mission, checked.
-    leaving : float
+    leaving_factor : float
         The factor on the probabilities of each factor of the state to leave a level.
 
     Raises
@@ -110,7 +110,7 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
     """
     return GraphicalModel.from_tables(
         levels={factor.name: factor.levels for factor in scenario.state},
-        tables=factor_tables(scenario, leaving),
+        tables=factor_tables(scenario, leaving_factor),
         prior={factor.name: factor.prior for factor in scenario.state},
     )
 

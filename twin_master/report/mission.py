@@ -154,14 +154,24 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
 def _panels_in_columns(run: Run, sensors: Sequence[int]) -> tuple[list[Panel], list[Panel]]:
     """Return the panels of the left and of the right column, from top to bottom.
 
-    States and control stand on the left, sensors on the right; rewards fill the shorter column.
+    State factors and the control stand on the left, sensors on the right. The rewards are added one
+    by one to the column that is the shorter one then.
     """
-    left_column: list[Panel] = [partial(_draw_state, factor) for factor in range(len(run.factors))]
+    left_column: list[Panel] = []
+    for factor_index in range(len(run.factors)):
+        left_column.append(partial(_draw_state, factor_index))
     left_column.append(_draw_control)
-    right_column: list[Panel] = [partial(_draw_sensor, sensor) for sensor in sensors]
-    for reward in range(len(REWARD_NAMES)):
-        shorter_column = left_column if len(left_column) <= len(right_column) else right_column
-        shorter_column.append(partial(_draw_reward, reward))
+
+    right_column: list[Panel] = []
+    for sensor_index in sensors:
+        right_column.append(partial(_draw_sensor, sensor_index))
+
+    for reward_index in range(len(REWARD_NAMES)):
+        reward_panel = partial(_draw_reward, reward_index)
+        if len(left_column) <= len(right_column):
+            left_column.append(reward_panel)
+        else:
+            right_column.append(reward_panel)
     return left_column, right_column
 
 

@@ -36,8 +36,8 @@ def opening_sentences(run: Run) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class _Switch:
-    """The level of a state factor from which on the policy chooses another control than the first.
+class _PolicySwitch:
+    """The level of a state factor from which on the policy leaves the initial control.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class _Switch:
     level : str
         The level with its unit, and whether the true value that is nearest to it is smaller.
     is_always_reached : bool
-        Whether the level is the lowest, so that the policy leaves the first control in every state.
+        Whether the level is the lowest, so that every state calls for another control.
     """
 
     factor: str
@@ -57,15 +57,15 @@ class _Switch:
 def _decision_sentence(run: Run) -> str:
     """Return the sentence on the flown controls, and on the delay from the damage to the fallback.
 
-    A fallback is the change from the first control after the true state has reached the level at
-    which the policy leaves it.
+    A fallback is the change from the initial control, that of the first step, after the true state
+    has reached the level at which the policy leaves it.
     """
-    first_control = run.controls[int(run.control_index[0])]
+    initial_control = run.controls[int(run.control_index[0])]
     if len(run.controls) == 1:
-        return f"There was one control, {first_control}, and nothing to decide."
+        return f"There was one control, {initial_control}, and nothing to decide."
     fallback = _fallback(run)
-    switch = _switch(run, fallback)
-    fell_back = fallback.fallback_step is not None and fallback.early_step is None
+    switch = _policy_switch(run, fallback)
+    fell_back = fallback.fallback_step is not None and fallback.early_change_step is None
     if fell_back and switch is not None and not switch.is_always_reached:
         sentence = _fallback_clause(run, fallback, switch)
     else:
@@ -90,20 +90,21 @@ def _fallback(run: Run) -> Fallback:
     )
 
 
-def _switch(run: Run, fallback: Fallback) -> _Switch | None:
-    """Return the level at which the policy leaves the first control; None if there is none."""
-    if fallback.switch_state is None or fallback.switch_level is None:
+def _policy_switch(run: Run, fallback: Fallback) -> _PolicySwitch | None:
+    """Return the level at which the policy leaves the initial control; None if there is none."""
+    if fallback.switch_factor is None or fallback.switch_level is None:
         return None
-    factor_index = run.scenario.state_names.index(fallback.switch_state)
+    factor_index = run.scenario.state_names.index(fallback.switch_factor)
     factor = run.factors[factor_index]
     level = factor.scale * fallback.switch_level
     level_text = f"{level:.4g} {factor.unit}".rstrip()
-    if fallback.called_for_step is not None and run.true_state is not None:
-        true_value = run.true_state[fallback.called_for_step, factor_index]
+    step = fallback.step_at_switch_level
+    if step is not None and run.true_state is not None:
+        true_value = run.true_state[step, factor_index]
         slack = run.model.states.factors[factor_index].slack
         if true_value < fallback.switch_level - slack:
             level_text += " (to the nearest level)"
-    return _Switch(
+    return _PolicySwitch(
         factor=_with_article(factor.title),
         level=level_text,
         is_always_reached=level <= factor.levels[0],
@@ -120,15 +121,15 @@ def _changes_of_control(run: Run) -> str:
     return control_changes(run.controls, run.control_index, run.step_word, run.first_step)
 
 
-def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
+def _fallback_clause(run: Run, fallback: Fallback, switch: _PolicySwitch) -> str:
     """Return the clause on the step of the fallback and on the delay from the damage to it."""
     row = fallback.fallback_step
     assert row is not None
     if np.count_nonzero(np.diff(run.control_index)) == 1:
-        first_control = run.controls[int(run.control_index[0])]
+        initial_control = run.controls[int(run.control_index[0])]
         new_control = run.controls[int(run.control_index[row])]
         fell_back = (
-            f"{_subject(run)} fell back from {first_control} to {new_control} "
+            f"{_subject(run)} fell back from {initial_control} to {new_control} "
             f"at {run.step_word} {run.first_step + row},"
         )
     else:
@@ -146,21 +147,29 @@ def _control_clause(run: Run) -> str:
     return f"{_subject(run)} kept {control} at every {run.step_word}"
 
 
-def _switch_clause(run: Run, fallback: Fallback, switch: _Switch | None) -> str:
-    """Return the clause on the step in which the damage called for another control.
+def _switch_clause(run: Run, fallback: Fallback, switch: _PolicySwitch | None) -> str:
+    """Return the clause on the step in which the damage reached the level of another control.
 
-    It is empty if the policy has no level at which it leaves the first control.
+    The clause depends on the policy, where 2g is the initial control:
+
+    - It has no level at which it leaves 2g: the clause is empty.
+    - It leaves 2g at every level: "; the policy leaves 2g in every state".
+    - The true state stays below the level: "; the stiffness loss of region 1 never reached the 60 %
+      from which the policy leaves 2g".
+    - The true state reaches it: "; the stiffness loss of region 1 reached the 60 % from which the
+      policy leaves 2g at step 30".
     """
     if switch is None:
         return ""
-    first_control = run.controls[int(run.control_index[0])]
+    initial_control = run.controls[int(run.control_index[0])]
     if switch.is_always_reached:
-        return f"; the policy leaves {first_control} in every state"
-    level = f"the {switch.level} from which the policy leaves {first_control}"
-    if fallback.called_for_step is None:
+        return f"; the policy leaves {initial_control} in every state"
+    level = f"the {switch.level} from which the policy leaves {initial_control}"
+    if fallback.step_at_switch_level is None:
         return f"; {switch.factor} never reached {level}"
-    step = run.first_step + fallback.called_for_step
-    return f"; {switch.factor} reached {level} at {run.step_word} {step}"
+    # The steps of a fallback count from the first step of the run, those of the report from 0.
+    step_number = run.first_step + fallback.step_at_switch_level
+    return f"; {switch.factor} reached {level} at {run.step_word} {step_number}"
 
 
 def _unheeded_requests(run: Run) -> int:

@@ -69,17 +69,24 @@ def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | Non
     if design is None or len(design.gauges.positions) != scenario.observation.count:
         return None
     # The factors z1, z2, ... of a state are the stiffness losses of the defects in their order.
-    regions = {}
+    region_of_factor = {}
     for number, defect in enumerate(design.defects, start=1):
         span = (defect.span_start, defect.span_end)
-        regions[f"z{number}"] = _wing_panel(design, span, (defect.chord_start, defect.chord_end))
-    names = scenario.state_names
-    # A scenario with any other factor gets no regions.
-    has_regions_as_states = {*names} <= {*regions}
+        chord = (defect.chord_start, defect.chord_end)
+        region_of_factor[f"z{number}"] = _wing_panel(design, span, chord)
+    regions: tuple[Float, ...] = ()  # if the scenario has any other factor
+    if all(name in region_of_factor for name in scenario.state_names):
+        regions = tuple(region_of_factor[name] for name in scenario.state_names)
+
+    whole_span = (0.0, design.planform.semi_span)
+    whole_chord = (0.0, 1.0)
+    gauge_points = []
+    for span_position, chord_fraction in design.gauges.positions:
+        gauge_points.append(_wing_point(design, span_position, chord_fraction))
     return Planform(
-        outline=_wing_panel(design, (0.0, design.planform.semi_span), (0.0, 1.0)),
-        regions=tuple(regions[name] for name in names) if has_regions_as_states else (),
-        gauges=np.array([_wing_point(design, *position) for position in design.gauges.positions]),
+        outline=_wing_panel(design, whole_span, whole_chord),
+        regions=regions,
+        gauges=np.array(gauge_points),
     )
 
 

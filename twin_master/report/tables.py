@@ -191,11 +191,18 @@ def calibrated_figures(record: JsonRecord) -> list[JsonRecord]:
     """Return the figures in the record of a calibration: parameters first, then quantities.
 
     Empty if the run was not calibrated from a file.
+
+    Parameters
+    ----------
+    record : mapping
+        The record in `calibration.json`. Its table `state` has a figure for each parameter, its
+        table `quantities` one for each derived quantity. JSON does not preserve their order, which
+        `correlation.names` and `names.quantities` give.
     """
-    parameters = record.get("correlation", {}).get("names", ())
-    quantities = record.get("names", {}).get("quantities", ())
-    figures = [record["state"][name] for name in parameters]
-    figures += [record["quantities"][name] for name in quantities]
+    parameter_names = record.get("correlation", {}).get("names", ())
+    quantity_names = record.get("names", {}).get("quantities", ())
+    figures = [record["state"][name] for name in parameter_names]
+    figures += [record["quantities"][name] for name in quantity_names]
     return figures
 
 

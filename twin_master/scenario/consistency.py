@@ -124,7 +124,7 @@ class ScenarioTables(Section):
         return tuple(control.name for control in self.control)
 
     @property
-    def readings(self) -> tuple[InspectionReading, ...]:
+    def inspection_readings(self) -> tuple[InspectionReading, ...]:
         """The quantities that inspections read, in the order of the actions of the scenario.
 
         In the record of a mission, the row of each step holds the values of the sensors and then
@@ -346,7 +346,7 @@ class ScenarioTables(Section):
             )
             return
         yield (
-            bool(self.readings),
+            bool(self.inspection_readings),
             "`observation.modes` does not go together with actions that inspect: leave one of "
             "them out",
         )

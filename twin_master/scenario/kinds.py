@@ -1,8 +1,9 @@
 """Tables of a scenario that name files, and the two tables whose `kind` decides what they hold.
 
 What flies (`asset`) and what the twin believes (`belief`) are each one of several kinds. A kind is
-one class in one file: a subclass of `AssetSection` or `BeliefSection` in a file whose name ends in
-`_source`, beside `assets/asset_source.py`. Its fields are the keys that a user writes; its method
+the value of `kind` in such a table, which selects the class that reads the table: a subclass of
+`AssetSection` or `BeliefSection` in a file whose name ends in `_source`, beside
+`assets/asset_source.py`. Its fields are the keys that a user writes; its method
 `source` makes of them what the mission needs. No other code names the kinds. An installed package
 adds a kind by an entry point for such a class.
 """
@@ -121,12 +122,13 @@ class KindSection(FileSection):
         Raises
         ------
         PlugInError
-            If a kind of an installed package cannot be loaded, or does not fit.
+            If a section class of an installed package cannot be imported, or is refused by
+            `import_installed_kinds`.
         """
         for module in iter_modules([str(KIND_FOLDER)]):
             if module.name.endswith("_source"):
                 import_module(f"{KIND_PACKAGE}.{module.name}")
-        check_installed_kinds(cls)
+        import_installed_kinds(cls)
         kinds = {}
         for subclass in _all_subclasses(cls):
             kind = subclass.kind_of_class()
@@ -141,23 +143,23 @@ class KindSection(FileSection):
         return kind if isinstance(kind, str) else None
 
     @classmethod
+    def is_shipped_kind(cls) -> bool:
+        """Return whether uav-twin itself defines this class, and no other package."""
+        return cls.__module__.startswith(KIND_PACKAGE)
+
+    @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> Table:
         """Return the JSON Schema of a kind, or that of all kinds for a base class."""
         kind = cls.kind_of_class()
         if kind is None:
-            kinds = []
+            schemas = []
             for name, subclass in sorted(cls.kinds().items()):
-                is_shipped = subclass.__module__.startswith(KIND_PACKAGE)
-                if is_shipped and name != WATCHED_KIND:  # users write no such table
-                    kinds.append(subclass)
-            return {
-                "oneOf": [
-                    kind.__get_pydantic_json_schema__(kind.__pydantic_core_schema__, handler)
-                    for kind in kinds
-                ]
-            }
+                if subclass.is_shipped_kind() and name != WATCHED_KIND:  # users write no such table
+                    core = subclass.__pydantic_core_schema__
+                    schemas.append(subclass.__get_pydantic_json_schema__(core, handler))
+            return {"oneOf": schemas}
         schema = super().__get_pydantic_json_schema__(core_schema, handler)
         table = handler.resolve_ref_schema(schema)
         if "properties" in table:
@@ -246,38 +248,46 @@ class AssetSection(KindSection):
 
 
 @cache
-def check_installed_kinds(base: type[KindSection]) -> None:
-    """Load the kinds of installed packages, once in a process, and refuse what does not fit.
+def import_installed_kinds(base: type[KindSection]) -> None:
+    """Import the section classes that installed packages add, and check them.
+
+    An imported class is a subclass of `base` from then on, so that `KindSection.kinds` finds it.
+    The result is cached: the entry points are read once in a process for each base class.
 
     Parameters
     ----------
     base : type
-        `AssetSection` or `BeliefSection`. The classes that are loaded are subclasses of it.
+        `AssetSection` or `BeliefSection`.
 
     Raises
     ------
     PlugInError
-        If two entry points have the same name, if one cannot be loaded, or if one is not a class
-        for its kind or has a kind of uav-twin.
+        If two entry points have the same name, if one cannot be imported, if it is not a subclass
+        of `base`, if its kind is one that uav-twin itself defines, or if the name of the entry
+        point is not its kind.
     """
-    own_kinds = []
+    shipped_kinds = []
     for subclass in _all_subclasses(base):
-        if subclass.__module__.startswith(KIND_PACKAGE):
-            own_kinds.append(subclass.kind_of_class())
-    for plug_in in load_plug_ins(base.entry_point_group):
-        section = plug_in.value
-        if not (isinstance(section, type) and issubclass(section, base)):
+        if subclass.is_shipped_kind():
+            shipped_kinds.append(subclass.kind_of_class())
+    for plug_in in load_plug_ins(base.entry_point_group):  # refuses equal names, and imports
+        section_class = plug_in.value
+        if not (isinstance(section_class, type) and issubclass(section_class, base)):
             raise PlugInError(
-                f"{plug_in.subject} must be a subclass of {base.__name__}, but is {section!r}."
+                f"{plug_in.subject} must be a subclass of {base.__name__}, but is "
+                f"{section_class!r}."
             )
-        kind = section.kind_of_class()
-        if kind in own_kinds:
+        kind = section_class.kind_of_class()
+        if kind in shipped_kinds:
             raise PlugInError(
-                f"{plug_in.subject} has the kind {kind!r}, which uav-twin has itself: choose "
+                f"{plug_in.subject} has the kind {kind!r}, which uav-twin itself defines: choose "
                 "another `kind`."
             )
         if kind != plug_in.name:
-            raise PlugInError(f"{plug_in.subject} has another name than its kind, {kind!r}.")
+            raise PlugInError(
+                f"{plug_in.subject} is registered as {plug_in.name!r}, but its kind is {kind!r}: "
+                "make the two equal."
+            )
 
 
 def _all_subclasses(cls: type[_Section]) -> Iterator[type[_Section]]:

@@ -140,7 +140,9 @@ class ModesSection(Section):
         (..., G) array
             The G observed features.
         """
-        return values[..., self.feature_indices].reshape(*values.shape[:-2], -1)
+        leading_axes = values.shape[:-2]
+        observed_by_mode = values[..., self.feature_indices]  # (..., M, observed features)
+        return observed_by_mode.reshape(*leading_axes, -1)
 
     def observed_covariance(self, mode_covariances: Float) -> Float:
         """Return the covariance (G, G) of the G observed features of all modes.
@@ -152,12 +154,13 @@ class ModesSection(Section):
         mode_covariances : (M, 1 + A, 1 + A) array
             The covariance of all features of each of the M modes.
         """
-        feature_count = len(self.feature_indices)
-        covariance = np.zeros((len(mode_covariances) * feature_count,) * 2)
+        features_per_mode = len(self.feature_indices)
+        feature_count = len(mode_covariances) * features_per_mode  # G
+        covariance = np.zeros((feature_count, feature_count))
         observed_block = np.ix_(self.feature_indices, self.feature_indices)
         for mode, mode_covariance in enumerate(mode_covariances):
-            rows = slice(mode * feature_count, (mode + 1) * feature_count)
-            covariance[rows, rows] = mode_covariance[observed_block]
+            of_mode = slice(mode * features_per_mode, (mode + 1) * features_per_mode)
+            covariance[of_mode, of_mode] = mode_covariance[observed_block]
         return covariance
 
 

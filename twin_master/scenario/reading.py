@@ -219,7 +219,7 @@ def obstacle_to_notices(scenario: Scenario) -> str:
     observation = scenario.observation
     if observation.modes is not None:
         return "observations of modes have a covariance of their own"
-    if scenario.readings:
+    if scenario.inspection_readings:
         return "a scenario with inspections asks for them by `[notice]`"
     if observation.average_over_draws == "inside":
         return (

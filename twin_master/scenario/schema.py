@@ -46,7 +46,7 @@ class Scenario(ScenarioTables):
     @property
     def row_width(self) -> int:
         """The length of the row of observations of a step."""
-        return self.observation.width + len(self.readings)
+        return self.observation.width + len(self.inspection_readings)
 
     def ends(self, control_index: int) -> bool:
         """Return whether the mission ends with a step under a control."""

@@ -114,16 +114,24 @@ class Section(toml_file.Section):
 
     @classmethod
     def _check_required_keys(cls, table: Mapping[str, object]) -> None:
-        """Refuse a table that lacks a required key which may carry a unit.
+        """Refuse a table that lacks a required key, if a missing key may carry a unit.
 
-        Pydantic refuses a table without any other required key. It does not know the units, which
-        the message here names.
+        Otherwise Pydantic refuses the table. It does not know the units, which the message here
+        names: `levels[_percent]`.
+
+        Parameters
+        ----------
+        table : mapping of str to object
+            The table, with keys without their units.
         """
-        required = [name for name, field in cls.model_fields.items() if field.is_required()]
-        missing_names = [name for name in required if name not in table]
-        if any(name in cls.units for name in missing_names):
-            documented = [cls._documented_key(name) for name in missing_names]
-            raise missing_keys(documented, f"`{documented[0]}` is missing")
+        missing = []
+        for key, field in cls.model_fields.items():
+            if field.is_required() and key not in table:
+                missing.append(key)
+        may_carry_unit = any(key in cls.units for key in missing)
+        if may_carry_unit:
+            documented_keys = [cls._documented_key(key) for key in missing]
+            raise missing_keys(documented_keys, f"`{documented_keys[0]}` is missing")
 
     @classmethod
     def _documented_key(cls, name: str) -> str:
@@ -304,7 +312,7 @@ def incomplete_table_fault(
 
 
 def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
-    """Return the factor from the stored to the printed values of a state factor, and their unit.
+    """Return the ratio of printed to stored values of a state factor, and the printed unit.
 
     Parameters
     ----------
@@ -313,4 +321,6 @@ def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
     percent : str
         The printed unit of percentages.
     """
-    return (100.0, percent) if unit == "1" else (1.0, unit)
+    if unit == "1":
+        return 100.0, percent
+    return 1.0, unit

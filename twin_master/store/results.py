@@ -20,7 +20,7 @@ from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 SchemaFields = Mapping[str, str]
-"""The values of the fields in braces of the schema."""
+"""The words that take the place of the fields in braces of the schema, the file `run.toml`."""
 _NO_FIELDS: SchemaFields = MappingProxyType({})
 
 
@@ -42,10 +42,11 @@ class Entry(NamedTuple):
     fields: SchemaFields = _NO_FIELDS
 
 
-_DECIDED_ON = {
+_BELIEF_OF_DECISION = {
     "filtered": "the filtered belief of the step",
     "predicted": "the belief predicted for the next step",
 }
+"""The words for each value of `planner.decide_on`."""
 _MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 
@@ -62,10 +63,10 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
         "action_value": plan.action_value,
         "value": plan.value,
     }
-    groups["policy"] = builder.group("policy", _entries_of(policy))
+    groups["policy"] = builder.group("policy", _plain_entries(policy))
     groups["calibration"] = builder.group(
         "calibration",
-        _entries_of({"draw_value": result.knowledge.draws.values}),
+        _plain_entries({"draw_value": result.knowledge.draws.values}),
         attributes={"parameter": result.scenario.calibration.parameter},
     )
     if result.learnt:
@@ -77,8 +78,8 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     return groups
 
 
-def _entries_of(values: Mapping[str, ArrayLike]) -> list[Entry]:
-    """Return an entry for each variable; their names in the schema have no fields in braces."""
+def _plain_entries(values: Mapping[str, ArrayLike]) -> list[Entry]:
+    """Return an entry for each variable whose name in the schema has no fields in braces."""
     return [Entry(name, np.asarray(array)) for name, array in values.items()]
 
 
@@ -165,7 +166,7 @@ def _coordinate_entries(result: MissionResult) -> list[Entry]:
         labels["sensor_unit"] = scenario.observation.sensor_units
     if scenario.observation.titles:
         labels["sensor_title"] = scenario.observation.titles
-    entries = _entries_of(labels)
+    entries = _plain_entries(labels)
     # A row for each state factor, a column for each state
     levels_of_states = result.knowledge.model.states.coordinates.T
     for levels, factor in zip(levels_of_states, scenario.state, strict=True):
@@ -183,8 +184,8 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
     if scenario.observation.modes is not None:
         # For identified modes the readings beside the sensors are their covariance
         yield Entry("{role}_covariance", flight.readings)
-    for index, (_control, state, name, _deviation) in enumerate(scenario.readings):
-        fields = {"reading": name, "unit": scenario.state[state].unit}
+    for index, reading in enumerate(scenario.inspection_readings):
+        fields = {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
         yield Entry("{reading}", flight.readings[:, index], fields)
     for name in sorted(scenario.control[0].values):  # config.json does not preserve their order
         value_of_control = np.array([control.values[name] for control in scenario.control])
@@ -197,23 +198,28 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     flight = result.flight
     expectation = _expected_in_flight(result, flight.filtered, is_smoothed=False)
     values = _belief_variables(result, flight.filtered, expectation)
-    values["noise_standard_deviation"] = expectation.noise
+    values["noise_standard_deviation"] = expectation.noise_standard_deviation
     values["decision_probability"] = flight.decision_probability
     values["log_evidence"] = flight.log_evidence
-    values["residual"] = (flight.observed - expectation.mean) / expectation.noise
+    residual = flight.observed - expectation.mean
+    values["residual"] = residual / expectation.noise_standard_deviation
     values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
-    # The belief on which the next control is decided; a plan over beliefs uses the predicted one
-    decided_on = result.scenario.planner.decide_on
-    if result.knowledge.plan.on_belief is not None:
-        decided_on = "predicted"
-    is_assumed = result.knowledge.learning is None
+    # The fields complete descriptions of the schema, such as
+    #   "p(state | {given})",
+    #   "policy averaged over {decided_on}; its mode is the control of the next step",
+    #   "observation minus its filtered mean, in the standard deviations {how}".
+    belief_of_decision = result.scenario.planner.decide_on
+    plans_over_beliefs = result.knowledge.plan.on_belief is not None
+    if plans_over_beliefs:  # such a plan always decides by the predicted belief
+        belief_of_decision = "predicted"
+    learns = result.knowledge.learning is not None
     fields = {
         "lead": "step",
         "given": "observations up to the step",
-        "decided_on": _DECIDED_ON[decided_on],
-        "how": "that the twin assumes" if is_assumed else "that the twin has learnt",
+        "decided_on": _BELIEF_OF_DECISION[belief_of_decision],
+        "how": "that the twin has learnt" if learns else "that the twin assumes",
     }
-    return builder.group("filtered", _entries_of(values), fields)
+    return builder.group("filtered", _plain_entries(values), fields)
 
 
 def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
@@ -222,7 +228,7 @@ def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     expectation = _expected_in_flight(result, smoothed_belief, is_smoothed=True)
     values = _belief_variables(result, smoothed_belief, expectation)
     fields = {"lead": "step", "given": "all observations"}
-    return builder.group("smoothed", _entries_of(values), fields)
+    return builder.group("smoothed", _plain_entries(values), fields)
 
 
 def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
@@ -248,7 +254,7 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
         "lead": "step horizon",
         "given": "observations up to the step, through the policy",
     }
-    return builder.group("predicted", _entries_of(values), fields)
+    return builder.group("predicted", _plain_entries(values), fields)
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
@@ -319,7 +325,7 @@ def _notice_entries(result: MissionResult) -> list[Entry]:
     for name in SCHEMA["notice"]:
         values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
     values["left_out"] = values["left_out"].astype(np.int8)
-    return _entries_of(values)
+    return _plain_entries(values)
 
 
 def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:
@@ -408,10 +414,10 @@ class _TableMaker:
         probability = filtered_group["decision_probability"].values
         columns = dict(self.steps)
         columns["control"] = self.controls[observed_group["control_index"].values]
-        columns |= _columns(
-            "{}_reward", filtered_group["reward"].values, filtered_group["reward_mean"].values
-        )
-        columns |= _columns("decision_probability_{}", self.controls, probability)
+        reward_names = filtered_group["reward"].values
+        reward_means = filtered_group["reward_mean"].values
+        columns |= _named_columns("{}_reward", reward_names, reward_means)
+        columns |= _named_columns("decision_probability_{}", self.controls, probability)
         columns["next_control"] = self.controls[probability.argmax(axis=1)]
         return columns
 
@@ -423,7 +429,8 @@ class _TableMaker:
             factor, unit = self._printed_state(region)
             columns[f"{region}_{unit}"] = factor * policy[region].values
         columns["control"] = self.controls[policy["control_index"].values]
-        columns |= _columns("action_value_{}", self.controls, policy["action_value"].values)
+        action_value = policy["action_value"].values
+        columns |= _named_columns("action_value_{}", self.controls, action_value)
         return columns
 
 
@@ -456,19 +463,23 @@ def csv_tables(
     return texts
 
 
-def _columns(heading: str, names: Iterable[str], values: AnyArray) -> Columns:
-    """Return the N columns of an array (T, N), each under its heading.
+def _named_columns(heading_template: str, names: Iterable[str], values: AnyArray) -> Columns:
+    """Return the N columns of an array of R rows, each under its heading.
 
     Parameters
     ----------
-    heading : str
-        A template of the headings, with braces for the name of a column.
+    heading_template : str
+        The heading of every column, with `{}` in the place of its name: "action_value_{}".
     names : iterable of str
         The N names.
-    values : (T, N) array
+    values : (R, N) array
         The values of the columns.
     """
-    return {heading.format(name): column for name, column in zip(names, values.T, strict=True)}
+    columns = {}
+    for name, column in zip(names, values.T, strict=True):
+        heading = heading_template.format(name)
+        columns[heading] = column
+    return columns
 
 
 def _cells(values: AnyArray) -> list[str]:

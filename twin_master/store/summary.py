@@ -85,33 +85,36 @@ class Fallback:
 
     Attributes
     ----------
-    switch_state : str or None
-        The one state factor that the policy depends on; None if it depends on several or on none.
+    switch_factor : str or None
+        The name of the one state factor that the policy depends on; None if it depends on several
+        or on none.
     switch_level : float or None
-        The level of this factor, SI, from which on the policy leaves the first control.
+        The level of this factor, SI, from which on the policy leaves the initial control, that of
+        the first step.
     switch_control : int or None
         The index of the control that the policy takes there; None if it takes several.
-    called_for_step : int or None
-        The first step in which that level, or a higher one, is the nearest to the true state.
+    step_at_switch_level : int or None
+        The first step in which that level, or a higher one, is the nearest to the true state: from
+        then on the policy calls for another control.
     fallback_step : int or None
         The first step from then on that is flown with another control.
-    early_step : int or None
+    early_change_step : int or None
         The first step before then that is flown with another control.
     """
 
-    switch_state: str | None = None
+    switch_factor: str | None = None
     switch_level: float | None = None
     switch_control: int | None = None
-    called_for_step: int | None = None
+    step_at_switch_level: int | None = None
     fallback_step: int | None = None
-    early_step: int | None = None
+    early_change_step: int | None = None
 
     @property
     def delay(self) -> int | None:
         """The number of steps from the damage that calls for the fallback to the fallback."""
-        if self.fallback_step is None or self.called_for_step is None:
+        if self.fallback_step is None or self.step_at_switch_level is None:
             return None
-        return self.fallback_step - self.called_for_step
+        return self.fallback_step - self.step_at_switch_level
 
 
 def find_fallback(
@@ -121,10 +124,11 @@ def find_fallback(
     control_index: Index,
     true_state: Float,
 ) -> Fallback:
-    """Return when the policy calls for another control than the first one, and when it was flown.
+    """Return when the policy calls for another control than the initial one, and when it is flown.
 
     A level of the policy stands for all true values that are nearest to it. So the true state calls
     for another control from the middle between the two levels on between which the policy changes.
+    All steps are counted from the first step of the run.
 
     T is the number of steps, S the number of states, and F the number of state factors.
 
@@ -147,19 +151,21 @@ def find_fallback(
     factor = states.factors[switch.factor_index]
     # `slack` lets a true value count as its level if it differs by rounding only
     is_called_for = true_state[:, switch.factor_index] >= switch.least_value - factor.slack
-    called_for_step = _first_true(is_called_for)
+    step_at_switch_level = _first_true(is_called_for)
     has_left = control_index != first_control
     is_at_level = states.coordinates[:, switch.factor_index] >= switch.level - factor.slack
     controls_at_level = np.unique(policy_index[is_at_level]).tolist()
     steps = len(control_index)
-    is_before_call = np.arange(steps) < (steps if called_for_step is None else called_for_step)
+    is_before_call = np.ones(steps, dtype=bool)  # if the level is never reached
+    if step_at_switch_level is not None:
+        is_before_call = np.arange(steps) < step_at_switch_level
     return Fallback(
         factor.name,
         switch.level,
         switch_control=controls_at_level[0] if len(controls_at_level) == 1 else None,
-        called_for_step=called_for_step,
+        step_at_switch_level=step_at_switch_level,
         fallback_step=_first_true(has_left & ~is_before_call),
-        early_step=_first_true(has_left & is_before_call),
+        early_change_step=_first_true(has_left & is_before_call),
     )
 
 
@@ -515,18 +521,18 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     """
     level = fallback.switch_level
     first_control = scenario.mission.first_control
-    if fallback.switch_state is None or level is None:
+    if fallback.switch_factor is None or level is None:
         return FigureGroup(
             "nowhere", {"first": first_control}, ["none, or it depends on several states"]
         )
-    factor = scenario.state[scenario.state_names.index(fallback.switch_state)]
+    factor = scenario.state[scenario.state_names.index(fallback.switch_factor)]
     scale, unit = printed_state(factor.unit)
     new_control = "another control"
     if fallback.switch_control is not None:
         new_control = scenario.control_names[fallback.switch_control]
     fallback_step = fallback.fallback_step
     delay = fallback.delay
-    if fallback.early_step is not None and delay == 0:
+    if fallback.early_change_step is not None and delay == 0:
         # The other control was in force before the damage: this is not a fallback from it.
         fallback_step = None
         delay = None
@@ -542,10 +548,10 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     }
     values = [
         scale * level,
-        fallback.called_for_step,
+        fallback.step_at_switch_level,
         fallback_step,
         delay,
-        fallback.early_step,
+        fallback.early_change_step,
     ]
     return FigureGroup("fallback", fields, values)
 

@@ -280,7 +280,7 @@ class FlightPage:
         reward_margin = NORMAL_95 * expectation.reward_standard_deviation
         sensor_mean = expectation.mean
         # The uncertain state and the noise are independent: their variances add up
-        deviation = np.hypot(expectation.standard_deviation, expectation.noise)
+        deviation = np.hypot(expectation.standard_deviation, expectation.noise_standard_deviation)
         if self._shows_deviations:
             if observations is not None:
                 observations = (observations - sensor_mean) / deviation

@@ -147,11 +147,11 @@ class Intake:
         self._previous_unreadable: set[int] = set()  # sensors, before the last reading
         self._previous_stream_state: JsonObject = {}
 
-        # Counts: of the watch, and of the messages of this process
+        # Counts: of the watch, and of the messages of this process, without those of earlier ones
         self.counts = Counts()
         self._rejected = RejectedFile(rejected)
-        self._received_here = 0
-        self._with_readings_here = 0
+        self._messages_received = 0
+        self._messages_with_readings = 0
 
         # Progress and end
         self.observation_step = -1
@@ -310,7 +310,7 @@ class Intake:
         if message is None:
             return False
         self.counts.received += 1
-        self._received_here += 1
+        self._messages_received += 1
         self._previous_position = self._position
         self._position = self._feed.position
         step: int | None = None
@@ -385,7 +385,7 @@ class Intake:
         """
         is_blind = bool(np.isnan(reading.observed).all())
         if not is_blind:
-            self._with_readings_here += 1
+            self._messages_with_readings += 1
         ignored = reading.ignored if isinstance(reading, Message) else {}
         if reading.revises is not None:  # a late message does not show how the sensors are now
             is_blind = self.stream.is_blind
@@ -394,22 +394,28 @@ class Intake:
     def complaint(self) -> str:
         """Return a sentence that says why the messages of this process were of no use.
 
-        The sentence is empty if no message came, or if they were of use: if at least one message
-        had the reading of a sensor, and fewer than `REFUSALS_IN_A_ROW` were refused at the end.
+        The first of these cases that holds decides:
+
+        - If no message came, the sentence is empty.
+        - If the last messages were refused, and these are `REFUSALS_IN_A_ROW` or more or no other
+          message had a reading, it names the last reason.
+        - If no message had the reading of a sensor, it says so.
+        - Otherwise it is empty: the messages were of use.
         """
-        received_messages = counted(self._received_here, "message")
-        refused_in_a_row = self.stream.refused_in_a_row
-        has_no_readings = self._with_readings_here == 0
-        if not self._received_here:
+        if self._messages_received == 0:
             return ""
-        if refused_in_a_row and (refused_in_a_row >= REFUSALS_IN_A_ROW or has_no_readings):
+        received_phrase = counted(self._messages_received, "message")  # "5 messages"
+        has_no_readings = self._messages_with_readings == 0
+        refused_at_end = self.stream.refused_in_a_row
+        are_too_many_refused = refused_at_end >= REFUSALS_IN_A_ROW
+        if refused_at_end > 0 and (are_too_many_refused or has_no_readings):
             return (
-                f"The watch ended while messages were refused: the last {refused_in_a_row} of "
-                f"{received_messages}, the last one because {self.stream.last_reason}."
+                f"The watch ended while messages were refused: the last {refused_at_end} of "
+                f"{received_phrase}, the last one because {self.stream.last_reason}."
             )
         if has_no_readings:
             return (
-                f"None of {received_messages} has a reading of any {self._words.sensor}: the "
+                f"None of {received_phrase} has a reading of any {self._words.sensor}: the "
                 "belief follows the transitions alone."
             )
         return ""
@@ -463,7 +469,7 @@ class Intake:
         # Undo what was noted when the message was accepted
         self.stream.restore(self._previous_stream_state)
         self._unreadable = self._previous_unreadable
-        self._with_readings_here -= 1
+        self._messages_with_readings -= 1
         self._refuse(str(error), self.observation_step)
         # Only the notice that two times disagree still holds
         self.notices = [notice for notice in self.notices if notice.kind == "clock"]
@@ -557,7 +563,7 @@ class Intake:
         merged_row = np.where(np.isnan(row), message.observed, row)
         if not has_other_control and np.array_equal(merged_row, row, equal_nan=True):
             self.counts.duplicates += 1
-            self._with_readings_here += 1  # a duplicate has readings, too
+            self._messages_with_readings += 1  # a duplicate has readings, too
             return
         self._row_before_revision = row
         revision = replace(message, observed=merged_row, revises=step)

@@ -163,9 +163,9 @@ class MessageReader:
             self._largest_values.append(LARGEST_STRAIN if is_strain else LARGEST_VALUE)
 
         # Readings of inspections, which follow the sensors in a row
-        for index, (_, state, name, _) in enumerate(scenario.readings):
-            self._sensor_of_name[name] = count + index
-            self._units.append(scenario.state[state].unit)
+        for index, reading in enumerate(scenario.inspection_readings):
+            self._sensor_of_name[reading.name] = count + index
+            self._units.append(scenario.state[reading.state_index].unit)
             self._largest_values.append(LARGEST_VALUE)
 
         # A stream repeats the same names in each message

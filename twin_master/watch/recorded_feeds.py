@@ -177,9 +177,10 @@ class RunFeed(RecordedFeed):
         records: list[JsonObject] = []
         for row, step in zip(rows, group["step"].values.tolist(), strict=True):
             records.append({role: row, "step": int(step)})
-        for _, _, name, _ in self.scenario.readings:
-            if name in group:
-                _add_finite_values(records, name, group[name].values.tolist())
+        for reading in self.scenario.inspection_readings:
+            if reading.name in group:
+                values = group[reading.name].values.tolist()
+                _add_finite_values(records, reading.name, values)
         covariance = group.get(f"{role}_covariance")  # of modes
         if covariance is not None:
             for record, triangle in zip(records, covariance.values, strict=False):

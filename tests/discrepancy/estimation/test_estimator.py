@@ -105,8 +105,8 @@ def test_the_simpler_forms_of_a_pair_keep_its_values(friction, number):
     other = 1 - number
     alone, canonical = forms[number], forms[2 + number]
     assert alone.candidate.terms == (terms[other],)
-    np.testing.assert_array_equal(alone.effect, values[other])
+    np.testing.assert_array_equal(alone.parameters, values[other])
     assert [term.free_shape for term in canonical.candidate.terms] == [number == 1, number == 0]
     kept = list(values)
     kept[number] = values[number][: len(terms[number].effect.parameters)]
-    np.testing.assert_array_equal(canonical.effect, np.concatenate(kept))
+    np.testing.assert_array_equal(canonical.parameters, np.concatenate(kept))

@@ -530,7 +530,7 @@ def test_each_twin_with_growing_damage_flies_what_it_flies_alone(library_file):
 
 
 def test_each_twin_with_a_transition_of_each_region_flies_what_it_flies_alone(library_file, monkeypatch):
-    monkeypatch.setattr("twin_master.network.transition.JOINT_NON_ZEROS", 0)
+    monkeypatch.setattr("twin_master.network.transition.MAX_JOINT_NON_ZEROS", 0)
     knowledge, asset = known("growing_damage", library_file)
     side = flown_side_by_side(knowledge, asset)
     assert knowledge.model.transition.is_product is True

@@ -197,7 +197,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
             mean, deviation = moments(shown, weight)
             np.testing.assert_allclose(found.mean[t], mean, atol=1e-8)
             np.testing.assert_allclose(found.standard_deviation[t], deviation, atol=1e-8)
-            np.testing.assert_allclose(found.noise[t], [0.7, 1.1])
+            np.testing.assert_allclose(found.noise_standard_deviation[t], [0.7, 1.1])
             health = rewards.health_per_draw[:, :, CONTROLS[t]].T[..., None]
             distance = np.ma.masked_invalid(np.abs(seen[t] - shown)).mean(axis=-1, keepdims=True)
             error = -distance.filled(np.nan) / (0.8 * np.array((2.0, 3.0))[CONTROLS[t]])
@@ -319,7 +319,7 @@ def test_the_quantity_that_is_expected_is_that_of_the_regression(regression, exp
     noise = SIGMA * np.sqrt(regression.squared_scale)
     assert expected_by_regression.mean[-1, 0] == pytest.approx(mean)
     assert expected_by_regression.standard_deviation[-1, 0] == pytest.approx(standard_deviation)
-    assert expected_by_regression.noise[-1, 0] == pytest.approx(noise)
+    assert expected_by_regression.noise_standard_deviation[-1, 0] == pytest.approx(noise)
 
 
 def test_the_reward_that_is_expected_is_that_of_a_folded_normal(regression, expected_by_regression):

@@ -77,7 +77,8 @@ def test_an_action_is_a_control():
     inspected = scenario()
     assert inspected.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
     assert inspected.control[INSPECT].values == {"load_factor": 2.0}
-    assert [reading[2:] for reading in inspected.readings] == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
+    readings = [(reading.name, reading.standard_deviation) for reading in inspected.inspection_readings]
+    assert readings == [("inspect_z1", 0.1), ("inspect_z2", 0.1)]
 
 
 def test_the_price_of_an_action_is_taken_from_the_reward_of_its_control():

@@ -102,10 +102,10 @@ MOVES = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(
 PRIOR = SPACE.certain((0.0, 0.0))
 
 
-@pytest.mark.parametrize("most", [transition_file.JOINT_NON_ZEROS, 0])
+@pytest.mark.parametrize("most", [transition_file.MAX_JOINT_NON_ZEROS, 0])
 def test_a_model_from_tables(monkeypatch, most):
     """States are in C order, and each factor moves by its own table, as one table or as many."""
-    monkeypatch.setattr(transition_file, "JOINT_NON_ZEROS", most)
+    monkeypatch.setattr(transition_file, "MAX_JOINT_NON_ZEROS", most)
     worse = [[0.9, 0.1], [0.0, 1.0]]
     three = [[0.8, 0.2, 0.0], [0.0, 0.7, 0.3], [0.0, 0.0, 1.0]]
     levels = {"a": (0.0, 0.5), "b": (0.0, 0.2, 0.4), "c": (1.0, 2.0)}

@@ -172,15 +172,15 @@ def test_a_fallback_has_a_delay_or_is_early(gentle, truth, delay, early):
     fallback = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
     *_, figures = fallback_figures(fallback, SCENARIO)
     delay_of_figure = None if early == 29 else delay
-    assert (fallback.delay, fallback.early_step) == (delay, early)
+    assert (fallback.delay, fallback.early_change_step) == (delay, early)
     assert list(figures)[3:] == [delay_of_figure, early]
 
 
 @pytest.mark.parametrize(("truth", "step"), [(TRUTH, 30), (np.zeros((50, 2)), None)])
 def test_damage_calls_for_a_fallback_at_the_level_of_the_policy(truth, step):
     fallback = find_fallback(MODEL.states, POLICY, 1, controls(), truth)
-    assert (fallback.switch_state, fallback.switch_level) == ("z1", 0.6)
-    assert fallback.called_for_step == step
+    assert (fallback.switch_factor, fallback.switch_level) == ("z1", 0.6)
+    assert fallback.step_at_switch_level == step
 
 
 def test_a_true_state_between_the_levels_calls_for_the_fallback_from_the_nearest_level_on():
@@ -191,9 +191,9 @@ def test_a_true_state_between_the_levels_calls_for_the_fallback_from_the_nearest
     states = build_graphical_model(loaded_from(table, "level_turns").scenario).states
     policy = np.where(states.coordinates[:, 0] > 0.49, 0, 1)
     found = find_fallback(states, policy, 1, controls(*range(21, 50)), TRUTH)
-    assert (found.switch_level, found.called_for_step) == (0.5, 20)
-    assert (found.delay, found.early_step) == (1, None)
-    assert find_fallback(states, policy, 1, controls(15, *range(21, 50)), TRUTH).early_step == 15
+    assert (found.switch_level, found.step_at_switch_level) == (0.5, 20)
+    assert (found.delay, found.early_change_step) == (1, None)
+    assert find_fallback(states, policy, 1, controls(15, *range(21, 50)), TRUTH).early_change_step == 15
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-13, 1e9])
@@ -207,7 +207,7 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
     scenario = loaded_from(table, "level_turns").scenario
     model, truth = build_graphical_model(scenario), scenario.scripted_history()
     np.testing.assert_allclose(truth, unit * SCENARIO.scripted_history(), rtol=1e-12)
-    assert find_fallback(model.states, POLICY, 1, controls(40), truth).called_for_step == 30
+    assert find_fallback(model.states, POLICY, 1, controls(40), truth).step_at_switch_level == 30
     belief = np.tile(model.states.certain((0.2 * unit, 0.4 * unit)), (50, 1))
     expected = in_credible_set(MODEL, belief, SCENARIO.scripted_history())
     np.testing.assert_array_equal(in_credible_set(model, belief, truth), expected)

@@ -92,7 +92,7 @@ def test_every_number_is_that_of_the_run(run):
     deviation = stored["filtered"]["quantity_standard_deviation"].values
     np.testing.assert_allclose(believed.expected.standard_deviation, deviation, rtol=1e-9)
     noise = stored["filtered"]["noise_standard_deviation"].values
-    np.testing.assert_allclose(believed.expected.noise, noise, rtol=1e-9)
+    np.testing.assert_allclose(believed.expected.noise_standard_deviation, noise, rtol=1e-9)
     np.testing.assert_array_equal(
         flight.true_states_in(flight.records_of_steps(0, STEPS)), stored["truth"]["state"].values
     )
@@ -253,7 +253,7 @@ def test_a_viewer_is_told_means_and_readings_in_printed_units(flight):
 def test_a_viewer_is_told_bands_in_printed_units(flight):
     past = told(FlightPage(flight), step=28)["past"]
     expected = of_steps(flight, 0, 29).expected
-    deviation = np.hypot(expected.standard_deviation, expected.noise)
+    deviation = np.hypot(expected.standard_deviation, expected.noise_standard_deviation)
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
     np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * deviation)
     assert np.min(past["state_lower"]) >= 0.0
