@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv, gammaln, logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation
@@ -267,6 +266,8 @@ class LearningFilter:
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_i, k | o_0..o_t) for the steps i of `carried`, which end at t: (n, K, S)."""
+        from scipy.special import logsumexp  # slow to import; only a twin that learns needs it
+
         result = np.zeros((len(carried), len(self._draw), self.model.states.size))
         if not len(carried):
             return result
@@ -358,6 +359,8 @@ class LearningFilter:
         dict of str to Learnt
             The posteriors by `noise_scale[g]`, with the gauges g counted from 1.
         """
+        from scipy.special import gammaincinv, gammaln  # slow to import, as above
+
         degrees = self._gauges.degrees
         shape = 0.5 * (degrees + count)  # (G,)
         rate = 0.5 * (degrees + fit.residual_squares)  # (K, G)

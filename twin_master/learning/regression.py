@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaln
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
@@ -186,6 +185,8 @@ class GaugeRegression:
         # normal if the noise scale is not learnt.
         log_constant: Float = np.full(len(is_present), -0.5 * np.log(2.0 * np.pi))
         if self.degrees > 0.0:
+            from scipy.special import gammaln  # slow to import; only a twin that learns needs it
+
             power = 0.5 * (self.degrees + count + 1.0)
             log_constant = gammaln(power) - gammaln(power - 0.5)
             log_constant = log_constant - 0.5 * np.log(
