@@ -11,18 +11,21 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 import numpy as np
 
 from fe.reduction.built_once import cache_folder
-from fe.runtime import dry_friction, laws, motion_arrays, motion_kernel, static_path
-from fe.runtime.motion import Kernel
 from reporting.progress import note
+
+if TYPE_CHECKING:
+    from fe.runtime.motion import Kernel
 
 try:
     import numba
     from numba.core import event
+    from numba.core.caching import FunctionCache
+    from numba.core.runtime import rtsys
     from numba.extending import overload, register_jitable
 except ModuleNotFoundError:
     numba = None
@@ -73,6 +76,7 @@ def compiled(
     with _cache_named_by_sources(source_files):
         try:
             compiled_function = numba.njit(cache=True, **OPTIONS)(function)
+            compiled_function._cache = _KeptMachineCode(function)
         except RuntimeError:  # raised by numba if it finds no folder that it can write to
             compiled_function = numba.njit(**OPTIONS)(function)
     return cast("Callable[Parameters, Result]", compiled_function)
@@ -105,6 +109,20 @@ if numba is not None:
 
     event.register("numba:compile", _CompilationNote())
 
+    class _KeptMachineCode(FunctionCache):  # type: ignore[misc]
+        """The files of a function's machine code, which are read without numba's compiler.
+
+        Before it reads machine code, numba's own cache imports all that the compiler can translate,
+        with parts of SciPy: 0.3 s in each process. Machine code needs none of it but the memory
+        management of arrays. A function that is compiled imports the rest as before.
+        """
+
+        def load_overload(self, signature: object, target_context: object) -> object:
+            """Return the machine code for a signature; None if it is not in the files."""
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(signature, target_context)
+
 
 @contextmanager
 def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
@@ -118,8 +136,10 @@ def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
     digest = hashlib.sha256()
     for file in sorted({*files, __file__}):  # this file generates code, too
         digest.update(Path(file).read_bytes())
-    if laws.MODULES[0].__file__ in files:
+    if any(Path(file).parent.name == "laws" for file in files):
         # The numbers of installed laws depend on which of them are installed.
+        from fe.runtime import laws
+
         digest.update("".join(law.kind for law in laws.INSTALLED_LAWS).encode())
     previous_folder = numba.config.CACHE_DIR
     folder_of_function = Path(files[0]).parent
@@ -168,6 +188,8 @@ def _functions_of(module: ModuleType) -> list[NumericalFunction]:
 @functools.cache
 def law_functions() -> tuple[NumericalFunction, ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
+    from fe.runtime import laws  # most compiled functions know no laws
+
     implementations = {
         choice: laws.functions_by_law(choice.__name__)
         for choice in (laws.advance, laws.force_and_slope)
@@ -220,11 +242,14 @@ def _choose_when_compiled(
 
 
 @functools.cache
-def compiled_kernel() -> Kernel:
+def compiled_kernel() -> "Kernel":
     """Return the compiled loops for the argument `kernel` of `advance` and `static_solution`.
 
     The functions of `fe.runtime` stay plain; compiled functions can call them from then on.
     """
+    from fe.runtime import dry_friction, motion_arrays, motion_kernel, static_path
+    from fe.runtime.motion import Kernel
+
     inner_functions = {
         *_functions_of(motion_arrays),
         *_functions_of(dry_friction),

@@ -427,7 +427,7 @@ def _write_vtu(path: Path, places: _GaugePlaces, choice: "SensorDesign") -> None
     """Write the gauges as points; their rank is 1 for the first chosen one, and 0 if not chosen."""
     import numpy as np
 
-    from fe.structure.operators import write_vtu
+    from fe.structure.vtu import write_vtu
 
     if places.positions is None:
         raise MissionInputError(

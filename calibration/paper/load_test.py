@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
@@ -115,6 +114,9 @@ def kernel_density(
     weights : (n,) array, optional
         The weights of the samples; equal by default.
     """
+    # slow to import, and an exact posterior needs no kernel density
+    from scipy.ndimage import gaussian_filter1d
+
     lower = window[0] - _KERNEL_REACH * bandwidth
     upper = window[1] + _KERNEL_REACH * bandwidth
     spacing = bandwidth / CELLS_PER_BANDWIDTH

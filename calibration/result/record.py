@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import xarray as xr
-from scipy.special import ndtr, ndtri
 
 from calibration.errors import CalibrationRecordError
 from calibration.result.sensors import SensorFit
@@ -475,6 +474,8 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     -------
     (count, P) array
     """
+    from scipy.special import ndtr, ndtri  # slow to import, and a file is read without it
+
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     columns = []
     for prior in priors:

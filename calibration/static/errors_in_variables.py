@@ -37,7 +37,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import erf
 
 from calibration.errors import OutsideValidityError
 from reporting.arrays import Float
@@ -122,6 +121,8 @@ def pair_log_likelihoods(
 
 def _mean_of_folded_gaussian(mean: Float, deviation: Float) -> Float:
     """Return E|X| of a Gaussian X ~ N(mean, deviation^2), elementwise."""
+    from scipy.special import erf  # slow to import; only the measure "ratio" needs it
+
     # E|X| = s sqrt(2 / pi) exp(-m^2 / (2 s^2)) + m erf(m / (s sqrt 2)); for s = 0 the score is
     # infinite and E|X| = m
     score = np.divide(mean, deviation, out=np.full_like(mean, np.inf), where=deviation > 0.0)

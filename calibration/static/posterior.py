@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from calibration.errors import PosteriorError
 from reporting.arrays import Float
@@ -76,6 +75,8 @@ class GaussianPrior:
 
     def quantile(self, probability: ArrayLike) -> Float:
         """Return quantiles, elementwise."""
+        from scipy.special import ndtri  # slow to import, and seldom needed
+
         standardised = ndtri(np.asarray(probability, dtype=float))
         return np.asarray(self.mean + self.standard_deviation * standardised)
 

@@ -3,6 +3,9 @@
 A build works in one thread, because sums over several threads depend on their number. A design
 therefore gives the same bytes on a machine, whatever its cores do.
 
+A model that is kept is read in a fraction of the time that the modelling code takes to import, with
+scikit-fem and SciPy's sparse matrices. So only the functions that build a model import that code.
+
 This module also computes fields on the whole wing from the reduced model, and writes them as VTU
 files for ParaView. No equation of the full model is solved for them: the reduced solution is
 expanded on the mesh by the static basis, which takes milliseconds.
@@ -11,27 +14,26 @@ expanded on the mesh by the static basis, which takes milliseconds.
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, overload
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fe.elements.cells import CellMesh
-from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import FloatArray, IntArray, StoredArrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash
-from fe.structure.operators import assemble_structure, write_vtu
 from fe.structure.tables import StructureSettings
+from fe.structure.vtu import write_vtu
 from fe.wing.design import WingDesign, load_design
-from fe.wing.operators import AffineOperators, assemble
 from reporting.files import atomic_write_bytes, hash_bytes, hash_tree
 from reporting.progress import Progress, reporter
 
 from .built_once import built_once, cache_folder
 
 if TYPE_CHECKING:
+    from fe.wing.operators import AffineOperators
+
     from .reduced_basis import Reduction
 
 MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduction")
@@ -39,6 +41,9 @@ MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduc
 
 A change in any of their files makes a new cache entry.
 """
+
+_WING_CELLS = "hexahedron20"
+"""The kind of the cells of a wing, as `fe.structure.vtu` names it."""
 
 _Record = TypeVar("_Record", bound=StoredArrays)
 
@@ -92,6 +97,9 @@ class WingFields(ReducedModel):
         the ribs.
     static_displacement : (P, 3, N) array
         Static basis vectors [m per unit coordinate].
+    static_strain : (C, 6, N) array
+        Strains xx, yy, zz, yz, xz, xy of the static basis vectors at the centres of the cells, with
+        engineering shear strains [1 per unit coordinate].
     modal_displacement : (P, 3, Nm) array
         Modal basis vectors.
     """
@@ -102,6 +110,7 @@ class WingFields(ReducedModel):
     cells: Annotated[IntArray, "cells", 20]
     region: Annotated[IntArray, "cells"]
     static_displacement: Annotated[FloatArray, "points", 3, "static"]
+    static_strain: Annotated[FloatArray, "cells", 6, "static"]
     modal_displacement: Annotated[FloatArray, "points", 3, "modal"]
 
     @property
@@ -215,8 +224,10 @@ def build_fields(
     return field_basis(operators, reduce_structure(operators, settings, progress))
 
 
-def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
+def _assembled(design: WingDesign, progress: Progress | None) -> "AffineOperators":
     """Return the operators of a wing, and report the stage."""
+    from fe.wing.operators import assemble
+
     with reporter(progress).stage("Meshing and assembling the wing"):
         return assemble(design)
 
@@ -261,6 +272,8 @@ def _reduced_structure(
     """Return the reduced model of a structure file; the parameters are those of `reduced_model`."""
 
     def build() -> ReducedModel:
+        from fe.structure.operators import assemble_structure
+
         from .reduced_basis import reduce_structure
 
         with reporter(progress).stage("Reading the mesh and assembling"):
@@ -282,6 +295,8 @@ def check_structure(file: Path | str) -> None:
         If the structure cannot be read or modelled.
     """
     if not _structure_cache_file(Path(file)).is_file():
+        from fe.structure.operators import assemble_structure
+
         assemble_structure(file)
 
 
@@ -292,7 +307,7 @@ def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
     return cache_file("structure", design_hash, design.reduction)
 
 
-def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingFields:
+def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:
     """Return a reduced model with its bases expanded on the mesh of the full model.
 
     Parameters
@@ -302,42 +317,29 @@ def field_basis(operators: AffineOperators, reduction: "Reduction") -> WingField
     reduction : Reduction
         The reduced model of the structure, and the bases.
     """
+    from fe.elements.cells import CellMesh
+    from fe.elements.kinds import HEXAHEDRA_20
+
     mesh = operators.wing_mesh
 
     def on_nodes(basis: FloatArray) -> FloatArray:
         return np.asarray(operators.expansion @ basis).reshape(-1, 3, basis.shape[1])
+
+    static_displacement = on_nodes(reduction.static_basis)
+    cells = CellMesh(HEXAHEDRA_20, mesh.points, mesh.cells)
+    static_strain = [
+        cells.strains(vector)[:, 0] for vector in np.moveaxis(static_displacement, 2, 0)
+    ]
 
     return WingFields(
         **_fields_of(reduction.model),
         points=mesh.points,
         cells=mesh.cells,
         region=mesh.region,
-        static_displacement=on_nodes(reduction.static_basis),
+        static_displacement=static_displacement,
+        static_strain=np.stack(static_strain, axis=2),
         modal_displacement=on_nodes(reduction.modal_basis),
     )
-
-
-class _CellStrains(NamedTuple):
-    """Strains at the centres of cells.
-
-    Attributes
-    ----------
-    tensor : (C, 6) array
-        Strains xx, yy, zz, yz, xz, xy, with engineering shear strains.
-    spanwise : (C,) array
-        Strain along the span, positive if compressed, as the gauges read it.
-    """
-
-    tensor: FloatArray
-    spanwise: FloatArray
-
-
-def _strains_at_centres(wing: WingFields, displacement: FloatArray) -> _CellStrains:
-    """Return the strains of nodal displacements (P, 3) [m] at the centres of the cells."""
-    mesh = CellMesh(HEXAHEDRA_20, wing.points, wing.cells)
-    tensor = mesh.strains(displacement).squeeze(axis=1)
-    _, spanwise, *_ = tensor.T
-    return _CellStrains(tensor, -spanwise)
 
 
 def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
@@ -363,19 +365,21 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     FileNotWrittenError
         If the file cannot be written.
     """
-    displacement = wing.static_displacement @ wing.static_response(vector).coordinates
-    strains = _strains_at_centres(wing, displacement)
+    coordinates = wing.static_response(vector).coordinates
+    displacement = wing.static_displacement @ coordinates
+    strain = wing.static_strain @ coordinates
+    _, strain_along_span, *_ = strain.T
     region_losses = [vector[wing.input_names.index(name)] for name in wing.regions]
     skin_loss, web_loss, rib_loss = 0.0, 0.0, 0.0
     losses = np.array([skin_loss, *region_losses, web_loss, rib_loss])
     write_vtu(
         path,
         wing.points,
-        (HEXAHEDRA_20.file_type, wing.cells),
+        (_WING_CELLS, wing.cells),
         point_data={"displacement": displacement},
         cell_data={
-            "strain": strains.tensor,
-            "spanwise_strain": strains.spanwise,
+            "strain": strain,
+            "spanwise_strain": -strain_along_span,
             "region": wing.region,
             "stiffness_loss": losses[wing.region],
         },
@@ -413,7 +417,7 @@ def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> N
     write_vtu(
         path,
         wing.points,
-        (HEXAHEDRA_20.file_type, wing.cells),
+        (_WING_CELLS, wing.cells),
         point_data=shapes,
         cell_data={"region": wing.region},
     )

@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from fe.elements.elasticity import unit_vector
-from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
-from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
 from .affine_fields import OutputRows
@@ -34,6 +31,7 @@ from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .nodal_loads import nodal_load, point_weights, port_row
 from .supports import supports_of_design
+from .vtu import write_vtu
 
 
 @dataclass(frozen=True)
@@ -358,39 +356,3 @@ def write_structure_vtu(
             "stiffness_loss": np.array(losses)[structure.region_of],
         },
     )
-
-
-Data = Mapping[str, npt.ArrayLike]
-"""Values of points or cells, by name."""
-
-
-def write_vtu(
-    path: Path | str,
-    points: FloatArray,
-    cells: tuple[str, IntArray],
-    point_data: Data,
-    cell_data: Data,
-) -> None:
-    """Write a VTU file, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path or str
-        The path of the file.
-    points : (nn, 3) array
-        Positions of the nodes [m].
-    cells : (str, (nc, k) array of int)
-        The kind of the cells in meshio, and their nodes.
-    point_data, cell_data : mapping of str to array
-        Values of the nodes and of the cells.
-
-    Raises
-    ------
-    FileNotWrittenError
-        If the file cannot be written.
-    """
-    meshio = meshio_with_wedges()
-    cell_blocks = {name: [values] for name, values in cell_data.items()}
-    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=cell_blocks)
-    with atomic_file(path) as temporary:
-        meshio.write(temporary, mesh, file_format="vtu")

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv, gammaln, logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation
@@ -285,6 +284,8 @@ class LearningFilter:
         (n, K, S) array
             p(D_i, k | o_0..o_t) for each step i, hypothesis k and state D_i.
         """
+        from scipy.special import logsumexp  # slow to import; only a twin that learns needs it
+
         step_count = len(carried)
         hypothesis_count = len(self._draw_of_hypothesis)
         smoothed_joint = np.zeros((step_count, hypothesis_count, self.model.states.size))
@@ -385,6 +386,8 @@ class LearningFilter:
         dict of str to Learnt
             The posteriors by `noise_scale[g]`, with the gauges g counted from 1.
         """
+        from scipy.special import gammaincinv, gammaln  # slow to import, as above
+
         degrees_of_freedom = self._gauges.degrees_of_freedom
         shape = 0.5 * (degrees_of_freedom + count)  # (G,)
         rate = 0.5 * (degrees_of_freedom + fit.sum_of_squares)  # (K, G)

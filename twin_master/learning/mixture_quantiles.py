@@ -1,7 +1,6 @@
 """Quantiles of mixtures of normal distributions, by bisection."""
 
 import numpy as np
-from scipy.special import ndtr
 
 from reporting.arrays import Float
 
@@ -26,6 +25,8 @@ def mixture_quantiles(weight: Float, mean: Float, deviation: Float, levels: Floa
     levels : (P,) array
         Levels of the quantiles, between 2.5 and 97.5 %.
     """
+    from scipy.special import ndtr  # slow to import; only a twin that learns needs it
+
     center = weight @ mean
     total_deviation = np.sqrt(weight @ (deviation**2 + (mean - center) ** 2))
     lower_bound = np.tile(center - SEARCH_DEVIATIONS * total_deviation, (len(levels), 1))

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaln
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
@@ -205,6 +204,8 @@ class GaugeRegression:
         # Terms that do not depend on the state: the constant of each gauge's density.
         log_constant: Float
         if self.learns_noise:
+            from scipy.special import gammaln  # slow to import; only a twin that learns needs it
+
             power = 0.5 * (self.degrees_of_freedom + count + 1.0)  # (G,)
             scale_squares = self.degrees_of_freedom + fit.sum_of_squares  # (K, G)
             log_constant = gammaln(power) - gammaln(power - 0.5)

@@ -218,7 +218,11 @@ class WatchState:
         }
         gauge_belief = np.zeros((sensors * gains, draws, states), dtype=np.float32)
         gauge_belief.ravel()[stored_arrays["gauge_place"]] = stored_arrays["gauge"]
-        gauge_sum_cc, gauge_sum_cx = np.moveaxis(stored_arrays["gauge_sums"], -1, 0)
+        # Contiguous as in a new state: for strided arrays the loops would be compiled once more,
+        # which takes five seconds.
+        gauge_sum_cc, gauge_sum_cx = np.ascontiguousarray(
+            np.moveaxis(stored_arrays["gauge_sums"], -1, 0)
+        )
         gauge_alarm_raised, free_gains_alarm_raised = stored_arrays["alarmed"].tolist()
         statistics = [row[None] for row in np.ascontiguousarray(stored_arrays["none_statistics"].T)]
         return cls(

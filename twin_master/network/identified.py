@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError
@@ -69,6 +68,8 @@ class IdentifiedSensorModel(GaussianSensorModel):
             If a row has another length, a value is infinite, or the covariance is not positive
             definite.
         """
+        from scipy.special import logsumexp  # slow to import, and few twins identify modes
+
         rows = zip(np.asarray(observations), np.asarray(control_index), strict=True)
         log_density = np.array([self._log_density_of_row(row, control) for row, control in rows])
         log_density = log_density.reshape(-1, self.state_count, self.draw_count)

@@ -362,10 +362,16 @@ def sweep_bellman(
             return sweeps, change
         change = 0.0
         for state in range(len(value)):
+            # In loops: sums and maxima of NumPy take seconds to compile, and their machine code
+            # needs numba's compiler whenever it is read.
             if len(policy):
-                new_value = np.sum(policy[state] * action_value[state])
+                new_value = 0.0
+                for control in range(len(discount)):
+                    new_value += policy[state, control] * action_value[state, control]
             else:
-                new_value = np.max(action_value[state])
+                new_value = action_value[state, 0]
+                for control in range(1, len(discount)):
+                    new_value = max(new_value, action_value[state, control])
             change = max(change, abs(new_value - value[state]))
             value[state] = new_value
         sweeps += 1

@@ -1,7 +1,6 @@
 """Classes of observations: few outcomes with nearly all the information about the state."""
 
 import numpy as np
-from scipy.special import rel_entr
 
 from reporting.arrays import Float
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -80,6 +79,8 @@ def _information(joint: Float) -> float:
     joint : (K, S) array
         Proportional to the joint probability of K observations and S states.
     """
+    from scipy.special import rel_entr  # slow to import, and not needed in flight
+
     observation_weight = joint.sum(axis=1, keepdims=True)
     state_weight = joint.sum(axis=0)
     joint_sum = joint.sum()

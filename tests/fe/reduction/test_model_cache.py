@@ -318,9 +318,12 @@ def test_without_a_folder_for_the_cache_a_loop_is_still_compiled(monkeypatch):
             raise RuntimeError("cannot cache function: no locator available")
         return njit(**options)
 
-    monkeypatch.setattr(numba, "njit", fail_with_cache)
+    # Numba decorates functions of its own by `njit` when it compiles for the first time.
+    with monkeypatch.context() as during_decoration:
+        during_decoration.setattr(numba, "njit", fail_with_cache)
+        double = compiled(lambda value: 2.0 * value)
 
-    assert compiled(lambda value: 2.0 * value)(3.0) == 6.0
+    assert double(3.0) == 6.0
     assert is_cached == [True, False]
 
 
@@ -381,3 +384,37 @@ def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(
     assert first == LoopRun(2.0, compilations=1)
     assert again == changed_back == LoopRun(2.0, compilations=0)
     assert changed == LoopRun(value, compilations=1)
+
+
+# ---------------------------------------------------------------- imports
+
+
+def run_in_new_process(code: str, **environment: str) -> str:
+    """Return what a program prints, run by a process of its own."""
+    process = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return process.stdout.strip()
+
+
+def test_a_kept_model_is_read_without_the_modelling_code():
+    code = "import fe.reduction.model_cache, sys; print('skfem' in sys.modules)"
+    assert run_in_new_process(code) == "False"
+
+
+def test_kept_machine_code_is_read_without_the_compiler(tmp_path):
+    """The second process imports nothing of what numba can translate, such as linear algebra."""
+    (tmp_path / "kept_loop.py").write_text(
+        "from fe.compilation import compiled\n\n@compiled\ndef double(x):\n    return 2.0 * x\n"
+    )
+    code = "import kept_loop, sys; print(kept_loop.double(3.0), 'numba.np.linalg' in sys.modules)"
+    environment = {
+        "NUMBA_CACHE_DIR": str(tmp_path / "kept"),
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
+    assert run_in_new_process(code, **environment) == "6.0 True"
+    assert run_in_new_process(code, **environment) == "6.0 False"
