@@ -2,19 +2,23 @@
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.measurement import Measurement
 from fe.reduction.model_cache import reduced_model
+from reporting.arrays import AnyArray
 from reporting.files import atomic_write_text
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fly_fleet
-from twin_master.fleet.plan import ensemble
+from twin_master.fleet.plan import Fleet, ensemble
+from twin_master.fleet.store import stored_variables
+from twin_master.fleet.store_address import StoreAddress
+from twin_master.fleet.store_writing import GroupWriter, create_store
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import fly_one_by_one, fly_side_by_side
 from twin_master.scenario.reading import load_scenario
@@ -52,6 +56,9 @@ def run() -> list[Measurement]:
         fly_fleet(ensemble(quiet, range(1)), folder / "start")
         start = cpu_seconds(lambda: fly_fleet(ensemble(quiet, range(1)), folder / "one"))
         fleet = ensemble(quiet, range(4 * TWINS))
+        written = seconds_of_writing(
+            fleet, stored_variables(knowledge, flown, fleet.groups[0].members[:TWINS])
+        )
         stored_seconds = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
     to_ten_thousand = 10_000 / (4 * TWINS)
     together_with_notices, alone_with_notices = seconds_with_notices()
@@ -79,6 +86,14 @@ def run() -> list[Measurement]:
             likelihood * 500_000,
         ),
         Measurement(
+            "twin of 50 steps written into the store",
+            1e3 * written,
+            "ms",
+            None,
+            "flown side by side",
+            1e3 * 50 * together,
+        ),
+        Measurement(
             "evidence of a step at a point of a grid",
             1e6 * learning / (steps * POINTS),
             "us",
@@ -101,6 +116,21 @@ def seconds_with_notices() -> tuple[float, float]:
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     to_fifty_steps = 50 / scenario.mission.steps
     return to_fifty_steps * together / TWINS, to_fifty_steps * alone / ALONE
+
+
+def seconds_of_writing(fleet: Fleet, variables: Mapping[str, AnyArray]) -> float:
+    """Return the processor time of writing a twin of a shard into the store of a fleet."""
+    with tempfile.TemporaryDirectory() as place:
+        create_store(Path(place), fleet)
+        writer = GroupWriter(StoreAddress(Path(place)), fleet, fleet.groups[0])
+        writer.write(variables, 0)
+        later_shards = range(TWINS, 4 * TWINS, TWINS)
+
+        def write_shards() -> None:
+            for first_row in later_shards:
+                writer.write(variables, first_row)
+
+        return cpu_seconds(write_shards) / (TWINS * len(later_shards))
 
 
 def cpu_seconds(function: Callable[[], object]) -> float:

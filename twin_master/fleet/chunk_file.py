@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from reporting.arrays import Unsigned
-from reporting.files import atomic_file, atomic_write_bytes
+from reporting.files import atomic_file, atomic_write_bytes, remove_leftovers
 from reporting.operating_system import open_descriptor
 from twin_master.errors import FleetError
 
@@ -111,6 +111,7 @@ class ChunkFile:
         """
         if not self.path.is_file():
             return
+        remove_leftovers(self.path.parent)  # of a process that was killed here
         index = self._index()
         ordered_index = self._ordered_index(index)
         has_chunk = index[:, 0] != _NO_CHUNK

@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 import zarr
 
+from reporting.files import TEMPORARY_SUFFIX
 from tests.twin_master.runs import written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
@@ -106,6 +107,14 @@ def test_a_finished_file_stays_as_it_is(growing_file):
     first = growing_file.path.stat()
     growing_file.file.finish()
     assert growing_file.path.stat().st_mtime_ns == first.st_mtime_ns
+
+
+def test_what_a_killed_process_left_beside_a_file_is_removed(growing_file):
+    growing_file.append(0)
+    leftover = growing_file.path.with_name(f".0.17-1{TEMPORARY_SUFFIX}")
+    leftover.write_bytes(b"half of a file")
+    growing_file.file.finish()
+    assert [path.name for path in growing_file.path.parent.iterdir()] == ["0"]
 
 
 def test_a_chunk_is_read_as_it_was_written(growing_file):
