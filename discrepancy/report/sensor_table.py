@@ -89,17 +89,19 @@ def sensor_rows(
     channels : mapping of str to Channel
         The channels of the campaign by name.
     """
+    estimates_by_channel: dict[str, list[SensorEstimate]] = {}
+    for estimate in estimates:
+        estimates_by_channel.setdefault(estimate.channel, []).append(estimate)
     rows = []
-    for channel in dict.fromkeys(estimate.channel for estimate in estimates):
-        of_channel = [estimate for estimate in estimates if estimate.channel == channel]
-        factor, unit = UNITS[channels[channel].quantity].drawn
-        for estimate in of_channel:
-            if estimate.kind is SensorValue.GAIN:
-                rows.append(SensorRow(estimate, *PERCENT))
-        zeros = [estimate for estimate in of_channel if estimate.kind is SensorValue.ZERO]
+    for channel, channel_estimates in estimates_by_channel.items():
+        gains = [estimate for estimate in channel_estimates if estimate.kind is SensorValue.GAIN]
+        rows += [SensorRow(gain, *PERCENT) for gain in gains]
+        zeros = [estimate for estimate in channel_estimates if estimate.kind is SensorValue.ZERO]
         if zeros:
-            farthest = max(zeros, key=_distance)
-            rows.append(SensorRow(farthest, factor, "" if unit == NOMINAL_UNIT else unit))
+            farthest_zero = max(zeros, key=_distance)
+            factor, unit = UNITS[channels[channel].quantity].drawn
+            shown_unit = "" if unit == NOMINAL_UNIT else unit
+            rows.append(SensorRow(farthest_zero, factor, shown_unit))
     return rows
 
 
