@@ -23,6 +23,7 @@ from reporting.progress import note
 try:
     import numba
     from numba.core import event
+    from numba.core.caching import UserProvidedCacheLocator
     from numba.extending import overload, register_jitable
 except ModuleNotFoundError:
     numba = None
@@ -105,6 +106,23 @@ if numba is not None:
 
     event.register("numba:compile", _CompilationNote())
 
+    class CacheFolderItself(UserProvidedCacheLocator):  # type: ignore[misc]
+        """Keeps machine code in the folder that is set, whatever the path of the source file.
+
+        By itself numba adds a folder that is named by this path, so that each copy of the package
+        would compile the same loops anew.
+        """
+
+        @classmethod
+        def get_suitable_cache_subpath(cls, py_file: str) -> str:
+            """Return the path below the folder that is set: none."""
+            return ""
+
+    CACHE_LOCATORS = (
+        f"{__name__}.{CacheFolderItself.__name__},InTreeCacheLocator,UserWideCacheLocator"
+    )
+    """Where numba looks for a folder that it can write to, in this order."""
+
 
 @contextmanager
 def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
@@ -129,11 +147,14 @@ def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
         parent = folder_of_function / "__pycache__"
     else:
         parent = cache_folder() / "compiled"
+    previous_locators = getattr(numba.config, "CACHE_LOCATOR_CLASSES", "")  # old versions have none
     numba.config.CACHE_DIR = str(parent / f"numba-{digest.hexdigest()[:16]}")
+    numba.config.CACHE_LOCATOR_CLASSES = CACHE_LOCATORS
     try:
         yield
     finally:
         numba.config.CACHE_DIR = previous_folder
+        numba.config.CACHE_LOCATOR_CLASSES = previous_locators
 
 
 def callable_when_compiled(
