@@ -174,26 +174,45 @@ class SelfCalibration:
         counts : (R, C) ndarray of int
             Numbers of campaigns.
         """
-        hidden = {case.hidden for case in self.cases}
-        rows = sorted(hidden, key=lambda name: (name != NOTHING, name))
-        verdicts = {_confusion_column(case) for case in self.cases}
-        other_verdicts = [name for name in dict.fromkeys(OTHER.values()) if name in verdicts]
-        names = verdicts.difference(other_verdicts)
-        columns = [name for name in rows if name in names]
-        columns += sorted(names.difference(rows))
-        nothing_missing = OTHER[VerdictKind.NOTHING_MISSING]
-        if nothing_missing in other_verdicts:
-            columns.insert(0, nothing_missing)
-        columns += [name for name in other_verdicts if name not in columns]
+        rows = self._confusion_rows()
+        columns = self._confusion_columns(rows)
         counts = np.zeros((len(rows), len(columns)), dtype=np.int64)
         for case in self.cases:
-            counts[rows.index(case.hidden), columns.index(_confusion_column(case))] += 1
+            row = rows.index(case.hidden)
+            column = columns.index(_confusion_column(case))
+            counts[row, column] += 1
         return rows, columns, counts
+
+    def _confusion_rows(self) -> list[str]:
+        """Return the hidden effects, sorted; "nothing" comes first."""
+        hidden = {case.hidden for case in self.cases}
+        rows = sorted(hidden - {NOTHING})
+        if NOTHING in hidden:
+            rows.insert(0, NOTHING)
+        return rows
+
+    def _confusion_columns(self, rows: list[str]) -> list[str]:
+        """Return the verdicts that occurred: "nothing missing", names by row, other verdicts."""
+        verdicts = {_confusion_column(case) for case in self.cases}
+        names = verdicts.difference(OTHER.values())
+        names_of_rows = [row for row in rows if row in names]
+        names_of_no_row = sorted(names.difference(rows))
+        # several kinds of verdict may share one column
+        other_verdicts = [
+            verdict for verdict in dict.fromkeys(OTHER.values()) if verdict in verdicts
+        ]
+        nothing_missing = OTHER[VerdictKind.NOTHING_MISSING]
+        if nothing_missing in other_verdicts:
+            other_verdicts.remove(nothing_missing)
+            return [nothing_missing, *names_of_rows, *names_of_no_row, *other_verdicts]
+        return [*names_of_rows, *names_of_no_row, *other_verdicts]
 
 
 def _confusion_column(case: CalibrationCase) -> str:
     """Return the column of a case in the confusion matrix: the name, or the kind of verdict."""
-    return " + ".join(case.named) if case.kind is VerdictKind.NAMED else OTHER[case.kind]
+    if case.kind is VerdictKind.NAMED:
+        return " + ".join(case.named)
+    return OTHER[case.kind]
 
 
 def wilson_interval(count: int, total: int) -> Proportion:
@@ -402,8 +421,9 @@ def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[s
     null : bool
         True for campaigns in which nothing was hidden.
     """
-    shown_outcomes = {"right", "wrong", *self_calibration.outcomes(null=null)}
-    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in shown_outcomes]
+    always_shown = {"right", "wrong"}
+    shown = always_shown.union(self_calibration.outcomes(null=null))
+    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in shown]
 
 
 _OUTCOMES_IN_ORDER = (

@@ -12,7 +12,7 @@ import numpy as np
 
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import BoolArray, Campaign, Trial
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.checks.fault import DataFault, FaultKind
@@ -428,14 +428,23 @@ def patch_draws(
     list of list of ModelPatch
         For each effect, its patch at each draw.
     """
+    patches_by_draw = []
+    for effect_parameters in _effect_draws(fit, seed, count):
+        patches_by_draw.append(fit.candidate.patches(problem.setting, effect_parameters))
+    # from a list of effects for each draw to a list of draws for each effect
+    return [list(patches_of_effect) for patches_of_effect in zip(*patches_by_draw, strict=True)]
+
+
+def _effect_draws(fit: CandidateFit, seed: int, count: int) -> FloatArray:
+    """Return draws (count, E) of the E scaled effect parameters of a fit from its posterior."""
     generator = np.random.default_rng(seed)
     if fit.draws is not None:
-        draws = generator.choice(fit.draws, count)
-    else:
-        size = fit.candidate.parameter_count
-        # covariance = L L^T, so that L times a standard normal vector has this covariance; the
-        # diagonal is raised slightly, in case the matrix is singular to rounding
-        factor = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
-        draws = fit.point.effect + generator.standard_normal((count, size)) @ factor.T
-    patches_of_draws = [fit.candidate.patches(problem.setting, draw) for draw in draws]
-    return [list(patches_of_effect) for patches_of_effect in zip(*patches_of_draws, strict=True)]
+        return np.asarray(generator.choice(fit.draws, count))
+    # Gaussian approximation: with the Cholesky factor L of the covariance, L times a standard
+    # normal vector has this covariance. The diagonal is raised slightly, because the matrix may be
+    # singular to rounding.
+    size = fit.candidate.parameter_count
+    covariance = fit.effect_covariance + 1e-15 * np.eye(size)
+    cholesky_factor = np.linalg.cholesky(covariance)
+    standard_normal = generator.standard_normal((count, size))
+    return np.asarray(fit.point.effect + standard_normal @ cholesky_factor.T)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 try:
     import numba
     from numba.core import event
-    from numba.core.caching import FunctionCache
+    from numba.core.caching import FunctionCache, UserProvidedCacheLocator
     from numba.core.runtime import rtsys
     from numba.extending import overload, register_jitable
 except ModuleNotFoundError:
@@ -123,6 +123,23 @@ if numba is not None:
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(signature, target_context)
 
+    class CacheFolderItself(UserProvidedCacheLocator):  # type: ignore[misc]
+        """Keeps machine code in the folder that is set, whatever the path of the source file.
+
+        By itself numba adds a folder that is named by this path, so that each copy of the package
+        would compile the same loops anew.
+        """
+
+        @classmethod
+        def get_suitable_cache_subpath(cls, py_file: str) -> str:
+            """Return the path below the folder that is set: none."""
+            return ""
+
+    CACHE_LOCATORS = (
+        f"{__name__}.{CacheFolderItself.__name__},InTreeCacheLocator,UserWideCacheLocator"
+    )
+    """Where numba looks for a folder that it can write to, in this order."""
+
 
 @contextmanager
 def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
@@ -149,11 +166,14 @@ def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
         parent = folder_of_function / "__pycache__"
     else:
         parent = cache_folder() / "compiled"
+    previous_locators = getattr(numba.config, "CACHE_LOCATOR_CLASSES", "")  # old versions have none
     numba.config.CACHE_DIR = str(parent / f"numba-{digest.hexdigest()[:16]}")
+    numba.config.CACHE_LOCATOR_CLASSES = CACHE_LOCATORS
     try:
         yield
     finally:
         numba.config.CACHE_DIR = previous_folder
+        numba.config.CACHE_LOCATOR_CLASSES = previous_locators
 
 
 def callable_when_compiled(

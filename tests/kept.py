@@ -32,15 +32,10 @@ FMU = (*FE, ROOT / "fmu_asset")
 DAYS = 14
 """What nobody read for so long is removed."""
 
-# The product has numba keep loops in folders named by the content of their sources; the path of a clone would
-# part them again. Before numba is imported, and for the processes that tests start. Those know nothing of
-# this: where there is one clone only, all keep the path and find each other's loops.
+# The product has numba keep loops in folders named by the content of their sources, which all clones and all
+# processes that tests start share. Before numba is imported.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "compiled"))
 os.environ.setdefault("NUMBA_OPT", "1")  # compiles in three quarters of the time, and our loops are as fast
-if not os.environ.get("CI"):
-    from numba.core.caching import UserProvidedCacheLocator
-
-    UserProvidedCacheLocator.get_suitable_cache_subpath = classmethod(lambda cls, py_file: "")
 
 _Made = TypeVar("_Made")
 
@@ -61,11 +56,7 @@ def kept(name: str, build: Callable[[], _Made], places: tuple[Path, ...], inputs
     """
     digest = hashlib.sha256(_surroundings() + repr(inputs).encode())
     for place in places:
-        for file in sorted(place.rglob("*")) if place.is_dir() else (place,):
-            if file.is_file() and "__pycache__" not in file.parts:
-                content = file.read_bytes()
-                digest.update(f"{file.relative_to(place.parent).as_posix()} {len(content)}\n".encode())
-                digest.update(content)
+        digest.update(_digest(place))
     path = FOLDER / f"{name}-{digest.hexdigest()[:32]}.pickle"
 
     def load() -> _Made:
@@ -102,6 +93,18 @@ def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:
     options = {"kind": "compiled", **options}
     inputs = (hashlib.sha256(model.to_bytes()).hexdigest(), options)
     return packed(path, lambda: build_fmu(model, path, **options), FMU, inputs)
+
+
+@cache  # of a hundred files, and asked for with each thing that is kept
+def _digest(place: Path) -> bytes:
+    """Return the digest of names and contents of a file, or of all files of a folder."""
+    digest = hashlib.sha256()
+    for file in sorted(place.rglob("*")) if place.is_dir() else (place,):
+        if file.is_file() and "__pycache__" not in file.parts:
+            content = file.read_bytes()
+            digest.update(f"{file.relative_to(place.parent).as_posix()} {len(content)}\n".encode())
+            digest.update(content)
+    return digest.digest()
 
 
 @cache

@@ -179,17 +179,19 @@ def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, 
     is chosen. If there are columns of times of several lengths, a table may have several clocks,
     and the columns of these lengths are chosen too.
     """
-    column_counts = Counter(len(column) for column in columns.values())
+    lengths = {name: len(column) for name, column in columns.items()}
+    number_count: Counter[int] = Counter()  # in all columns of a length
+    for length in lengths.values():
+        number_count[length] += length
     # of two lengths whose columns hold equally many numbers, the larger one
-    main_length = max(column_counts, key=lambda length: (length * column_counts[length], length))
+    main_length = max(number_count, key=lambda length: (number_count[length], length))
+    accepted_lengths = {main_length}
     # MATLAB variables have no units, so that columns of times are recognised by their names
-    names_of_times = time_heads([*columns], [""] * len(columns))
-    accepted_lengths = {len(columns[name]) for name in names_of_times}
-    if len(accepted_lengths) > 1:
-        accepted_lengths.add(main_length)
-    else:
-        accepted_lengths = {main_length}
-    return {name: column for name, column in columns.items() if len(column) in accepted_lengths}
+    no_units = [""] * len(columns)
+    clock_lengths = {lengths[name] for name in time_heads([*columns], no_units)}
+    if len(clock_lengths) > 1:
+        accepted_lengths.update(clock_lengths)
+    return {name: column for name, column in columns.items() if lengths[name] in accepted_lengths}
 
 
 def _cells(column: np.ndarray) -> list[str]:

@@ -99,8 +99,12 @@ class Sheet:
         decimal : str
             The decimal mark of its cells.
         """
-        cells = self.columns[self.heads.index(head)]
-        return tuple((plain_number(cell, decimal) or cell) if cell else "" for cell in cells)
+        column = self.heads.index(head)
+        numbers = []
+        for cell in self.columns[column]:
+            number = plain_number(cell, decimal) if cell else None
+            numbers.append(number or cell)  # what is no number stays as it is printed
+        return tuple(numbers)
 
 
 def read_sheet(path: Path) -> Sheet:

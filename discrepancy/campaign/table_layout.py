@@ -26,16 +26,26 @@ def _is_single_column(rows: Rows) -> bool:
     if has_further_cells:
         return False
     cells = [row[0] for _, row in rows]
-    rows_of_numbers = [index for index, cell in enumerate(cells) if is_value(cell)]
-    if not rows_of_numbers or rows_of_numbers[0] == 0:
+    first_number = next((index for index, cell in enumerate(cells) if is_value(cell)), None)
+    if first_number is None or first_number == 0:  # no numbers, or no title above them
         return False
-    first_row = rows_of_numbers[0]
-    numbers = [cells[index] for index in rows_of_numbers]
-    has_blanks = any(" " in cell and not CLOCK.fullmatch(cell) for cell in numbers)
-    title = cells[first_row - 1]
-    is_separated = any(mark in title and mark in " ".join(numbers) for mark in SEPARATORS)
-    are_most = 2 * len(numbers) > len(cells) - first_row
-    return are_most and not has_blanks and not is_separated
+    title = cells[first_number - 1]
+    cells_below_title = cells[first_number:]
+    numbers = [cell for cell in cells_below_title if is_value(cell)]
+    most_are_numbers = 2 * len(numbers) > len(cells_below_title)
+    return most_are_numbers and not _hold_several_numbers(title, numbers)
+
+
+def _hold_several_numbers(title: str, cells: Sequence[str]) -> bool:
+    """Return whether cells contain blanks, or a separator that is also in the title above them.
+
+    The blank between the date and the time of a clock separates no numbers.
+    """
+    for cell in cells:
+        if " " in cell and not CLOCK.fullmatch(cell):
+            return True
+    text = " ".join(cells)
+    return any(separator in title and separator in text for separator in SEPARATORS)
 
 
 def _rows_of_longer_clocks(

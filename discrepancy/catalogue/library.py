@@ -141,17 +141,20 @@ def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Eff
     tuple of Effect
         Variants of the effects, event by event; empty if no fitted trial has an event.
     """
-    fitted = {trial.name for trial in setting.campaign.fitted}
-    events = [event for event in setting.campaign.events if fitted.intersection(event.trials)]
-    event_names = dict.fromkeys(event.name for event in events)
+    names_of_fitted_trials = {trial.name for trial in setting.campaign.fitted}
+    event_names: list[str] = []
+    for event in setting.campaign.events:
+        is_fitted = not names_of_fitted_trials.isdisjoint(event.trials)
+        if is_fitted and event.name not in event_names:
+            event_names.append(event.name)
     if not event_names:
         return ()
     switchable_effects = [effect for effect in effects if _can_act_in_windows(effect, setting)]
-    return tuple(
-        _variant_in_event(effect, name, setting)
-        for name in event_names
-        for effect in switchable_effects
-    )
+    variants = []
+    for name in event_names:
+        for effect in switchable_effects:
+            variants.append(_variant_in_event(effect, name, setting))
+    return tuple(variants)
 
 
 def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:

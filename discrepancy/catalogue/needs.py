@@ -34,11 +34,12 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 
     By default the kinds are those that the effect acts on.
     """
-    kinds = kinds or effect.section.acts_on
-    if any(trial.kind in kinds for trial in effect.setting.campaign.fitted):
+    needed_kinds = kinds or effect.section.acts_on
+    fitted_kinds = {trial.kind for trial in effect.setting.campaign.fitted}
+    if not fitted_kinds.isdisjoint(needed_kinds):
         return None
-    names = [name for kind, name in KIND_NAMES.items() if kind in kinds]
-    return f"The campaign has no {' or '.join(names)} trial to fit."
+    needed_names = [name for kind, name in KIND_NAMES.items() if kind in needed_kinds]
+    return f"The campaign has no {' or '.join(needed_names)} trial to fit."
 
 
 def _no_event(effect: EffectInSetting) -> str | None:

@@ -161,13 +161,18 @@ def prior_conditions(campaign: Campaign, model: Model, trial: Trial) -> Conditio
 
     The parameters have their prior means, the release its nominal displacement, the clock no error.
     """
-    parameters = np.array([mean for mean, _ in model.prior_moments(campaign)])
-    initial_modes = np.zeros((0, 2))
-    if trial.release is not None:
-        initial_modes = np.zeros((trial.release.mode_count, 2))
-        if not trial.release.at_rest:
-            initial_modes[0, 0] = 1.0  # the first mode at the nominal release displacement
-    return Conditions(parameters, initial_modes, (0.0, 0.0), trial.health)
+    prior_means = np.array([mean for mean, _ in model.prior_moments(campaign)])
+    # displacement and velocity of each mode that the release may excite
+    mode_count = 0 if trial.release is None else trial.release.mode_count
+    initial_modes = np.zeros((mode_count, 2))
+    if trial.release is not None and not trial.release.at_rest:
+        initial_modes[0, 0] = 1.0  # the first mode at the nominal release displacement
+    return Conditions(
+        parameters=prior_means,
+        initial=initial_modes,
+        clock=(0.0, 0.0),
+        health=trial.health,
+    )
 
 
 def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[DataFault]:

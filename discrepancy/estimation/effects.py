@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, T
 
 HALF_DIFFERENCE = 0.02
 """Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
+MOST_KEPT_PATCHES = 128
+"""Patches that are kept of a hypothesis: those of several linearisations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +152,31 @@ class EffectLaws:
         problem = self.column_builder.problem
         trial = problem.trials[self._index_in_problem(trial_index)].trial
         patch = ModelPatch()
-        for term, term_values in self.candidate.split_by_term(effect):
+        for index, (term, term_values) in enumerate(self.candidate.split_by_term(effect)):
             if trial.kind in term.effect.acts_on:
-                patch = patch + term.patch(problem.setting, term_values).in_trial(trial.name)
+                patch = patch + self._patch_of_term(index, term_values).in_trial(trial.name)
         return patch
+
+    def _patch_of_term(self, index: int, values: FloatArray) -> ModelPatch:
+        """Return the change of the model by one effect, given its index and its unknowns."""
+        return self._kept_patches(index, values.tobytes())
+
+    @cached_property
+    def _kept_patches(self) -> Callable[[int, bytes], ModelPatch]:
+        """The change of the model by one effect, given its index and the bytes of its unknowns.
+
+        It is kept, because all trials have the same effects, and a derivative by one unknown leaves
+        the other effects as they are. To build it costs as much as to evaluate its law along a
+        trial.
+        """
+        terms = self.candidate.terms
+        setting = self.column_builder.problem.setting
+
+        @lru_cache(maxsize=MOST_KEPT_PATCHES)
+        def patch_of_term(index: int, values: bytes) -> ModelPatch:
+            return terms[index].patch(setting, np.frombuffer(values))
+
+        return patch_of_term
 
     def _index_in_problem(self, trial_index: int) -> int:
         """Return the index in the problem, which has static trials too, of a dynamic trial."""
@@ -189,7 +213,6 @@ class EffectLaws:
         """Return the changes of a trial's readings by errors of sensors, with their derivatives."""
         trial_index = arguments.trial_index
         trial = self.trials[trial_index]
-        setting = self.column_builder.problem.setting
         motion = motion_for_columns(arguments.trajectory)
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
@@ -199,8 +222,8 @@ class EffectLaws:
         derivatives: dict[int, FloatArray] = {}
         # the unknowns of effects follow the shared ones
         first_unknown = len(trial.shared_derivatives)
-        for term, values in self.candidate.split_by_term(arguments.effect):
-            has_law = bool(len(term.patch(setting, values).of(PortForce)))
+        for index, (term, values) in enumerate(self.candidate.split_by_term(arguments.effect)):
+            has_law = bool(len(self._patch_of_term(index, values).of(PortForce)))
             # an effect without a law at a port changes readings only
             if not has_law:
                 change = change + change_by_effect(term, values)

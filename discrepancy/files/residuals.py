@@ -125,15 +125,25 @@ def read_residuals(path: Path) -> ResidualSet:
 
 def _residual_set(tree: xr.DataTree) -> ResidualSet:
     """Return the residuals in the groups of a file."""
-    samples_at_rest: dict[str, FloatArray] = {}
-    if "noise" in tree.children:
-        for group in tree["noise"].children.values():
-            samples_at_rest[str(group.attrs["channel"])] = group.to_dataset()["noise"].values
+    samples_at_rest = _samples_at_rest(tree)
     channels = {}
     for row in json.loads(tree.attrs["channels"]):
-        channels[row["name"]] = _channel(row, samples_at_rest.get(row["name"]))
-    names = sorted(name for name in tree.children if name != "noise")
-    return ResidualSet(channels, tuple(_fitted_trial(tree[name].to_dataset()) for name in names))
+        name = row["name"]
+        channels[name] = _channel(row, samples_at_rest.get(name))
+    # every other group is a trial, and its name ends with its number
+    groups_of_trials = sorted(set(tree.children) - {"noise"})
+    trials = [_fitted_trial(tree[group].to_dataset()) for group in groups_of_trials]
+    return ResidualSet(channels, tuple(trials))
+
+
+def _samples_at_rest(tree: xr.DataTree) -> dict[str, FloatArray]:
+    """Return the samples of the noise records in a file [channel's unit], by channel."""
+    samples: dict[str, FloatArray] = {}
+    if "noise" in tree.children:
+        for group in tree["noise"].children.values():
+            channel = str(group.attrs["channel"])
+            samples[channel] = group.to_dataset()["noise"].values
+    return samples
 
 
 def _channel_row(channel: Channel) -> dict[str, object]:

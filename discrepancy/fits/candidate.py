@@ -242,8 +242,13 @@ class Candidate:
             The scaled parameters of all terms.
         """
         terms_with_values = self.split_by_term(scaled_values)
-        terms, values = zip(*(terms_with_values[number] for number in term_indices), strict=True)
-        return Candidate(terms), np.concatenate(values)
+        terms = []
+        values_of_terms = []
+        for index in term_indices:
+            term, values = terms_with_values[index]
+            terms.append(term)
+            values_of_terms.append(values)
+        return Candidate(tuple(terms)), np.concatenate(values_of_terms)
 
 
 PARAMETER_STEP = 1e-2

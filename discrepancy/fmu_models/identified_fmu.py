@@ -217,9 +217,16 @@ class IdentifiedFmu(FmuRuns):
         outputs to those without a force is divided by the amplitude.
         """
         amplitude = self.probing_amplitude(name)
-        impulse = amplitude * np.eye(1, excitation.recorded_steps).ravel()
-        run = FmuRun(*excitation.recording_arguments, offsets={name: impulse})
-        key = (*excitation.recording_arguments, name, False)
+        force_by_step = np.zeros(excitation.recorded_steps)
+        force_by_step[:1] = amplitude  # empty if no step is recorded
+        run = FmuRun(
+            operating_point=excitation.state,
+            step=excitation.step,
+            steps=excitation.recorded_steps,
+            offsets={name: force_by_step},
+        )
+        is_release = False
+        key = (*excitation.recording_arguments, name, is_release)
         return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
 
     def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:

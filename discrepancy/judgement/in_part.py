@@ -79,13 +79,16 @@ def _missing_force_vanishes(search: Search) -> bool:
     trials are in motion, as trials at rest show no missing force, and if every channel has a noise
     record.
     """
-    if not search.is_all_in_motion or not np.all(search.problem.record_freedom > 0.0):
+    every_channel_has_a_record = bool(np.all(search.problem.record_freedom > 0.0))
+    if not search.is_all_in_motion or not every_channel_has_a_record:
         return False
-    simulations = [fit for fit in search.exact_fits.values() if fit.candidate.terms]
-    scores_without_force = [search.score_under_recorded_noise(fit) for fit in simulations]
-    scores_with_force = [search.score(hypothesis) for hypothesis in search.force_hypotheses]
-    best_without_force = max(scores_without_force, default=-np.inf)
-    return best_without_force > max(scores_with_force)
+    best_without_force = -np.inf
+    for simulation in search.exact_fits.values():
+        if simulation.candidate.terms:
+            score = search.score_under_recorded_noise(simulation)
+            best_without_force = max(best_without_force, score)
+    best_with_force = max(map(search.score, search.force_hypotheses))
+    return best_without_force > best_with_force
 
 
 def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:

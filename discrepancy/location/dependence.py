@@ -203,7 +203,12 @@ def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
     if high <= low:
         return np.ones((values.size, 1))
     knots = np.linspace(low, high, _HAT_COUNT)
-    return np.column_stack([np.interp(values, knots, hat) for hat in np.eye(_HAT_COUNT)])
+    hats = np.empty((values.size, _HAT_COUNT))
+    for index in range(_HAT_COUNT):
+        value_at_knots = np.zeros(_HAT_COUNT)
+        value_at_knots[index] = 1.0  # a hat is one at its own knot and zero at the others
+        hats[:, index] = np.interp(values, knots, value_at_knots)
+    return hats
 
 
 def explained_dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
@@ -429,9 +434,11 @@ class _UsedSamples:
         (n, k T) ndarray
             Block diagonal: the columns of a trial are zero at the samples of the others.
         """
-        used_counts = [int(rows.sum()) for rows in self.rows]
-        starts_of_next_trials = np.cumsum(used_counts)[:-1]
-        functions_by_trial = np.split(functions, starts_of_next_trials)
+        # the samples of one trial follow those of the previous one
+        used_counts = np.array([rows.sum() for rows in self.rows])
+        trial_ends = np.cumsum(used_counts)
+        functions_by_trial = np.split(functions, trial_ends[:-1])
+        # a block of its own for each trial
         return np.asarray(block_diag(*functions_by_trial))
 
     def prediction_features(self, *names: str) -> FloatArray:

@@ -114,20 +114,32 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     equations : sequence of NormalEquations
         The normal equations of each channel; every channel has its own coefficients.
     """
-    grams = [channel_equations.gram for channel_equations in equations]
-    absorbed_by_fit = [channel_equations.absorbed_by_fit for channel_equations in equations]
-    projections = [channel_equations.projection for channel_equations in equations]
-    # covariance of the projection, without what the fit absorbs
-    covariance = block_diag(*grams)
-    if all(len(absorbed_of_channel) for absorbed_of_channel in absorbed_by_fit):
-        absorbed = np.hstack(absorbed_by_fit)
-        covariance = covariance - absorbed.T @ absorbed
-    # squares along the remaining eigenvectors, over their variances
-    eigenvalues, eigenvectors = np.linalg.eigh(covariance)
-    is_remaining = eigenvalues > _LEAST_REMAINING_VARIANCE
-    components = eigenvectors[:, is_remaining].T @ np.concatenate(projections)
-    squares = components**2 / eigenvalues[is_remaining]
-    return ExplainedSquares(float(np.sum(squares)), int(is_remaining.sum()))
+    projection = np.concatenate([equation.projection for equation in equations])
+    variances, directions = np.linalg.eigh(_covariance_of_projection(equations))
+    is_remaining = variances > _LEAST_REMAINING_VARIANCE
+    components = directions[:, is_remaining].T @ projection
+    squares = components**2 / variances[is_remaining]
+    return ExplainedSquares(
+        sum_of_squares=float(np.sum(squares)), degrees_of_freedom=int(is_remaining.sum())
+    )
+
+
+def _covariance_of_projection(equations: Sequence[NormalEquations]) -> FloatArray:
+    """Return G = B^T B - (S^T B)^T (S^T B), with the functions B of all K coefficients, (K, K).
+
+    Parameters
+    ----------
+    equations : sequence of NormalEquations
+        The normal equations of each channel. Without the sensitivities S of one of them nothing
+        counts as absorbed by the fit.
+    """
+    gram = np.asarray(block_diag(*(equation.gram for equation in equations)))
+    has_sensitivities = all(len(equation.absorbed_by_fit) > 0 for equation in equations)
+    if not has_sensitivities:
+        return gram
+    # all channels share the parameters, so that the columns of the channels stand side by side
+    absorbed = np.hstack([equation.absorbed_by_fit for equation in equations])
+    return np.asarray(gram - absorbed.T @ absorbed)
 
 
 def motion_envelope(fitted_trial: FittedTrial, column: int) -> FloatArray:

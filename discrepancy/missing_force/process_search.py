@@ -210,15 +210,19 @@ class ProcessSearch:
         values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
-        logarithm_steps = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
-        # on the diagonal: central differences; off the diagonal: forward differences in both
+        # step i enlarges logarithm i alone
+        steps = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
+        # on the diagonal: central differences
         curvature = np.diag(values_above + values_below - 2.0 * value)
-        for i, k in zip(*np.triu_indices(log_values.size, 1), strict=True):
-            value_with_both_larger = self.log_posterior(
-                log_values + logarithm_steps[i] + logarithm_steps[k]
-            )
-            curvature[i, k] = value_with_both_larger - values_above[i] - values_above[k] + value
-            curvature[k, i] = curvature[i, k]
+        # off the diagonal: forward differences in both logarithms
+        for i in range(log_values.size):
+            for k in range(i + 1, log_values.size):
+                value_with_both_larger = self.log_posterior(log_values + steps[i] + steps[k])
+                mixed_difference = (
+                    value_with_both_larger - values_above[i] - values_above[k] + value
+                )
+                curvature[i, k] = mixed_difference
+                curvature[k, i] = mixed_difference
         return curvature
 
     def _newton_step(

@@ -79,15 +79,18 @@ class EventTrials:
         self.columns = [rows[:, ::stride] for rows in linear_trials.regression_rows]
 
     def log_evidence(self, by_trial: Sequence[TrialProducts]) -> FloatArray:
-        """Return the log evidence (...) of all trials [nat], given the products of each."""
-        products = sum(trial.products for trial in by_trial)
-        half_log_determinants = sum(trial.half_log_determinants for trial in by_trial)
+        """Return the log evidence (...) of all trials [nat], given the products of each.
+
+        It is -r^T r / 2 - (ln det C) / 2, with the whitened residual r and the covariance C of the
+        readings, after the unknowns that the trials share have been integrated out.
+        """
+        sum_of_products = np.asarray(sum(trial.products for trial in by_trial))
+        sum_of_determinants = np.asarray(sum(trial.half_log_determinants for trial in by_trial))
         products, half_log_determinants = integrate_out_last(
-            np.asarray(products),
-            np.asarray(half_log_determinants),
-            self.linear_trials.shared_precision,
+            sum_of_products, sum_of_determinants, self.linear_trials.shared_precision
         )
-        return np.asarray(-0.5 * products[..., 0, 0] - half_log_determinants)
+        squared_residual = products[..., 0, 0]
+        return np.asarray(-0.5 * squared_residual - half_log_determinants)
 
 
 class SwitchedRecord:

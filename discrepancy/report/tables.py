@@ -1,8 +1,9 @@
 """The tables of the report on residuals, scores, parameters, detectable sizes and data."""
 
+from collections.abc import Mapping, Sequence
 from math import isnan, nan
 
-from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.campaign.records import Campaign, Channel, Trial
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import Origin
 from discrepancy.judgement.closed_share import NOMINAL_UNIT, percent_with_interval
@@ -147,20 +148,44 @@ def proof_table(investigation: Investigation, proof: Proof) -> TitledTable:
         "fitted, after": proof.fitted_after,
     }
     scored = {title: scores for title, scores in scores_by_title.items() if scores is not None}
-    cells_of_scores = [_score_cells(scores) for scores in scored.values()]
-    rows = [[title, *(cells[title] for cells in cells_of_scores)] for title in cells_of_scores[0]]
-    channels = investigation.campaign.channels
-    for name in dict.fromkeys(name for scores in scored.values() for name in scores.rms):
-        factor, unit = UNITS[channels[name].quantity].drawn
-        cells = [number(factor * scores.rms.get(name, nan)) for scores in scored.values()]
-        shown_unit = "in its own unit" if unit == NOMINAL_UNIT else unit
-        rows.append([f"rms residual of {name.replace('_', ' ')} ({shown_unit})", *cells])
     columns = [PageColumn("score"), *(number_column(title) for title in scored)]
+    rows = _score_rows([*scored.values()])
+    rows += _rms_rows([*scored.values()], investigation.campaign.channels)
     return TitledTable(
         Table(columns, rows),
         title="Before and after, at the same scale",
         caption=_proof_caption(investigation, proof),
     )
+
+
+def _score_rows(scores_of_columns: Sequence[Scores]) -> list[list[str]]:
+    """Return a row for each score: its title, and a cell for each column of scores."""
+    cells_of_columns = [_score_cells(scores) for scores in scores_of_columns]
+    rows = []
+    for title in cells_of_columns[0]:
+        rows.append([title, *(cells[title] for cells in cells_of_columns)])
+    return rows
+
+
+def _rms_rows(
+    scores_of_columns: Sequence[Scores], channels: Mapping[str, Channel]
+) -> list[list[str]]:
+    """Return a row for each channel: its rms residual in each column of scores.
+
+    A channel that a column's trials do not have gets the cell of a number that is unknown.
+    """
+    # a dict keeps the order in which the channels come first
+    channel_names: dict[str, None] = {}
+    for scores in scores_of_columns:
+        channel_names.update(dict.fromkeys(scores.rms))
+    rows = []
+    for name in channel_names:
+        factor, unit = UNITS[channels[name].quantity].drawn
+        shown_unit = "in its own unit" if unit == NOMINAL_UNIT else unit
+        title = f"rms residual of {name.replace('_', ' ')} ({shown_unit})"
+        cells = [number(factor * scores.rms.get(name, nan)) for scores in scores_of_columns]
+        rows.append([title, *cells])
+    return rows
 
 
 def _proof_caption(investigation: Investigation, proof: Proof) -> str:

@@ -183,15 +183,19 @@ class LumpedDescription(ModelDescription):
         It then has no states, constant loads, prescribed motions, damping parts or controllers. Its
         inputs act along vectors of their own, and its outputs are vectors without a constant.
         """
-        if not self.input or self.free:
+        is_held_and_forced = bool(self.input) and not self.free
+        has_other_parts = bool(
+            self.state_count or self.load or self.damping_part or self.controller
+        )
+        if not is_held_and_forced or has_other_parts:
             return False
-        if self.state_count or self.load or self.damping_part or self.controller:
-            return False
-        prescribes_motion = any(section.is_prescribed for section in self.input)
-        acts_through_matrix = any(section.through for section in self.input)
-        acts_elsewhere = any(port.acts for port in self.port)
-        shows_more = any(output.reaction or output.constant for output in self.output)
-        return not (prescribes_motion or acts_through_matrix or acts_elsewhere or shows_more)
+        for section in self.input:
+            if section.is_prescribed or section.through:
+                return False
+        for output in self.output:
+            if output.reaction or output.constant:
+                return False
+        return not any(port.acts for port in self.port)
 
     def matrices_of(self, kind: str) -> dict[str, Rows]:
         """Return the base matrix of a kind, if there is one, and its parts, by their names."""

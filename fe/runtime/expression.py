@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
+from math import isfinite
 from types import CodeType
 from typing import NamedTuple, TypeAlias
 
@@ -57,6 +58,15 @@ _GLOBALS = {"__builtins__": {}, **_FUNCTIONS}
 
 RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
 """Names with a meaning of their own in expressions: no event and no parameter may have one."""
+
+
+def _is_finite_and_real(value: NumberOrArray) -> bool:
+    """Return whether a number, or each element of an array, is finite and not complex."""
+    if isinstance(
+        value, float
+    ):  # most values of a fit; the functions of NumPy take ten times as long
+        return isfinite(value)
+    return not np.iscomplexobj(value) and bool(np.isfinite(value).all())
 
 
 class _ParsedExpression(NamedTuple):
@@ -187,7 +197,7 @@ class Expression:
             ) from cause
         except (ArithmeticError, ValueError, TypeError) as cause:
             raise self._error(f": {self.text!r} cannot be evaluated ({cause})") from cause
-        if np.iscomplexobj(result) or not np.isfinite(result).all():
+        if not _is_finite_and_real(result):
             raise self._error(f": {self.text!r} is not a finite number{when}")
         return result
 

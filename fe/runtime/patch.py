@@ -7,7 +7,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 from .errors import InvalidPatchError
@@ -290,9 +290,9 @@ def _primitive_from_row(row: object, where: str) -> Primitive:
         )
     primitive_type = PRIMITIVES[kind]
     values = {name: value for name, value in row.items() if name not in ("kind", "windows")}
-    required = [item.name for item in fields(primitive_type) if item.default is MISSING]
+    types, required = primitive_type.value_types(), primitive_type.required_values()
     return primitive_type(
-        **_checked_values(values, primitive_type.value_types(), required, where),
+        **_checked_values(values, types, required, where),
         windows=_windows_from_rows(row.get("windows", ()), where),
     )
 

@@ -4,7 +4,8 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import re
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from inspect import get_annotations
 from math import inf, isfinite
 from typing import Any, ClassVar, NamedTuple, dataclass_transform
@@ -45,6 +46,12 @@ def time_formula(text: str, kind: str) -> Expression:
     return Expression(text, ("time", "pi"), f"The formula of the primitive {kind!r}")
 
 
+def _type_of_value(declared_type: Any) -> type:
+    """Return the type of a value; that of a number may be annotated with its unit."""
+    plain_type: type = getattr(declared_type, "__origin__", declared_type)
+    return plain_type
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 @dataclass(frozen=True)
 class Primitive:
@@ -74,6 +81,8 @@ class Primitive:
     """Whether the primitive can act in windows only."""
     formula_fields: ClassVar[tuple[str, ...]] = ()
     """Names of the texts that are formulas in `time`."""
+    _types_of_values: ClassVar[Mapping[str, type]] = {}
+    _names_of_required: ClassVar[tuple[str, ...]] = ()
 
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
@@ -86,15 +95,19 @@ class Primitive:
             for name, hint in get_annotations(cls).items()
             if hasattr(hint, "__metadata__")
         }
+        # found once for each class, because primitives are built at every step of a fit
+        values = [item for item in fields(cls) if item.name != "windows"]
+        cls._types_of_values = {item.name: _type_of_value(item.type) for item in values}
+        cls._names_of_required = tuple(item.name for item in values if item.default is MISSING)
 
     def __post_init__(self) -> None:
         self._check_windows()
-        for item in fields(self):
-            value = getattr(self, item.name)
+        for name in self._types_of_values:
+            value = getattr(self, name)
             is_number = isinstance(value, float | int) and not isinstance(value, bool)
             if is_number and not isfinite(value):
                 raise InvalidPatchError(
-                    f"{item.name} of the primitive {self.kind!r} must be finite, but is {value!r}."
+                    f"{name} of the primitive {self.kind!r} must be finite, but is {value!r}."
                 )
         for name in self.formula_fields:
             time_formula(getattr(self, name), self.kind)
@@ -132,10 +145,9 @@ class Primitive:
     @classmethod
     def value_types(cls) -> dict[str, type]:
         """Return the type of each value by its name, without the windows."""
-        types: dict[str, type] = {}
-        for item in fields(cls):
-            if item.name != "windows":
-                # the type of a number may be annotated with its unit
-                declared_type: Any = item.type
-                types[item.name] = getattr(declared_type, "__origin__", declared_type)
-        return types
+        return dict(cls._types_of_values)
+
+    @classmethod
+    def required_values(cls) -> tuple[str, ...]:
+        """Return the names of the values without a default."""
+        return cls._names_of_required

@@ -66,7 +66,9 @@ def releases(seed, first_stamp=0.0, at_rest=True):
     return Campaign("releases", channels, tuple(trials), None, {}, "0" * 64), model
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=pytest.mark.long)]
+)
 def test_friction_that_ends_a_motion_is_named_in_its_size(seed):
     """Each number of half swings is an optimum of its own, in fitted trials and in those held out."""
     verdict = investigate(*releases(seed), DAMPERS, thorough=False).verdict

@@ -200,7 +200,7 @@ CAMPAIGNS = {
     "named": (lambda: rig(0.01), ("quadratic_damping", FRICTION)),
     "named without a noise record": (lambda: rig(0.01, noise=None), ("quadratic_damping",)),
     "named in part": (lambda: slow_friction(1.0), (FRICTION, "quadratic_damping")),
-    "named of ring-downs": (lambda: rig(0.01, "ringdown"), ("quadratic_damping", FRICTION)),
+    "named of ring-downs": (lambda: rig(0.01, "ringdown"), ("quadratic_damping",)),
     "without its effect": (lambda: rig(0.01), (FRICTION, CUBIC)),
     "a drift alone": (lambda: rig(0.01), ("stiffness_drift",)),
     "coloured remainder": (lambda: slow_friction(3.0), ("quadratic_damping",)),

@@ -23,9 +23,7 @@ from tests.discrepancy.rigs import chosen
 def friction(tmp_path_factory):
     """Return the search for the force of a cart that dry friction brings to rest, and its effects."""
     problem = blind(tmp_path_factory.mktemp("friction"), CART)
-    return ForceSearch(problem), chosen(
-        "coulomb_friction", "quadratic_damping", "structural_damping", "cubic_stiffness", "gauge_gain"
-    )
+    return ForceSearch(problem), chosen("coulomb_friction", "quadratic_damping", "cubic_stiffness")
 
 
 def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):

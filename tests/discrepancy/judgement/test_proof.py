@@ -249,7 +249,7 @@ def test_standard_error_is_that_of_trials_not_of_samples():
     bench = Bench(count=200, amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
     generator = np.random.default_rng(9)
     found = []
-    for _ in range(120):
+    for _ in range(60):
         held = [n for n, t in enumerate(bench.trials) if t.held_out]
         extra = {n: generator.standard_normal() * 1.5 * np.ones((1, 4)) for n in held}
         seed = generator.integers(1 << 30)

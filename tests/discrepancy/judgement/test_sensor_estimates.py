@@ -164,7 +164,7 @@ def hidden_in_gains(beam_model):
     """The verdict on a stiffness loss of 20 % that hides in gains that are stated to 12 %."""
     loss = ("region_stiffness_loss", {"loss": 0.2}, "z2")
     campaign = with_stated_gains(simulated(beam_model, "static", 3, loss), 0.12)
-    return investigate(campaign, beam_model, library(), seed=3).verdict
+    return investigate(campaign, beam_model, library(), seed=3, thorough=False).verdict
 
 
 def test_gains_that_moved_within_their_priors_are_told(hidden_in_gains):
@@ -186,7 +186,7 @@ def test_nothing_missing_says_which_gain_an_error_may_hide_in(hidden_in_gains):
 def gain_far_from_stated(beam_model):
     """The verdict on a campaign without an effect, one of whose drawn gains is far from what is stated."""
     campaign = simulated(beam_model, "static", 3)
-    return investigate(campaign, beam_model, chosen("load_cell"), seed=3).verdict
+    return investigate(campaign, beam_model, chosen("load_cell"), seed=3, thorough=False).verdict
 
 
 def test_a_gain_far_from_what_is_stated_is_no_effect(gain_far_from_stated):

@@ -141,7 +141,7 @@ def test_effects_that_make_the_held_out_record_of_the_tanks_worse_are_not_named(
 
 
 def test_the_place_of_what_a_pendulum_lacks_is_said(tmp_path):
-    effects = chosen("coulomb_friction", "quadratic_damping", "clock_error")
+    effects = chosen("coulomb_friction", "quadratic_damping")
     found = investigate(*rig("pendulum", tmp_path), effects, thorough=False)
     assert found.verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot'; " in found.verdict.sentence

@@ -353,15 +353,17 @@ class LoopRun:
 
 @pytest.fixture
 def run_outer(tmp_path, monkeypatch) -> Callable[..., LoopRun]:
-    """Write both modules with numbers, import them anew, and run the outer loop."""
+    """Write both modules with numbers into a folder, import them anew, and run the outer loop."""
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.syspath_prepend(tmp_path)
 
-    def run(**numbers: float) -> LoopRun:
+    def run(folder: str = "modules", **numbers: float) -> LoopRun:
+        modules = tmp_path / folder
+        modules.mkdir(exist_ok=True)
+        monkeypatch.syspath_prepend(modules)
         text = INNER_MODULE.format_map({"step": 1.0, "added": 1.0} | numbers)
-        (tmp_path / "inner.py").write_text(text)
-        (tmp_path / "outer.py").write_text(OUTER_MODULE)
+        (modules / "inner.py").write_text(text)
+        (modules / "outer.py").write_text(OUTER_MODULE)
         for name in ("inner", "outer"):
             monkeypatch.delitem(sys.modules, name, raising=False)
         importlib.invalidate_caches()
@@ -384,6 +386,14 @@ def test_loops_are_kept_by_content_and_a_changed_source_never_meets_old_ones(
     assert first == LoopRun(2.0, compilations=1)
     assert again == changed_back == LoopRun(2.0, compilations=0)
     assert changed == LoopRun(value, compilations=1)
+
+
+def test_a_copy_at_another_path_finds_the_loops_of_the_first(run_outer):
+    first = run_outer("a_copy")
+    second = run_outer("another_copy")
+
+    assert first == LoopRun(2.0, compilations=1)
+    assert second == LoopRun(2.0, compilations=0)
 
 
 # ---------------------------------------------------------------- imports
