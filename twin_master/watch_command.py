@@ -20,6 +20,7 @@ from twin_master.command_options import (
     CalibrationOption,
     CertificateOption,
     LibraryOption,
+    LineProtocolOption,
     MetricsOption,
     SeedOption,
     ViewOption,
@@ -137,6 +138,7 @@ def watch(
     ] = False,
     ca_file: CertificateOption = None,
     metrics: MetricsOption = None,
+    line_protocol: LineProtocolOption = None,
     seed: SeedOption = None,
     calibration: CalibrationOption = None,
     library: LibraryOption = None,
@@ -195,6 +197,7 @@ def watch(
             otherwise="-",
             begun=begin_watch,
             metrics=metrics,
+            line_protocol=line_protocol,
             cause_search=cause_search,
             progress=terminal.progress(),
         )

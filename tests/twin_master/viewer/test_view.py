@@ -366,7 +366,7 @@ def check_notices_and_learning_of_the_last_step(tab: Any) -> None:
     tab.press("End")
     tab.wait("window.painted.at(-1)[0] === 49")
     notices = tab.value("[...element('notices').children].map((item) => item.textContent)")
-    learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
+    learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a, gauge 9", "a, gauge 10"))
     assert tab.value("element('latest').getAttribute('aria-pressed')") == "true"
     assert notices == ["Step 49: gauge 4 is off.", "step 49: Look at <b>gauge 3</b>."]
     assert tab.value("element('learnt').textContent") == learnt
