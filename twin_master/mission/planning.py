@@ -178,7 +178,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
             reason = "it is neither NPY nor NPZ"
         raise PlanningError(
             f"{path} is not a policy such as `uav-twin plan --out` writes ({reason}): give such a "
-            "file, or fly a run again whose copy is damaged"
+            "file; if it is the copy in a run folder, fly the run again"
         ) from None
     states = policy.vectors.shape[1]
     if controls != model.controls or states != model.states.size:

@@ -185,7 +185,7 @@ def test_records_that_are_no_steps_are_passed_over(late_observation):
 
 def test_a_step_that_is_missing_ends_the_view(late_observation):
     late_observation.add(late_observation.records[30])
-    with pytest.raises(RunFolderError, match="has step 30 where 10 was expected"):
+    with pytest.raises(RunFolderError, match="has a line of step 30 where step 10 is expected"):
         late_observation.flight.update()
 
 
