@@ -366,8 +366,8 @@ def pack_patched(
     """
     if choice.design is None:
         raise ModelError(
-            f"{path}: only a wing is packed with its effects; for {choice.label} give --out with "
-            "the ending .json, which can be given wherever a model is expected."
+            f"{path}: only a wing is packed with its effects as an FMU; for {choice.label} give an "
+            "--out that ends in .json. Such a file can be given wherever a model is expected."
         )
     effect_tables = []
     for stored_effect in patch.effects:

@@ -43,6 +43,13 @@ MetricsOption = Annotated[
         "without HOST to this machine only.",
     ),
 ]
+LineProtocolOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--line-protocol",
+        help="Append each decision to this file in the line protocol of InfluxDB.",
+    ),
+]
 ClusterOption = Annotated[
     str | None,
     typer.Option(

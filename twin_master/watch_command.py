@@ -20,6 +20,7 @@ from twin_master.command_options import (
     CalibrationOption,
     CertificateOption,
     LibraryOption,
+    LineProtocolOption,
     MetricsOption,
     SeedOption,
     ViewOption,
@@ -137,6 +138,7 @@ def watch(
     ] = False,
     ca_file: CertificateOption = None,
     metrics: MetricsOption = None,
+    line_protocol: LineProtocolOption = None,
     seed: SeedOption = None,
     calibration: CalibrationOption = None,
     library: LibraryOption = None,
@@ -164,8 +166,8 @@ def watch(
     from twin_master.watch import broker_address, opening
 
     watches: list[Watch] = []
-    comes_from_broker = broker_address.is_broker(observations or "")
-    is_live = follow or observations is None or observations == "-" or comes_from_broker
+    is_broker = broker_address.is_broker(observations or "")
+    is_live = follow or observations is None or observations == "-" or is_broker
 
     with view_beside(view) as begun:
 
@@ -178,9 +180,7 @@ def watch(
             observations,
             out,
             {"seed": seed, "calibration": calibration, "library": library},
-            decide=_decision_printer(
-                watches, flush=is_live, pace=pace, needs_reader=not comes_from_broker
-            ),
+            decide=_decision_printer(watches, flush=is_live, pace=pace, needs_reader=not is_broker),
             resume=resume,
             follow=follow,
             steps=steps,
@@ -195,6 +195,7 @@ def watch(
             otherwise="-",
             begun=begin_watch,
             metrics=metrics,
+            line_protocol=line_protocol,
             cause_search=cause_search,
             progress=terminal.progress(),
         )

@@ -132,15 +132,24 @@ def _parse_effect(table: object, place: str) -> Effect:
     )
 
 
+_REASON_OF_NAME = (
+    "a name is letters, digits and `_`, and must not mean something else in an expression."
+)
+
+
 def _check_names(section: EffectSection, names: frozenset[str], place: str) -> None:
     """Refuse names of parameters and events that mean something else in an expression."""
     used_names = {*SCALES, *RESERVED}
     for name in names:
         if not name.isidentifier() or name in used_names:
-            raise CatalogueError(f"{place}: a parameter must not be called {name!r}.")
+            raise CatalogueError(
+                f"{place}: a parameter must not be called {name!r}: {_REASON_OF_NAME}"
+            )
     for name in section.events:
         if not name.isidentifier() or name in used_names | names:
-            raise CatalogueError(f"{place}: an event must not be called {name!r}.")
+            raise CatalogueError(
+                f"{place}: an event must not be called {name!r}: {_REASON_OF_NAME}"
+            )
 
 
 def _check_places_and_needs(section: EffectSection, place: str) -> None:

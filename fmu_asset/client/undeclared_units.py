@@ -64,9 +64,7 @@ def _bound_units(binding: Binding) -> Iterator[tuple[str, str]]:
     for monitor in binding.monitor.values():
         yield monitor.variable, monitor.unit
     for vector in binding.observation.values():
-        count = len(vector.variables)
-        units = (vector.unit,) * count if isinstance(vector.unit, str) else vector.unit
-        yield from zip(vector.variables, units, strict=True)
+        yield from zip(vector.variables, vector.units, strict=True)
 
 
 def _is_unit_of_si(unit: str) -> bool:

@@ -286,8 +286,9 @@ def stepped_components(
     if linear and not any(component.linear for component in components.values()):
         raise BindingError(
             f"The binding {exchange.binding.name} asks for linear interpolation of inputs, but no "
-            f"component of the system {wiring.structure.name} has a continuous input and takes its "
-            "derivatives (`canInterpolateInputs`, or model exchange); leave it out."
+            f"component of the system {wiring.structure.name} has a continuous input of which it "
+            "accepts the derivative (`canInterpolateInputs`, or model exchange): leave "
+            "`interpolation` out."
         )
     return components
 

@@ -220,7 +220,10 @@ class Wiring:
             raise CouplingError(two_sources_sentence(target, source_of_target[target], source))
         source_of_target[target] = source
         if not (math.isfinite(connection.factor) and math.isfinite(connection.offset)):
-            raise CouplingError(f"The transformation from {source} to {target} must be finite.")
+            raise CouplingError(
+                f"The factor and the offset from {source} to {target} must be finite, but are "
+                f"{connection.factor} and {connection.offset}."
+            )
         if not source.component and not target.component:
             raise CouplingError(
                 f"The connection from {source} to {target} joins two connectors of the system; one "

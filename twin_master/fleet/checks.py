@@ -174,7 +174,7 @@ def _check_true_parameters(group: Group, scenario: Scenario) -> None:
     outside = [value for value in values if not low - _ROUNDING <= value <= high + _ROUNDING]
     if outside:
         raise FleetError(
-            f"the true {_WING_PARAMETER} of {len(outside)} of {len(values)} assets is outside of "
-            f"{low:g} to {high:g}, where the model holds, such as {outside[0]:.4g}: "
+            f"the true {_WING_PARAMETER} of {len(outside)} of {len(values)} assets lies outside "
+            f"{low:g} to {high:g}, the range of the model; the first of them is {outside[0]:.4g}: "
             "let it vary less, or fly FMUs."
         )

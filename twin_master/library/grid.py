@@ -331,8 +331,8 @@ def grid_of_scenario(
     gives_other_parameter = any(name != draws.name for name in parameters)
     if gives_other_parameter or values_by_role["control"] or values_by_role["load"]:
         raise MissionInputError(
-            f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the "
-            "scenario gives the rest."
+            f"with a scenario, --grid may name only states and the uncertain parameter "
+            f"{draws.name}: controls, loads and other parameters come from the scenario."
         )
     levels = {factor.name: factor.levels for factor in scenario.state}
     values = parameters.get(draws.name, tuple(draws.values.tolist()))

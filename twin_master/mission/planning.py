@@ -180,7 +180,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
             reason = "it is neither NPY nor NPZ"
         raise PlanningError(
             f"{path} is not a policy such as `uav-twin plan --out` writes ({reason}): give such a "
-            "file, or repeat the run if its copy of the policy is damaged"
+            "file; if it is the copy in a run folder, fly the run again"
         ) from None
     if stored_policy.controls != model.controls or stored_policy.state_count != model.states.size:
         raise PlanningError(

@@ -241,10 +241,11 @@ class Flight:
         last_step = self.steps - 1
         observed_step = int(record.get("observation_step", int(record["step"])))
         if not 0 <= observed_step <= record["step"] == last_step:
-            step = f"{self.scenario.mission.step_name} {record['step']}"
+            step_name = self.scenario.mission.step_name
             raise RunFolderError(
-                f"the journal in {self.folder} has {step} where {self.steps} was expected: it is "
-                "of another version."
+                f"the journal in {self.folder} has a line of {step_name} {record['step']} where "
+                f"{step_name} {self.steps} is expected: it was written by another version, or is "
+                "damaged."
             )
         self._lines_of_steps[-1].belief = begin
         self._lines_of_steps[observed_step].observation = begin

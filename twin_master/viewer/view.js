@@ -245,13 +245,19 @@ function drawNotices(rows, steps) {
   element("told").hidden = newest.length === 0;
 }
 
+function learntTitle(name) { // "noise_scale[3]" is "noise scale, gauge 3"
+  const [, quantity, number] = name.match(/^([^[]*)(?:\[(\d+)\])?/);
+  const words = quantity.replaceAll("_", " ");
+  return number ? `${words}, ${scene.sensors.titles[number - 1] ?? number}` : words;
+}
+
 function drawLearnt(now) {
   const entries = Object.entries(now.learnt).sort(([a], [b]) =>
     a.includes("[") - b.includes("[") || a.localeCompare(b, "en", { numeric: true })); // those of a sensor last
   element("learnt").replaceChildren(...entries.map(([name, learnt]) => {
     const [row, term, value] = ["div", "dt", "dd"].map((tag) => document.createElement(tag));
     const [mean, lower, upper] = [learnt.mean, learnt.lower, learnt.upper].map((number) => number.toPrecision(4));
-    term.textContent = name;
+    term.textContent = learntTitle(name);
     value.textContent = `${mean} (${lower} to ${upper})${learnt.unit === "1" ? "" : ` ${learnt.unit}`}`;
     row.append(term, value);
     return row;

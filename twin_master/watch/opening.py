@@ -29,6 +29,7 @@ from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as open_stored_run
 from twin_master.watch.broker_address import Broker
 from twin_master.watch.cause_search import CauseSearch
+from twin_master.watch.decision_points import DecisionLines
 from twin_master.watch.feed import Feed
 from twin_master.watch.feeds import Observations, choose_feed
 from twin_master.watch.folder import GivenPatch, Watch
@@ -269,6 +270,7 @@ def watch(
     otherwise: str | None = None,
     begun: Callable[[Watch], object] = _ignore_watch,
     metrics: str | int | None = None,
+    line_protocol: Path | str | None = None,
     cause_search: CauseSearch | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -323,6 +325,8 @@ def watch(
     metrics : str or int, optional
         The port at which the figures of the watch are served for Prometheus while it goes on, or
         ``HOST:PORT``; without a host, only this machine can read them.
+    line_protocol : Path or str, optional
+        The file to which each decision is appended in the line protocol of InfluxDB.
     cause_search : CauseSearch, optional
         What looks for the cause of an alarm. `uav_twin.watch` gives `uav-twin discrepancy run` in a
         process of its own; only a watch with `teach` needs it.
@@ -366,7 +370,7 @@ def watch(
     with serve_metrics(metrics) as metrics_server, opened as watched:
         try:
             begun(watched)
-            decide = _also_as_metrics(decide, metrics_server, watched)
+            decide = _also_for_monitoring(decide, metrics_server, line_protocol, watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, reading_scenario)
             teacher = cause_search if teach else None
@@ -376,6 +380,17 @@ def watch(
             error.add_note(_advice_after_error(watched))
             raise
     return watched.folder
+
+
+def _also_for_monitoring(
+    decide: DecisionSink,
+    server: MetricsServer | None,
+    line_protocol: Path | str | None,
+    watched: Watch,
+) -> DecisionSink:
+    """Return a function that also serves each decision as metrics, and appends it to a file."""
+    served = _also_as_metrics(decide, server, watched)
+    return _also_as_lines(served, line_protocol, watched)
 
 
 def _also_as_metrics(
@@ -392,6 +407,19 @@ def _also_as_metrics(
         decide(decision)
 
     return decide_and_count
+
+
+def _also_as_lines(decide: DecisionSink, path: Path | str | None, watched: Watch) -> DecisionSink:
+    """Return a function that also appends each decision to a file of line protocol, if any."""
+    if path is None:
+        return decide
+    lines = DecisionLines(Path(path), watched.scenario.mission.name)
+
+    def decide_and_append(decision: Decision) -> None:
+        lines.write(decision)
+        decide(decision)
+
+    return decide_and_append
 
 
 def _given_patch(

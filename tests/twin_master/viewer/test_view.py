@@ -185,7 +185,7 @@ def test_records_that_are_no_steps_are_passed_over(late_observation):
 
 def test_a_step_that_is_missing_ends_the_view(late_observation):
     late_observation.add(late_observation.records[30])
-    with pytest.raises(RunFolderError, match="has step 30 where 10 was expected"):
+    with pytest.raises(RunFolderError, match="has a line of step 30 where step 10 is expected"):
         late_observation.flight.update()
 
 
@@ -366,7 +366,7 @@ def check_notices_and_learning_of_the_last_step(tab: Any) -> None:
     tab.press("End")
     tab.wait("window.painted.at(-1)[0] === 49")
     notices = tab.value("[...element('notices').children].map((item) => item.textContent)")
-    learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
+    learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a, gauge 9", "a, gauge 10"))
     assert tab.value("element('latest').getAttribute('aria-pressed')") == "true"
     assert notices == ["Step 49: gauge 4 is off.", "step 49: Look at <b>gauge 3</b>."]
     assert tab.value("element('learnt').textContent") == learnt
