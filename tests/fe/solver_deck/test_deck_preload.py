@@ -117,6 +117,15 @@ def test_a_preloaded_deck_agrees_with_small_changes_by_calculix(tensioned):
 
 
 @needs_calculix
+def test_a_preload_with_large_displacements_agrees_with_calculix(tmp_path):
+    """The tension lengthens the beam by 0.09 %, which large displacements take into account."""
+    structure = converted(tmp_path, solid_beam(STRESS, step="*STEP, NLGEOM"))
+    assert structure.tip() == pytest.approx(tip_under_tension(), rel=1e-2)
+    assert structure.report.load_deviations["force"] < 2e-6
+    assert structure.report.frequency_deviation < 2e-6
+
+
+@needs_calculix
 def test_the_remarks_say_what_of_a_preload_is_constant(tensioned):
     assert tensioned.report.remarks == [
         "the stiffness is that at the end of the preload of 1 step, and stays as it is there",
