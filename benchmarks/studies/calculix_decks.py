@@ -39,7 +39,7 @@ _TIME_REASON = "more than the time limit"
 _REASONS = {
     "no *ELASTIC: heat, electricity, hyperelastic and user materials": r"a material with \*ELASTIC",
     "cyclic symmetry": r"\*CYCLIC SYMMETRY MODEL is one sector",
-    "flow or fluid networks": r"computes a flow|material with .*none; give|\*FLUID",
+    "flow or fluid networks": r"computes a flow",
     "electromagnetic fields": "electromagnetic field",
     "submodel, restart or user elements": r"\*SUBMODEL|\*RESTART|\*USER ELEMENT",
     _TIME_REASON: "CalculiX took more than|seconds for a deck",
