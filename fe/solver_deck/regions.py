@@ -13,11 +13,18 @@ from .linear_model import LinearModel, real_text
 
 _PROPERTIES = {
     "CONDUCTIVITY",
+    "CREEP",
+    "CYCLIC HARDENING",
+    "DAMPING",
     "DENSITY",
     "DEPVAR",
     "ELASTIC",
     "EXPANSION",
+    "HYPERELASTIC",
+    "HYPERFOAM",
+    "PLASTIC",
     "SPECIFIC HEAT",
+    "USER MATERIAL",
 }
 """Keywords that belong to the *MATERIAL above them."""
 

@@ -9,6 +9,8 @@ import pytest
 from fe.runtime.errors import CalculixError, SolutionError
 from fe.solver_deck.comparison import DeckReport
 from fe.solver_deck.conversion import DeckOptions, convert_deck
+from fe.solver_deck.linear_model import read_linear_model
+from fe.solver_deck.regions import choose_regions, with_own_materials
 from fe.structure.affine import static_responses
 from fe.structure.operators import assemble_structure
 from tests.calculix_decks import needs_calculix
@@ -117,12 +119,32 @@ def test_a_preloaded_deck_agrees_with_small_changes_by_calculix(tensioned):
 
 
 @needs_calculix
+def test_a_preload_with_large_displacements_agrees_with_calculix(tmp_path):
+    """The tension lengthens the beam by 0.09 %, which large displacements take into account."""
+    structure = converted(tmp_path, solid_beam(STRESS, step="*STEP, NLGEOM"))
+    assert structure.tip() == pytest.approx(tip_under_tension(), rel=1e-2)
+    assert structure.report.load_deviations["force"] < 2e-6
+    assert structure.report.frequency_deviation < 2e-6
+
+
+@needs_calculix
 def test_the_remarks_say_what_of_a_preload_is_constant(tensioned):
     assert tensioned.report.remarks == [
         "the stiffness is that at the end of the preload of 1 step, and stays as it is there",
         "the loads of the preload keep size and direction: they are no loads of the structure",
         "a region loses the stiffness that it has without preload",
     ]
+
+
+def test_the_copies_of_a_material_of_regions_are_as_plastic_as_the_material(tmp_path):
+    """Without it the preload of a region would be elastic, and CalculiX would not tell."""
+    deck = tmp_path / "deck.inp"
+    deck.write_text(solid_beam(STRESS).replace("*DENSITY", "*PLASTIC\n40.,0.\n80.,0.1\n*DENSITY"))
+    model = read_linear_model(deck)
+    blocks = with_own_materials(model, choose_regions(model, ["BEAM"]))
+    materials = [block.parameters["NAME"] for block in blocks if block.keyword == "MATERIAL"]
+    assert materials == ["METAL_UAVR1", "METAL"]
+    assert [block.keyword for block in blocks].count("PLASTIC") == len(materials)
 
 
 @needs_calculix
