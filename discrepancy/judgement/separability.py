@@ -400,21 +400,23 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
         The distances, see `Separability.distance` [sigma^2].
     """
     small_changes = [_small_changes(screen, effect) for effect in effects]
+    references = [effect.reference for effect in effects]
+    # the first option of an effect is its reference
+    small_references = [changes_of_effect[0] for changes_of_effect in small_changes]
+    small_targets = [small_reference.change for small_reference in small_references]
+    # back to the size of the reference: squared distances grow with the square of it
+    growth = np.array([1.0 / reference.factor**2 for reference in small_references])
     distance = np.zeros((len(effects), len(effects)))
-    for i, effect in enumerate(effects):
-        reference = effect.reference
-        small_reference = small_changes[i][0]
-        for j, other_effect in enumerate(effects):
-            if i == j:
-                continue
-            small_changes_of_other = [small_change.change for small_change in small_changes[j]]
-            first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
-            # back to the size of the reference: squared distances grow with the square of it
-            first_order /= small_reference.factor**2
-            least_distance = min(
-                _squared_distance(screen, reference, other_effect.options), first_order
-            )
-            distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
+    for j, other_effect in enumerate(effects):
+        reach = _Reach(screen, other_effect.options)
+        small_reach = _Reach(screen, [small_change.change for small_change in small_changes[j]])
+        at_reference = reach.squared_distances(references)
+        to_first_order = small_reach.squared_distances(small_targets) * growth
+        distance[:, j] = np.minimum(at_reference, to_first_order)
+    # an effect whose reference cannot be detected is compared at the least size that can
+    squared_sizes = np.array([reference.squared_size for reference in references])
+    distance *= np.maximum(1.0, DETECTION_DISTANCE / squared_sizes)[:, None]
+    np.fill_diagonal(distance, 0.0)
     return distance
 
 
@@ -427,55 +429,98 @@ def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]
     return small_changes
 
 
-def _squared_distance(
-    screen: Screen, target: ScreenedChange, options: Sequence[ScreenedChange]
-) -> float:
-    """Return the squared distance of a change from the changes that an effect can make [sigma^2].
+class _LinearSpace(NamedTuple):
+    """The linear space of the changes that an effect can make near one of them.
 
-    The changes that the effect can make are approximated by a linear space: it is spanned by the
-    option nearest in direction to the target, and by its differences when the parameters of the
-    effect are varied.
+    Attributes
+    ----------
+    directions : (B, D) array
+        The changes that span the space, scaled to unit length.
+    gram : (B, B) array
+        Their inner products.
+    """
+
+    directions: FloatArray
+    gram: FloatArray
+
+
+class _Reach:
+    """The changes that an effect can make, to tell how far other changes are from them.
+
+    Near each of the options they are approximated by a linear space. It is spanned by the option,
+    and by its differences when the parameters of the effect are varied.
 
     Parameters
     ----------
     screen : Screen
         The fit whose inner product measures distances.
-    target : ScreenedChange
-        The change whose distance is computed.
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
-    sign = screen.inner_product_signs
-    if target.squared_size <= 0.0:
-        return 0.0
 
-    def cosine(option: ScreenedChange) -> float:
-        """Return the cosine between option and target, times the length of the target."""
-        if option.squared_size <= 0.0:
+    def __init__(self, screen: Screen, options: Sequence[ScreenedChange]) -> None:
+        self._screen = screen
+        self._options = options
+        self._spaces: dict[int, _LinearSpace] = {}  # by the number of the option
+
+    def squared_distances(self, targets: Sequence[ScreenedChange]) -> FloatArray:
+        """Return the squared distance (T,) of each of T changes from these changes [sigma^2]."""
+        return np.array(
+            [
+                self._squared_distance(target, option_number)
+                for target, option_number in zip(
+                    targets, self._nearest_options(targets), strict=True
+                )
+            ]
+        )
+
+    def _nearest_options(self, targets: Sequence[ScreenedChange]) -> list[int]:
+        """Return the number of the option that is nearest in direction to each target."""
+        signed_options = np.array([option.vector for option in self._options])
+        signed_options *= self._screen.inner_product_signs
+        target_vectors = np.array([target.vector for target in targets])
+        products = np.abs(signed_options @ target_vectors.T)  # (options, targets)
+        squared_lengths = np.array([option.squared_size for option in self._options])
+        inverse_lengths = np.zeros(len(self._options))
+        has_length = squared_lengths > 0.0
+        inverse_lengths[has_length] = 1.0 / np.sqrt(squared_lengths[has_length])
+        cosines = products * inverse_lengths[:, None]  # times the length of the target
+        nearest: list[int] = np.argmax(cosines, axis=0).tolist()
+        return nearest
+
+    def _squared_distance(self, target: ScreenedChange, option_number: int) -> float:
+        """Return the squared distance of a change from the linear space near an option."""
+        if target.squared_size <= 0.0:
             return 0.0
-        return abs(float(target.vector * sign @ option.vector)) / sqrt(option.squared_size)
+        if self._options[option_number].squared_size <= 0.0:
+            return target.squared_size
+        if option_number not in self._spaces:
+            self._spaces[option_number] = self._space_near(self._options[option_number])
+        space = self._spaces[option_number]
+        overlaps = space.directions @ (self._screen.inner_product_signs * target.vector)
+        explained_squares = float(overlaps @ np.linalg.solve(space.gram, overlaps))
+        return max(target.squared_size - explained_squares, 0.0)
 
-    nearest_change = max(options, key=cosine)
-    if nearest_change.squared_size <= 0.0:
-        return target.squared_size
-    # spanning changes: the nearest option, and its differences by the parameters, over ten times
-    # the step of derivatives
-    changes = [nearest_change.vector]
-    for index in range(len(nearest_change.effect_values)):
-        stepped_values = nearest_change.effect_values.copy()
-        stepped_values[index] += 10.0 * PARAMETER_STEP
-        with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change_by_effect(nearest_change.term, stepped_values)
-            changes.append(change.vector - nearest_change.vector)
-    # least squares by normal equations, scaled to unit length; a small multiple of the identity is
-    # added because changes by several parameters may be nearly parallel
-    spanning_changes = np.stack(changes)
-    gram = (spanning_changes * sign) @ spanning_changes.T
-    lengths = np.sqrt(np.maximum(np.diag(gram), LEAST_DIVISOR))
-    gram = gram / np.outer(lengths, lengths) + 1e-6 * np.eye(len(gram))
-    overlaps = (spanning_changes * sign) @ target.vector / lengths
-    explained_squares = float(overlaps @ np.linalg.solve(gram, overlaps))
-    return max(target.squared_size - explained_squares, 0.0)
+    def _space_near(self, option: ScreenedChange) -> _LinearSpace:
+        """Return the linear space near an option.
+
+        The differences by the parameters are taken over ten times the step of derivatives. A small
+        multiple of the identity is added to the inner products, because changes by several
+        parameters may be nearly parallel.
+        """
+        changes = [option.vector]
+        for index in range(len(option.effect_values)):
+            stepped_values = option.effect_values.copy()
+            stepped_values[index] += 10.0 * PARAMETER_STEP
+            with suppress(DiscrepancyError):  # the option may be at the limit of the model
+                change = self._screen.change_by_effect(option.term, stepped_values)
+                changes.append(change.vector - option.vector)
+        directions = np.stack(changes)
+        sign = self._screen.inner_product_signs
+        squared_lengths = np.sum(directions * sign * directions, axis=1)
+        directions /= np.sqrt(np.maximum(squared_lengths, LEAST_DIVISOR))[:, None]
+        gram = (directions * sign) @ directions.T + 1e-6 * np.eye(len(directions))
+        return _LinearSpace(directions, gram)
 
 
 def _confusion_groups(

@@ -367,7 +367,7 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
 
 def test_a_true_parameter_beyond_the_model_is_refused(fleet_file):
     soft = changed(fleet_file, ("mean = 1.0,", "mean = 1.3,"))
-    sentence = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
+    sentence = r"south: the true young_modulus_factor of 2 of 2 assets lies outside"
     with pytest.raises(FleetError, match=sentence):
         fly_fleet(soft, fleet_file.parent / "out")
     assert not (fleet_file.parent / "out").exists()

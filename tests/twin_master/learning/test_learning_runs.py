@@ -270,7 +270,7 @@ def view(folder: Path, stored: xr.DataTree) -> View:
 def test_the_view_shows_the_standard_deviations_and_rewards_of_the_store(view):
     shown = view.expected()
     stored_deviation = np.hypot(view.noise, view.filtered["quantity_standard_deviation"].values)
-    shown_deviation = np.hypot(shown.standard_deviation, shown.noise)
+    shown_deviation = np.hypot(shown.standard_deviation, shown.noise_standard_deviation)
     np.testing.assert_allclose(shown_deviation, stored_deviation, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, view.filtered["reward_mean"].values, atol=0.03)
 
