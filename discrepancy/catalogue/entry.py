@@ -80,6 +80,25 @@ class Prior:
             value = log(value)
         return (value - mean) / deviation
 
+    def multiply(self, u: float, factor: float, lowest: float, highest: float) -> float:
+        """Return the standard normal variable after its value is multiplied by a factor.
+
+        A log-normal value cannot change its sign: zero and less become the value at `lowest`.
+
+        Parameters
+        ----------
+        u : float
+            Standard normal variable of the value before.
+        factor : float
+            The factor on the value.
+        lowest, highest : float
+            The limits of the returned variable.
+        """
+        product = factor * self.value(u)
+        if self.shape == "log_normal":
+            product = max(product, self.value(lowest))
+        return min(max(self.standard_normal(product), lowest), highest)
+
     def step_within_prior(self, u: float, step: float) -> float:
         """Return the standard normal variable after a step of an iteration.
 

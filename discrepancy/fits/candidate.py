@@ -97,8 +97,6 @@ class EffectTerm:
     ) -> FloatArray:
         """Return the scaled parameters (E,) after all magnitudes are multiplied by a factor.
 
-        They stay within `largest_scaled_values`.
-
         Parameters
         ----------
         scaled_values : (E,) array
@@ -106,19 +104,26 @@ class EffectTerm:
         factor : float
             The factor on the physical value of each magnitude.
         lowest, highest : float
-            Further limits of the returned scaled magnitudes.
+            The limits of the returned scaled magnitudes. Without them the factor is exact, and must
+            be positive if a prior is log-normal.
         """
         rescaled = scaled_values.copy()
         for number, parameter in enumerate(self.parameters):
-            if not parameter.magnitude:
-                continue
-            prior = parameter.prior
-            low_end = max(lowest, -prior.largest_standard_normal)
-            high_end = min(highest, prior.largest_standard_normal)
-            physical_value = factor * prior.value(float(scaled_values[number]))
-            if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
-                physical_value = max(physical_value, prior.value(low_end))
-            rescaled[number] = np.clip(prior.standard_normal(physical_value), low_end, high_end)
+            if parameter.magnitude:
+                scaled_value = float(scaled_values[number])
+                rescaled[number] = parameter.prior.multiply(scaled_value, factor, lowest, highest)
+        return rescaled
+
+    def multiply_magnitudes_within_range(
+        self, scaled_values: FloatArray, factor: float
+    ) -> FloatArray:
+        """Return the same, but no magnitude beyond `largest_scaled_values`, to begin a fit with."""
+        rescaled = scaled_values.copy()
+        for number, parameter in enumerate(self.parameters):
+            if parameter.magnitude:
+                scaled_value = float(scaled_values[number])
+                largest = parameter.prior.largest_standard_normal
+                rescaled[number] = parameter.prior.multiply(scaled_value, factor, -largest, largest)
         return rescaled
 
 

@@ -262,7 +262,7 @@ class ForceSearch(MissingForces):
         weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
         for index, (log_evidence, factor) in weighed_columns.items():
             tried_effect = tried_effects[index]
-            start = tried_effect.term.multiply_magnitudes(tried_effect.values, factor)
+            start = tried_effect.term.multiply_magnitudes_within_range(tried_effect.values, factor)
             weighed_by_term.setdefault(tried_effect.term, []).append(
                 _WeighedStart(log_evidence, start)
             )

@@ -64,7 +64,7 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
     (term,) = candidate.terms
     valued_points: list[tuple[float, Point]] = []
     for factor in SEARCH.restart_sizes:
-        effect = term.multiply_magnitudes(start.effect, factor)
+        effect = term.multiply_magnitudes_within_range(start.effect, factor)
         point = replace(start, effect=effect)
         with suppress(DiscrepancyError):  # the effect is larger than the model allows
             valued_points.append((objective(problem, candidate, point), point))

@@ -13,8 +13,8 @@ from scipy.stats import norm
 from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, TrialKind
-from discrepancy.fits.candidate import EffectTerm
-from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.next_experiment import (
     Proposal,
@@ -23,7 +23,12 @@ from discrepancy.judgement.next_experiment import (
     next_experiments,
     oscillates,
 )
-from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    DETECTION_DISTANCE,
+    campaign_as_predicted,
+    compute_separability,
+)
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.self_calibration import SelfCalibration, outcome_of, self_calibrate, wilson_interval
 from discrepancy.self_calibration_file import self_calibration_schema, write_self_calibration
@@ -151,6 +156,42 @@ def test_effects_of_usual_size_are_detectable_and_what_cannot_be_tested_says_why
     for item in laboratory.detectability:
         assert bool(item.reason) is (item.effect.identifier == "washout")
         assert item.reason or item.detectable < item.typical
+
+
+def refitted_chi_square(measured: Campaign, model: LumpedModel, term: EffectTerm, size: float) -> float:
+    """Return χ² of the fit without effect, in data without noise in which an effect of a size hides."""
+    problem = kit.problem_of(measured, model)
+    point = problem.prior_mean_point(Candidate())
+    scaled = term.start_values()
+    (magnitude,) = (number for number, parameter in enumerate(term.parameters) if parameter.magnitude)
+    scaled[magnitude] = term.parameters[magnitude].prior.standard_normal(size)
+    patch = Candidate((term,)).patch(problem.setting, scaled)
+    trials = []
+    for index, data in enumerate(problem.trials):
+        response, _ = problem.response(index, point.shared, point.local[index], patch)
+        trials.append(replace(data.trial, values=problem.prediction(index, point, response)))
+    changed = kit.problem_of(replace(measured, trials=tuple(trials)), model)
+    return fit(changed, Candidate(), changed.prior_mean_point(Candidate())).chi_square
+
+
+@pytest.mark.parametrize("identifier", ["root_compliance", "stiffness_drift"])
+def test_the_least_detectable_size_of_an_effect_leaves_its_squared_distance_after_a_refit(identifier):
+    """Also where other parameters imitate it so well that this size is far below the prior's median."""
+    bench = kit.chain_bench(static=False)
+    measured = bench.measured(3)
+    (row,) = decided(bench.model, measured, identifier).detectability
+    term = EffectTerm(row.effect, row.place)
+    chi_square = refitted_chi_square(measured, bench.model, term, row.detectable)
+    assert chi_square == pytest.approx(DETECTION_DISTANCE, rel=0.1)
+
+
+def test_a_change_is_shrunk_by_the_factor_that_is_told():
+    """However small it becomes: the stated distances are scaled back by this factor."""
+    (effect,) = kit.chosen("root_compliance")
+    term = EffectTerm(effect, "")
+    (prior,) = (parameter.prior for parameter in term.parameters if parameter.magnitude)
+    shrunk = term.multiply_magnitudes(np.zeros(len(term.parameters)), 1e-9)
+    assert prior.value(float(shrunk[0])) == pytest.approx(1e-9 * prior.value(0.0), rel=1e-9)
 
 
 def test_an_effect_within_the_noise_of_anything_is_not_confused_with_all_others():
