@@ -76,9 +76,11 @@ class MotionEstimator(GaussNewton):
     def follow_to_small_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
     ) -> MotionEstimate | None:
-        """Follow an estimate from large missing forces to small missing forces, and return it.
+        """Return the estimate by continuation from large missing forces to small ones.
 
-        The windows of speeds are narrowed first, then the missing forces are lowered.
+        With large missing forces the trajectory follows the readings whatever the laws. They are
+        lowered step by step, and each estimate begins where the last one ended. Before that, laws
+        of the speed are smoothed over wide windows of speeds, which are narrowed step by step.
 
         Parameters
         ----------

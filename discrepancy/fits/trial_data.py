@@ -204,11 +204,13 @@ class LocalUnknowns:
         _, initial_entries, input_constants, time_zero, loss_changes = np.split(
             self.scale * scaled_values, self.ends_by_kind
         )
+        # two columns: the state itself, and its rate where that is unknown, too
         rows, width = self.initial_shape
         initial_states = np.zeros((rows, 2))
         initial_states[:, :width] = initial_entries.reshape(rows, width)
         offset = np.zeros(len(trial.inputs))
         offset[self.offset_inputs] = input_constants
+        # a trial in motion is simulated with the stiffness losses at its start
         health = trial.health[:1] if trial.is_dynamic else trial.health
         if loss_changes.size:
             health = health.copy()

@@ -44,7 +44,9 @@ def window_text(window: GapWindow) -> str:
 
 
 def gap_times_sentence(windows: Sequence[GapWindow]) -> str:
-    """Return a sentence on when the model without effect has a gap; empty without a gap in time.
+    """Return a sentence on when model and readings disagree; empty if no window shows a gap.
+
+    The model is the one without effect: a gap of the best hypothesis is told elsewhere.
 
     Parameters
     ----------

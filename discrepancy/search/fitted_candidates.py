@@ -156,7 +156,8 @@ class FittedCandidates:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
         If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
-        has clearly more evidence.
+        has clearly more evidence. If hypotheses are compared under a wider noise, the candidate's
+        fit under that noise is returned as it is.
         """
         key = rough_fit.candidate.key
         if key in self.wide_fits:
@@ -169,4 +170,5 @@ class FittedCandidates:
             exact_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
             # the rough fit may be at a point from which the model cannot be fitted further
             self.record_fit(rough_fit if exact_fit is None else exact_fit, exact=True)
+        # `record_fit` keeps the better of the new and the former fit
         return self.exact_fits[key]

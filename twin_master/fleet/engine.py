@@ -112,6 +112,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
     one. A single twin for which this happens again is returned as failed.
     """
     from distributed import CancelledError, as_completed
+    from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
 
     piece_of_key: dict[str, Piece] = {}
@@ -140,7 +141,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
                 continue
             reason = "its flight ended the worker process: fly an FMU that crashes isolated."
             result = result_of_unflown(piece.members[0], reason)
-        except CancelledError:
+        except (CancelledError, CommClosedError):  # while it flew, or while its result was fetched
             raise FleetError(
                 "the scheduler was lost: what was flown is kept, "
                 "repeat the command to go on from there."

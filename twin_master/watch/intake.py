@@ -229,10 +229,14 @@ class Intake:
     def restore(self, state: JsonRecord | None) -> None:
         """Restore the state of an earlier process of the watch, so that reading goes on after it.
 
-        If the feed is the file that was read before, reading goes on at the recorded position.
-        Every other feed is read from its first message. Messages that were written to
-        `rejected.jsonl` after the state was recorded are added to the counts, unless the feed
-        contains them again.
+        Where reading goes on depends on the feed:
+
+        - the file that was read before: at the recorded position;
+        - another file: at its first message;
+        - a feed that cannot be read twice, such as a pipe: at what comes next.
+
+        Messages may have been written to `rejected.jsonl` after the state was recorded. The first
+        feed gives them again; for the others they are added to the counts here.
 
         Parameters
         ----------

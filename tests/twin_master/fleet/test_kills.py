@@ -112,10 +112,11 @@ def test_a_fleet_whose_process_was_killed_is_readable_and_goes_on(killed_client,
 
 
 class KillingProgress(Progress):
-    """Kills processes as soon as the first shard is in the store."""
+    """Kills processes when the first shard is in the store, after a pause [s]."""
 
-    def __init__(self, victims: Callable[[], list[psutil.Process]]) -> None:
+    def __init__(self, victims: Callable[[], list[psutil.Process]], pause: float = 0.0) -> None:
         self._victims = victims
+        self._pause = pause
         self.killed: list[int] = []
 
     @contextmanager
@@ -125,6 +126,7 @@ class KillingProgress(Progress):
     def kill_once(self) -> None:
         if self.killed:
             return
+        time.sleep(self._pause)
         for process in self._victims():
             process.kill()
             self.killed.append(process.pid)
@@ -185,9 +187,10 @@ def address_with_worker(port_file: Path) -> str:
     return address
 
 
-def test_a_fleet_whose_scheduler_was_killed_goes_on_without_it(library_file, tmp_path, whole, cluster):
+@pytest.mark.parametrize("pause", [0.0, 1.5], ids=["while twins fly", "while results wait"])
+def test_a_fleet_whose_scheduler_was_killed_goes_on_without_it(library_file, tmp_path, whole, cluster, pause):
     address, scheduler = cluster
-    progress = KillingProgress(lambda: [scheduler])
+    progress = KillingProgress(lambda: [scheduler], pause)
     folder = tmp_path / "fleet"
     with pytest.raises(FleetError, match="the scheduler was lost: what was flown is kept"):
         fly_fleet(growing(library_file), folder, Engine(cluster=address), progress=progress)
