@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 from calibration.result.file import save_calibration
-from fmu_asset.compiled.compiler import find_compiler
-from fmu_asset.errors import FmuBuildError
 from tests import command_line
 from tests.conftest import REFERENCE, synthetic_calibration
+from tests.fmu_asset.making import has_compiler
 from tests.meshes import box
 from tests.refusals import Inputs
 
@@ -158,15 +157,6 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
 """What is in the reader's folder before the first block: commands that were run, and what makes more."""
 
 TABLES = INPUTS.table("pages.toml")
-
-
-def has_compiler() -> bool:
-    """Return whether this machine has a C compiler."""
-    try:
-        find_compiler()
-    except FmuBuildError:
-        return False
-    return True
 
 
 @pytest.mark.parametrize("name", TABLES["minutes"])

@@ -15,6 +15,7 @@ import pytest
 
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, parse_binding
+from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -22,10 +23,20 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     expand_connection,
 )
+from fmu_asset.errors import FmuBuildError
 from tests.kept import packed
 
 ROOT = Path(__file__).parents[2]
 DESCRIPTION, XML = "modelDescription.xml", (".xml", ".ssd", ".ssv", ".ssm")
+
+
+def has_compiler() -> bool:
+    """Return whether this machine has a C compiler."""
+    try:
+        find_compiler()
+    except FmuBuildError:
+        return False
+    return True
 
 
 def tables(test: str, name: str = "refused") -> dict[str, Any]:

@@ -11,7 +11,7 @@ import xarray as xr
 
 from fmu_asset.client.binding import load_binding
 from tests.command_line import refused, said
-from tests.fmu_asset.making import edited
+from tests.fmu_asset.making import edited, has_compiler
 
 END = "</ssm:ParameterMapping>"
 
@@ -181,6 +181,7 @@ def members_of_component(system: Path, component: str) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
+@pytest.mark.skipif(not has_compiler(), reason="there is no C compiler, which compiled FMUs are built with")
 def test_fmus_of_a_design_are_exported_as_the_user_says(tmp_path):
     """A compiled FMU has no Python inside, and other components stay as they are."""
     said("ssp", "export", "uav_wing", "--kind", "compiled", "--out", tmp_path / "wing.ssp")
