@@ -7,7 +7,7 @@ from math import nan
 
 from discrepancy.document import Number, Patch
 from reporting.notebook import html_table
-from reporting.words import between, brief, rounded
+from reporting.words import between, brief, listing, rounded
 
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
@@ -312,6 +312,18 @@ class ForceAtPort:
     law: str = ""
     fitted: ForceLeft | None = None
     held_out: ForceLeft | None = None
+
+    @property
+    def followed_percent(self) -> str:
+        """The largest fraction of the force's variance that follows one variable, in %."""
+        return f"{100.0 * max(self.orders.values()):.0f}"
+
+    @property
+    def dependence(self) -> str:
+        """What the force depends on, as a clause of a sentence."""
+        if not self.ordered_by:
+            return f"it follows none of {listing(self.orders)}"
+        return f"{self.followed_percent} % of its variance follows {listing(self.ordered_by)}"
 
 
 @dataclass(frozen=True)

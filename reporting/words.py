@@ -83,9 +83,11 @@ def is_or_are(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def listing(words: Iterable[str], joint: str = "and") -> str:
-    """Return words as "a, b and c", or with another `joint`."""
+def listing(words: Iterable[str], joint: str = "and", most: int | None = None) -> str:
+    """Return words as "a, b and c", or with another `joint`; those beyond `most` as "3 more"."""
     texts = list(words)
+    if most is not None and len(texts) > most:
+        texts = [*texts[:most], f"{len(texts) - most} more"]
     if len(texts) < 2:
         return "".join(texts)
     return f"{', '.join(texts[:-1])} {joint} {texts[-1]}"

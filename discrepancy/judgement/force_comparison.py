@@ -131,12 +131,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
         if force_of_best_port is None:
             return ""
         force = force_of_best_port.at_port
-        dependence = "it follows none of displacement, velocity, amplitude and time"
-        if force.ordered_by:
-            variables = " and ".join(force.ordered_by)
-            percent = 100.0 * max(force.orders.values())
-            dependence = f"{percent:.0f} % of its variance follows {variables}"
         return (
             f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}; "
-            f"{dependence}."
+            f"{force.dependence}."
         )

@@ -29,7 +29,6 @@ from discrepancy.report.verdict_sentences import (
     group_members,
     headline,
     noise_levels,
-    ordered_percent,
     parameters_sentence,
     proof_scores,
     remainders_sentence,
@@ -230,7 +229,7 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
         )
         cards.append((percent_with_interval(proof.closed), meaning))
     if force is not None and force.ordered_by and not tested_trials(force):
-        meaning = f"what it follows: {ordered_percent(force)} % of its variance"
+        meaning = f"what it follows: {force.followed_percent} % of its variance"
         cards.append((listing(force.ordered_by), meaning))
     if proof is not None and force is None:
         before, _, trials = proof_scores(proof)

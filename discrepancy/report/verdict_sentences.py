@@ -17,7 +17,7 @@ from discrepancy.report.text import (
 )
 from discrepancy.verdict import ForceAtPort, ForceLeft, NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.words import counted, listing
+from reporting.words import counted
 
 ROLE_OF_PROBABILITY = {
     VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
@@ -116,22 +116,10 @@ def force_sentence(force: ForceAtPort) -> str:
         ahead = evidence - other_ports[nearest]
         more_or_less = "more" if ahead >= 0.0 else "less"
         comparison += f", {nats(abs(ahead))} {more_or_less} than at {nearest}"
-    sentence = f"{size} at {motion}{_dependence_phrase(force)} ({comparison})."
+    # a force with a law depends on what the law says
+    dependence = "" if force.law else f"; {force.dependence}"
+    sentence = f"{size} at {motion}{dependence} ({comparison})."
     return f"{sentence} {_sentence_on_law(force)}".rstrip()
-
-
-def _dependence_phrase(force: ForceAtPort) -> str:
-    """Return what a missing force without a law depends on, as the end of a clause."""
-    if force.law:
-        return ""
-    if not force.ordered_by:
-        return "; it follows none of displacement, velocity and time"
-    return f"; {ordered_percent(force)} % of its variance follows {listing(force.ordered_by)}"
-
-
-def ordered_percent(force: ForceAtPort) -> str:
-    """Return the largest fraction of a missing force's variance that follows one variable, in %."""
-    return f"{100.0 * max(force.orders.values()):.0f}"
 
 
 def _sentence_on_law(force: ForceAtPort) -> str:

@@ -41,16 +41,13 @@ def undeclared_units_sentence(description: FmuDescription, binding: Binding) -> 
     ]
     if not doubtful:
         return ""
-    named = doubtful[:_MOST_NAMED]
-    if len(doubtful) > len(named):
-        named.append(f"{len(doubtful) - len(named)} more")
     is_one = len(doubtful) == 1
     has = "has" if is_one else "have"
     its = "its" if is_one else "their"
     return (
         f"{description.label}: {counted(len(doubtful), 'variable')} {has} no unit in the FMU, so "
         f"that {its} numbers are taken to be in the unit of the binding {binding.title}: "
-        f"{listing(named)}. If that is wrong, correct `unit` there."
+        f"{listing(doubtful, most=_MOST_NAMED)}. If that is wrong, correct `unit` there."
     )
 
 

@@ -40,16 +40,13 @@ def unset_inputs_sentence(
             unset.append(_with_start_value(variable))
     if not unset:
         return ""
-    named = unset[:_MOST_NAMED]
-    if len(unset) > len(named):
-        named.append(f"{len(unset) - len(named)} more")
     is_one = len(unset) == 1
     stay = "stays at its start value" if is_one else "stay at their start values"
     them = "it" if is_one else "them"
     return (
         f"{description.label}: {counted(len(unset), 'input')} {stay}, because nobody sets {them}: "
-        f"{listing(named)}. If that is not meant, name {them} in [control], [health] or [load] of "
-        f"the binding {binding.title} and give values."
+        f"{listing(unset, most=_MOST_NAMED)}. If that is not meant, name {them} in [control], "
+        f"[health] or [load] of the binding {binding.title} and give values."
     )
 
 

@@ -39,6 +39,11 @@ def has_compiler() -> bool:
     return True
 
 
+needs_compiler = pytest.mark.skipif(
+    not has_compiler(), reason="there is no C compiler, which compiled FMUs are built with"
+)
+
+
 def tables(test: str, name: str = "refused") -> dict[str, Any]:
     """Return the tables of a TOML file beside a test, by the test's `__file__`."""
     return tomllib.loads(Path(test).with_name(f"{name}.toml").read_text("utf-8"))
