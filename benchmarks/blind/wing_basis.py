@@ -2,9 +2,11 @@
 
 The basis holds static solutions under every load of the campaign and at every place where something
 may be hidden at three values of e, fourteen modes at two of them, again with other masses, and for
-a damaged region all of these again with the damage. A Galerkin solution in it differs from the full
-solution by less than a thousandth of the noise (tests). It is not the basis of the package's
-reduced model, and holds ten times as many vectors.
+a damaged region all of these again with the damage. A point mass pulls at its place with all of its
+inertia, so that the basis has the solutions under forces at each mesh line and half way between
+two. Were there only every second line, the sixth frequency of a wing with 90 g at 1.38 m would be
+0.5 % too high and its third 0.01 %, which a release of 6 s shows. It is not the basis of the
+package's reduced model, and holds ten times as many vectors.
 """
 
 from __future__ import annotations
@@ -83,6 +85,8 @@ class WingBasis:
     stations, line : (S,) m, (3, S, r)
         Mesh lines along the span, and the displacement of the straight chord line there along x, y,
         z.
+    line_between : (3, S - 1, r)
+        The same half way between neighbouring mesh lines.
     holder_stations, holders : dict
         By "tip" and "middle": stations (H,) [m] and, by web, upward displacements (3, H, r) there.
     lift_stations, lift : (L,) m, (L, r) N
@@ -103,6 +107,7 @@ class WingBasis:
     root: FloatArray
     stations: FloatArray
     line: FloatArray
+    line_between: FloatArray
     tip_stations: FloatArray
     tip_holders: FloatArray
     middle_stations: FloatArray
@@ -182,7 +187,8 @@ class _Functionals:
 
     displacement: FloatArray
     line_stations: FloatArray
-    line: tuple[FloatArray, FloatArray, FloatArray]
+    line: tuple[FloatArray, ...]
+    line_between: tuple[FloatArray, ...]
     tip_stations: FloatArray
     tip_holders: tuple[FloatArray, ...]
     middle_stations: FloatArray
@@ -206,6 +212,7 @@ def _functionals(operators: AffineOperators) -> _Functionals:
 
     lines = mesh.span_lines
     line = lines[(lines >= PORT_STATIONS[0]) & (lines <= PORT_STATIONS[1])]
+    between = 0.5 * (line[:-1] + line[1:])
     tip, middle = (lines[(lines > low) & (lines < high)] for low, high in HOLDER_SPAN.values())
     corner = design.planform.semi_span - design.tip_load.distance_from_tip
 
@@ -226,7 +233,8 @@ def _functionals(operators: AffineOperators) -> _Functionals:
     return _Functionals(
         displacement=np.vstack([operators.load_tip, operators.tip_row, rows([MIDDLE])]),
         line_stations=line,
-        line=tuple(rows([(y, 0.3) for y in line], c) for c in range(3)),  # type: ignore[arg-type]
+        line=tuple(rows([(y, 0.3) for y in line], c) for c in range(3)),
+        line_between=tuple(rows([(y, 0.3) for y in between], c) for c in range(3)),
         tip_stations=tip,
         tip_holders=tuple(rows([(y, chord) for y in tip]) for chord in CHORDS),
         middle_stations=middle,
@@ -248,8 +256,9 @@ def _loads(functionals: _Functionals, design: WingDesign) -> FloatArray:
         [
             f.displacement,
             f.corner,
-            f.line[2][::2],
-            f.line[0][-1:],
+            f.line[0][::2],
+            f.line[2],
+            f.line_between[2],
             *f.tip_holders,
             *f.middle_holders[:2],
             *washed,
@@ -319,6 +328,7 @@ def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> Wi
         root=f.root @ basis,
         stations=f.line_stations,
         line=np.array([rows @ basis for rows in f.line]),
+        line_between=np.array([rows @ basis for rows in f.line_between]),
         tip_stations=f.tip_stations,
         tip_holders=np.array([rows @ basis for rows in f.tip_holders]),
         middle_stations=f.middle_stations,

@@ -124,10 +124,20 @@ class WingRig:
         return np.asarray(weights / (0.5 * (plan.root_chord + plan.tip_chord) * plan.semi_span))
 
     def _at(self, basis: WingBasis, station: float) -> FloatArray:
-        """Return the displacement (3, r) of a chord line, interpolated between mesh lines."""
-        k = int(np.clip(np.searchsorted(basis.stations, station) - 1, 0, len(basis.stations) - 2))
-        share = (station - basis.stations[k]) / (basis.stations[k + 1] - basis.stations[k])
-        return np.asarray((1.0 - share) * basis.line[:, k] + share * basis.line[:, k + 1])
+        """Return the displacement (3, r) of the chord line at a station [m].
+
+        It is that of the mesh's quadratic cells: the parabola through the two mesh lines beside
+        the station and the point half way between them.
+        """
+        cell = np.searchsorted(basis.stations, station) - 1
+        cell = int(np.clip(cell, 0, len(basis.stations) - 2))
+        begin, end = basis.stations[cell : cell + 2]
+        t = (station - begin) / (end - begin)
+        return np.asarray(
+            (1.0 - t) * (1.0 - 2.0 * t) * basis.line[:, cell]
+            + 4.0 * t * (1.0 - t) * basis.line_between[:, cell]
+            + t * (2.0 * t - 1.0) * basis.line[:, cell + 1]
+        )
 
     def load(self, place: str, changes: Changes, region: int = -1) -> FloatArray:
         """Return the load (r,) of an upward force of 1 N said to act at a place.

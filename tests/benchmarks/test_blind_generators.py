@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 import benchmarks.blind
 from benchmarks.blind.cases import (
@@ -27,7 +28,9 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.system.structures import WingModel
+from fe.full.factorisation import lowest_eigenpairs
 from fe.runtime.patch import ModelPatch
+from fe.wing.operators import point_masses, section_displacement
 from tests.discrepancy.rigs import chosen, model_of, setting_of
 from tests.test_architecture import named_imports
 
@@ -87,6 +90,23 @@ def test_a_hidden_effect_shows_as_its_patch_in_the_model(rig, draw):
         assert np.abs((found - expected) / noise).max() < NEAR[work.rig.name], trial.name
         seen = max(seen, np.abs((expected - bare[trial.name]) / noise).max())
     assert seen > 0.6
+
+
+@pytest.mark.parametrize("station", [0.9477, 1.3834, 1.4071])
+def test_a_wing_with_a_point_mass_has_the_frequencies_of_its_full_model(folder, station):
+    mass, parameters = 0.09, {"young_modulus_factor": 1.03, "servo_mass": 0.165, "pitot_mass": 0.14}
+    rig = workbench("wing", folder).rig
+    operators = rig.store.operators
+    stiffness = operators.stiffness({"young_modulus_factor": parameters["young_modulus_factor"]})
+    whole_mass = operators.mass(point_masses(parameters["servo_mass"], parameters["pitot_mass"]))
+    at_place = section_displacement(operators.wing_mesh, station, 0.3)
+    for direction in np.eye(3):
+        row = sparse.csc_array((operators.expansion.T @ np.kron(at_place, direction))[:, np.newaxis])
+        whole_mass = whole_mass + mass * (row @ row.T)
+    squares, _ = lowest_eigenpairs(stiffness, whole_mass.tocsr(), 6)
+    damping = {"damping_alpha": 0.0, "damping_beta": 0.0}
+    structure = rig.structure(parameters | damping, Changes(mass=mass, mass_station=station))
+    np.testing.assert_allclose(structure.angular_frequency[:6], np.sqrt(squares), rtol=5e-6)
 
 
 ORDER = Order("case-0007", "catalogue", "lumped", ("coulomb_friction",), 5)
