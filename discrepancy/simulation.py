@@ -142,7 +142,7 @@ class Simulator:
             if has_free_initial_state(
                 trial
             ):  # the prior has no information: the state stays as fitted
-                initial_state = slice(*data.unknowns.ends_by_kind[:2])
+                initial_state = data.unknowns.indices.initial_state
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
             response, _ = problem.response(

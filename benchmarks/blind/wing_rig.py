@@ -129,8 +129,8 @@ class WingRig:
         It is that of the mesh's quadratic cells: the parabola through the two mesh lines beside
         the station and the point half way between them.
         """
-        cell = np.searchsorted(basis.stations, station) - 1
-        cell = int(np.clip(cell, 0, len(basis.stations) - 2))
+        lines_before = int(np.searchsorted(basis.stations, station))
+        cell = min(max(lines_before - 1, 0), len(basis.stations) - 2)
         begin, end = basis.stations[cell : cell + 2]
         t = (station - begin) / (end - begin)
         return np.asarray(

@@ -150,25 +150,26 @@ def nuisance_derivatives(
             differences.slope(parameter_step, no_local_step, step, both_sides=both_sides)
         )
     # initial state and constants of inputs
-    zeros_end, _, inputs_end, time_zero_end = unknowns.ends_by_kind
+    indices = unknowns.indices
     by_local = [
         differences.slope(no_shared_step, with_step(no_local_step, k), PARAMETER_STEP)
-        for k in range(zeros_end, inputs_end)
+        for k in (*indices.initial_state, *indices.input_constants)
     ]
     if unknowns.has_time_zero:
+        time_zero = indices.time_zero.start
         if differences.rates is None:
-            time_zero_step = with_step(no_local_step, inputs_end)
+            time_zero_step = with_step(no_local_step, time_zero)
             by_local.append(differences.slope(no_shared_step, time_zero_step, PARAMETER_STEP))
         else:
             # a shift of time zero by scale u changes the response by its rate times scale u
-            by_local.append(differences.rates * unknowns.scale[inputs_end])
+            by_local.append(differences.rates * unknowns.scale[time_zero])
     # health
     if len(unknowns.health_rows):
         by_local.extend(
             _health_derivatives(
                 data,
                 local_point,
-                time_zero_end,
+                indices.health.start,
                 differences.response.shape,
                 lambda step: differences.slope(
                     no_shared_step, step, PARAMETER_STEP, both_sides=False

@@ -38,7 +38,8 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     """Test whether the residuals of a fit are white noise of the recorded level.
 
     The tests are those of `absolute_fit_tests`. The least of their p-values, multiplied by the
-    number of tests, is compared with `ABSOLUTE_FIT_LEVEL` (Holm 1979, Scand. J. Statist. 6, 65-70).
+    number of tests (Bonferroni's correction, the first step of Holm 1979, Scand. J. Statist. 6,
+    65-70), is compared with `ABSOLUTE_FIT_LEVEL`.
 
     Parameters
     ----------
@@ -54,24 +55,33 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
         False if one of the other tests (priors, whiteness) fails.
     """
     tests = absolute_fit_tests(problem, fit)
-    has_variance_test = any(test.name.startswith("variance") for test in tests)
-    has_noise_record = bool(np.any(problem.record_freedom[problem.sample_counts > 0.0] > 0.0))
-    cause = "Too few readings for the unknowns" if has_noise_record else "No noise record"
-    worst_test = min(tests, key=lambda test: test.p_value, default=NamedTest("", np.nan))
-    statistic = min(worst_test.p_value * len(tests), 1.0)
-    passed = True if has_variance_test else None
-    reason = "The residuals agree with the noise records."
     if not tests:
-        reason = f"{cause}: the fit cannot be judged."
-    elif statistic < ABSOLUTE_FIT_LEVEL:
-        passed = False
+        reason = f"{_lacking_for_variance(problem)}: the fit cannot be judged."
+        return _absolute_fit_gate(None, np.nan, reason)
+    worst_test = min(tests, key=lambda test: test.p_value)
+    corrected_p_value = min(worst_test.p_value * len(tests), 1.0)
+    if corrected_p_value < ABSOLUTE_FIT_LEVEL:
         reason = f"The residuals are larger than noise and priors allow: {worst_test.name}."
-    elif not has_variance_test:
+        return _absolute_fit_gate(False, corrected_p_value, reason)
+    if not any(test.name.startswith("variance") for test in tests):
         reason = (
-            f"{cause}: only the priors and the whiteness of the residuals could be judged, and "
-            "both agree with the fit."
+            f"{_lacking_for_variance(problem)}: only the priors and the whiteness of the residuals "
+            "could be judged, and both agree with the fit."
         )
-    return Gate("absolute fit", passed, statistic, ABSOLUTE_FIT_LEVEL, reason)
+        return _absolute_fit_gate(None, corrected_p_value, reason)
+    reason = "The residuals agree with the noise records."
+    return _absolute_fit_gate(True, corrected_p_value, reason)
+
+
+def _absolute_fit_gate(passed: bool | None, corrected_p_value: float, reason: str) -> Gate:
+    """Return the outcome of the test of absolute fit, see `Gate`."""
+    return Gate("absolute fit", passed, corrected_p_value, ABSOLUTE_FIT_LEVEL, reason)
+
+
+def _lacking_for_variance(problem: Problem) -> str:
+    """Return what a comparison of variances with the noise records lacks, to begin a sentence."""
+    has_noise_record = bool(np.any(problem.record_freedom[problem.sample_counts > 0.0] > 0.0))
+    return "Too few readings for the unknowns" if has_noise_record else "No noise record"
 
 
 def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:

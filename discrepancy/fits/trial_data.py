@@ -125,6 +125,16 @@ class SharedUnknowns:
         return np.array([gains.get(name, 0.0) for name in channels])
 
 
+class LocalIndices(NamedTuple):
+    """The indices of each kind of unknown among the unknowns of one trial."""
+
+    zeros: range
+    initial_state: range
+    input_constants: range
+    time_zero: range
+    health: range
+
+
 @dataclass(frozen=True)
 class LocalUnknowns:
     """The layout of the unknowns of one trial.
@@ -171,20 +181,22 @@ class LocalUnknowns:
         return len(self.zero_columns)
 
     @cached_property
-    def ends_by_kind(self) -> list[int]:
-        """The indices after the zeros, initial state, input constants, and time zero."""
+    def indices(self) -> LocalIndices:
+        """The indices of each kind of unknown among the local unknowns (L,)."""
         counts = (
             self.zero_count,
             prod(self.initial_shape),
             len(self.offset_inputs),
             int(self.has_time_zero),
+            len(self.health_rows),
         )
-        return list(accumulate(counts))
+        ends = list(accumulate(counts))
+        return LocalIndices(*map(range, [0, *ends[:-1]], ends))
 
     def channel_zeros(self, scaled_values: FloatArray, channel_count: int) -> FloatArray:
         """Return the zeros (C,) of the trial's channels, given its scaled unknowns (L,)."""
         zeros = np.zeros(channel_count)
-        zeros[self.zero_columns] = (self.scale * scaled_values)[: self.zero_count]
+        zeros[self.zero_columns] = (self.scale * scaled_values)[self.indices.zeros]
         return zeros
 
     def conditions(
@@ -201,26 +213,39 @@ class LocalUnknowns:
         scaled_values : (L,) array
             The scaled values of the L unknowns of the trial.
         """
-        _, initial_entries, input_constants, time_zero, loss_changes = np.split(
-            self.scale * scaled_values, self.ends_by_kind
+        values = self.scale * scaled_values
+        # the unknown constants of the inputs; the others are known exactly
+        offsets = np.zeros(len(trial.inputs))
+        offsets[self.offset_inputs] = values[self.indices.input_constants]
+        time_zero = float(values[self.indices.time_zero.start]) if self.has_time_zero else 0.0
+        return Conditions(
+            parameters=parameters,
+            initial=self._initial_states(values),
+            clock=(0.0, time_zero),
+            health=self._health(trial, values),
+            offset=tuple(offsets.tolist()),
         )
-        # two columns: the state itself, and its rate where that is unknown, too
-        rows, width = self.initial_shape
+
+    def _initial_states(self, values: FloatArray) -> FloatArray:
+        """Return displacements and velocities at the start (R, 2); known velocities are zero."""
+        rows, column_count = self.initial_shape
         initial_states = np.zeros((rows, 2))
-        initial_states[:, :width] = initial_entries.reshape(rows, width)
-        offset = np.zeros(len(trial.inputs))
-        offset[self.offset_inputs] = input_constants
+        initial_entries = values[self.indices.initial_state]
+        initial_states[:, :column_count] = initial_entries.reshape(rows, column_count)
+        return initial_states
+
+    def _health(self, trial: Trial, values: FloatArray) -> FloatArray:
+        """Return the stiffness losses of a trial, corrected by their unknown changes."""
         # a trial in motion is simulated with the stiffness losses at its start
         health = trial.health[:1] if trial.is_dynamic else trial.health
+        loss_changes = values[self.indices.health]
         if loss_changes.size:
             health = health.copy()
             uncertain_entries = (self.health_rows, self.health_columns)
             health[uncertain_entries] = np.clip(
                 health[uncertain_entries] + loss_changes, LEAST_LOSS, LARGEST_LOSS
             )
-        # the sum is 0 without an unknown time zero, and its only entry otherwise
-        times = (0.0, float(time_zero.sum()))
-        return Conditions(parameters, initial_states, times, health, tuple(offset.tolist()))
+        return health
 
 
 def shared_unknowns(

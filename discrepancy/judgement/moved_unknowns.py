@@ -195,8 +195,7 @@ def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[Moved
     for data, local_values in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
-        zeros_end, initial_end, inputs_end, _ = layout.ends_by_kind
-        indices = [*range(zeros_end), *range(initial_end, inputs_end)]
+        indices = [*layout.indices.zeros, *layout.indices.input_constants]
         for (name, unit), index in zip(names_and_units, indices, strict=True):
             if layout.precision[index] > 0.0:
                 scaled_value = float(local_values[index])

@@ -180,7 +180,7 @@ def verdict_by_simulations(search: Search) -> VerdictOutcome:
         ]
         if not roughly_fitted_sets:
             break
-        search.fit_exactly(search.best_fit_of_set(roughly_fitted_sets[0]))
+        search.fit_to_convergence(search.best_fit_of_set(roughly_fitted_sets[0]))
         probabilities = search.set_probabilities()
     return decide_verdict(VerdictCase(search, probabilities))
 

@@ -11,7 +11,7 @@ It grows with n only until the unknowns imitate the change. Then their prior dev
 and neither less noise nor more trials of the same kind help.
 """
 
-from math import inf
+from math import inf, prod
 
 import numpy as np
 from scipy.optimize import brentq
@@ -147,7 +147,6 @@ def _names_of_trial_unknowns(problem: Problem, data: TrialData) -> list[str]:
     """Return the names of the unknowns of a trial, without the name of the trial."""
     trial = data.trial
     layout = data.unknowns
-    zeros_end, initial_end, inputs_end, times_end = layout.ends_by_kind
     names = []
     for index, column in enumerate(layout.zero_columns):
         channel = trial.channels[column]
@@ -156,10 +155,11 @@ def _names_of_trial_unknowns(problem: Problem, data: TrialData) -> list[str]:
             factor, unit = UNITS[problem.campaign.channels[channel].quantity].drawn
             stated_text = f"stated to {factor * layout.scale[index]:.3g} {unit}"
         names.append(f"the zero of {channel} ({stated_text})")
-    names += ["how the trials begin"] * (initial_end - zeros_end)
-    for index in layout.offset_inputs[: inputs_end - initial_end]:
+    names += ["how the trials begin"] * prod(layout.initial_shape)
+    for index in layout.offset_inputs:
         names.append(f"the constant of {trial.inputs[index].name}")
-    names += ["the time of the release"] * (times_end - inputs_end)
+    if layout.has_time_zero:
+        names.append("the time of the release")
     for column in layout.health_columns:
         names.append(f"the stated loss of {trial.regions[column]}")
     return names

@@ -74,7 +74,7 @@ class VerdictCase:
         self.leading_set = next(iter(probabilities)) if leading_set is None else leading_set
         self.leading_fit = search.best()
         if self.leading_set:
-            self.leading_fit = search.fit_exactly(search.best_fit_of_set(self.leading_set))
+            self.leading_fit = search.fit_to_convergence(search.best_fit_of_set(self.leading_set))
         self.conclusion = Conclusion.from_probabilities(search, self.leading_fit, probabilities)
         self.no_effect_probability = probabilities.get((), 0.0)
         self.has_enough_evidence = self.conclusion.log_bayes_factor >= SEARCH.least_log_bayes_factor
@@ -246,7 +246,7 @@ class VerdictCase:
             return self._below_limit_verdict()
         members = []
         for names in self.probable_sets:
-            fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
+            fit = self.search.fit_to_convergence(self.search.best_fit_of_set(names))
             members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are not members, and their probability is not counted
         passing_members = [member for member in members if not member.absolute_fit.has_failed]

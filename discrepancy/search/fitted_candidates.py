@@ -133,12 +133,19 @@ class FittedCandidates:
         probabilities = normalised_probabilities(log_weights_in_order).tolist()
         return dict(zip(sets_in_order, probabilities, strict=True))
 
-    def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
-        """Store a fit unless an earlier fit of the same candidate has more evidence."""
+    def record_fit(self, fit: CandidateFit, *, exact: bool) -> CandidateFit:
+        """Store a fit unless an earlier fit of the same candidate has more evidence.
+
+        Returns
+        -------
+        CandidateFit
+            The fit that is kept, the new one or the earlier one.
+        """
         fits = self.exact_fits if exact else self.rough_fits
         key = fit.candidate.key
         if key not in fits or fits[key].log_evidence < fit.log_evidence:
             fits[key] = fit
+        return fits[key]
 
     def is_unexplained(self) -> bool:
         """Return whether the best candidate does not pass the test of absolute fit.
@@ -152,7 +159,7 @@ class FittedCandidates:
         """Whether all trials are in motion."""
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
-    def fit_exactly(self, rough_fit: CandidateFit) -> CandidateFit:
+    def fit_to_convergence(self, rough_fit: CandidateFit) -> CandidateFit:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
         If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
@@ -162,13 +169,11 @@ class FittedCandidates:
         key = rough_fit.candidate.key
         if key in self.wide_fits:
             return self.wide_fits[key]
-        previous_fit = self.exact_fits.get(key)
-        if (
-            previous_fit is None
-            or previous_fit.log_evidence < rough_fit.log_evidence - SEARCH.refit_gain
-        ):
-            exact_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
-            # the rough fit may be at a point from which the model cannot be fitted further
-            self.record_fit(rough_fit if exact_fit is None else exact_fit, exact=True)
-        # `record_fit` keeps the better of the new and the former fit
-        return self.exact_fits[key]
+        earlier_fit = self.exact_fits.get(key)
+        if earlier_fit is not None:
+            gained_evidence = rough_fit.log_evidence - earlier_fit.log_evidence
+            if gained_evidence <= SEARCH.refit_gain:
+                return earlier_fit
+        converged_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
+        # the rough fit may be at a point from which the model cannot be fitted further
+        return self.record_fit(converged_fit or rough_fit, exact=True)

@@ -291,7 +291,7 @@ class Search(FittedCandidates):
             promising_fits,
             lambda fit: f"fitting {fit.candidate.description} until it converges",
         ):
-            exact_fits.append(self.fit_exactly(fit))
+            exact_fits.append(self.fit_to_convergence(fit))
         return sorted(exact_fits, key=lambda fit: -self.score(fit))
 
     def refine_time_steps(self) -> None:

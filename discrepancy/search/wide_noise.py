@@ -439,13 +439,13 @@ def _fit_under_wide_noise(
         promising_fits,
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
-        _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))
+        _add_wide_fit(wide_fits, search, wide_problem, search.fit_to_convergence(fit))
     # fit the subsets of the best set, to compare whether each of its effects is needed
     leading_names = set(max(wide_fits.values(), key=search.score).candidate.identifiers)
     for fit in list(search.compared_fits().values()):
         names = set(fit.candidate.identifiers)
         if names and names < leading_names and fit.candidate.key not in wide_fits:
-            _add_wide_fit(wide_fits, search, wide_problem, search.fit_exactly(fit))
+            _add_wide_fit(wide_fits, search, wide_problem, search.fit_to_convergence(fit))
     return wide_fits
 
 
