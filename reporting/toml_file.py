@@ -239,8 +239,8 @@ NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
-Fault = tuple[object, str]
-"""Whether a table has the fault (a true value), and the message."""
+Check = tuple[object, str]
+"""Whether a check of a table failed (a true value), and the message that is told then."""
 
 
 class Section(BaseModel):
@@ -248,17 +248,18 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield (is present, message) of each possible fault of the table.
+    def checks(self) -> Iterator[Check]:
+        """Yield (has failed, message) of each check of the table.
 
-        The first fault that the table has is raised; those after it are not evaluated.
+        The first one that failed is raised, and those after it are not evaluated. A check may
+        therefore rely on those before it.
         """
         yield from ()
 
     @model_validator(mode="after")
-    def _refuse_faults(self) -> Self:
-        for has_fault, message in self.faults():
-            if has_fault:
+    def _refuse_failed_checks(self) -> Self:
+        for has_failed, message in self.checks():
+            if has_failed:
                 raise ValueError(message)
         return self
 

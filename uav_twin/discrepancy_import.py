@@ -218,25 +218,25 @@ def import_files(
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    understanding = _understand_files(files, answers, model)
-    _print_understanding(understanding)
+    imported = _understand_files(files, answers, model)
+    _print_laboratory_import(imported)
     # Without a terminal, a question that is still open is an error of `campaign`
     is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive:
-        understanding = _ask_and_confirm(ImportCommand(files, out, model), understanding, folder)
-    campaign = understanding.campaign(folder.resolve().name)
-    write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
+        imported = _ask_and_confirm(ImportCommand(files, out, model), imported, folder)
+    campaign = imported.campaign(folder.resolve().name)
+    write_campaign(campaign, folder, si=True, units=imported.units(), left_out_as_empty=True)
     terminal.say(f"Wrote {folder}: {campaign_size(campaign)}.")
-    if understanding.assumed:
+    if imported.assumed:
         terminal.say(
-            f"{understanding.assumed} Where you know better, give --zero and --gain, or correct "
+            f"{imported.assumed} Where you know better, give --zero and --gain, or correct "
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
     terminal.say(f"Next: uav-twin discrepancy check {shell_arguments(folder, model)}")
 
 
 def _ask_and_confirm(
-    command: ImportCommand, understanding: "LaboratoryImport", folder: Path
+    command: ImportCommand, imported: "LaboratoryImport", folder: Path
 ) -> "LaboratoryImport":
     """Ask what is open, and whether to write the folder; return the import with the answers.
 
@@ -247,10 +247,10 @@ def _ask_and_confirm(
     typer.Exit
         If the user stops the dialogue, or wants nothing to be written.
     """
-    dialogue = ImportDialogue(command, understanding)
+    dialogue = ImportDialogue(command, imported)
     has_asked = dialogue.ask_all()
     if has_asked:
-        _print_understanding(dialogue.understanding)
+        _print_laboratory_import(dialogue.understanding)
     dialogue.understanding.campaign(folder.resolve().name)  # wrong files are told before
     if has_asked:
         dialogue.print_repetition()
@@ -303,12 +303,12 @@ def _understand_files(
     from discrepancy.model_choice import choose_model
 
     sheets = [read_sheet(file) for file in files]
-    understanding = LaboratoryImport(sheets, answers)
+    imported = LaboratoryImport(sheets, answers)
     if model is None:
-        return understanding
+        return imported
     chosen_model = choose_model(model).model
     return LaboratoryImport(
-        understanding.sheets,
+        imported.sheets,
         answers,
         chosen_model.output_quantity,
         chosen_model.outputs_with_quantities,
@@ -319,37 +319,41 @@ _DECIMAL_MARKS = {".": "points", ",": "commas"}
 """The word for each decimal mark in the printed table."""
 
 
-def _print_understanding(understanding: "LaboratoryImport") -> None:
-    """Print how each file and each column is understood.
-
-    The row of a column has an example: its first cell that is not zero, or its last cell, and the
-    value of this cell in SI units.
-    """
-    for sheet in understanding.sheets:
-        kind = understanding.kinds[sheet.name] or "?"
-        decimal_mark = _DECIMAL_MARKS.get(understanding.decimals[sheet.name], "?")
+def _print_laboratory_import(imported: "LaboratoryImport") -> None:
+    """Print how each file and each column is understood, a column with one cell as an example."""
+    decimal_signs = imported.decimals
+    for sheet in imported.sheets:
+        kind = imported.kinds[sheet.name] or "?"
+        decimal_mark = _DECIMAL_MARKS.get(decimal_signs[sheet.name], "?")
         terminal.say(f"{sheet.name}: {kind}; {sheet.remark}; decimal {decimal_mark}")
-    for sentence in understanding.clock_sentences:
+    for sentence in imported.clock_sentences:
         terminal.say(sentence)
-    rows = []
-    for column in understanding.columns:
+    table_rows = []
+    for column in imported.columns:
         sheet = column.sheet
         cells = sheet.columns[sheet.heads.index(column.head)]
-        # The decimal mark may be unknown, so that cells are texts: not zero means a digit 1 to 9
-        nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
-        row = nonzero_rows[0] if nonzero_rows else -1
-        si_value = column.cells_in_si(understanding.decimals[sheet.name])[row]
-        rows.append(
+        example_row = _row_of_example(cells)
+        si_value = column.cells_in_si(decimal_signs[sheet.name])[example_row]
+        table_rows.append(
             (
                 sheet.name,
                 column.head,
                 column.unit or "?",
                 column.role or "?",
                 column.quantity or "",
-                cells[row],
+                cells[example_row],
                 f"{float(si_value):.6g} {column.si}" if si_value else "",
             )
         )
-    if rows:
+    if table_rows:
         headings = ("file", "column", "unit", "is", "quantity", "a cell", "in SI")
-        terminal.print_table(headings, rows)
+        terminal.print_table(headings, table_rows)
+
+
+def _row_of_example(cells: Sequence[str]) -> int:
+    """Return the row of the first cell of a column that is not zero, -1 (the last) if all are.
+
+    The decimal mark may be unknown, so that cells are texts: not zero means a digit 1 to 9.
+    """
+    nonzero_rows = (row for row, cell in enumerate(cells) if re.search("[1-9]", cell))
+    return next(nonzero_rows, -1)

@@ -16,7 +16,7 @@ from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.json_file import JsonRecord
-from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
+from reporting.toml_file import Check, Name, NotNegative, Number, Positive, Section, validate
 from reporting.words import comma_list
 
 FORMAT = 1
@@ -261,23 +261,23 @@ class CampaignSection(Section):
         """Channels and inputs."""
         return (*self.channel, *self.input)
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the rules that concern several tables of the file, each with its message.
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks that concern several tables of the file, each with its message.
 
         The first entry of a fault is true if the file breaks the rule.
         """
         for table in ("channel", "input", "trial"):
             repeated = _first_repeated(section.name for section in getattr(self, table))
             yield repeated, f"there is more than one {table} called {repeated!r}: rename one"
-        yield from self._column_faults()
-        yield from self._logger_faults()
+        yield from self._column_checks()
+        yield from self._logger_checks()
         yield from self._unknown_channels()
 
     def _has_trial_of(self, *kinds: records.TrialKind) -> bool:
         """Return whether there is a trial of any of these kinds."""
         return any(trial.kind in kinds for trial in self.trial)
 
-    def _column_faults(self) -> Iterator[Fault]:
+    def _column_checks(self) -> Iterator[Check]:
         """Yield unused inputs, columns with several readers, and mixed units of temperature."""
         have_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
         no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*have_inputs)
@@ -310,7 +310,7 @@ class CampaignSection(Section):
             "temperatures are given in degC and in K: use one of the two units for all of them",
         )
 
-    def _unknown_channels(self) -> Iterator[Fault]:
+    def _unknown_channels(self) -> Iterator[Check]:
         """Yield the names in `channels` and `left_out` of trials that are not names of channels."""
         channel_names = {channel.name for channel in self.channel}
         for trial in self.trial:
@@ -321,8 +321,8 @@ class CampaignSection(Section):
                     f"which is not among the channels {', '.join(sorted(channel_names))}",
                 )
 
-    def _logger_faults(self) -> Iterator[Fault]:
-        """Yield the rules on the key `loggers`: each channel and input must be on one logger."""
+    def _logger_checks(self) -> Iterator[Check]:
+        """Yield the checks on the key `loggers`: each channel and input must be on one logger."""
         if not self.loggers:
             return
         inputs = {recorded_input.name for recorded_input in self.input}

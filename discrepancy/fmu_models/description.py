@@ -15,7 +15,7 @@ from discrepancy.system.model_file import (
     Section,
 )
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.toml_file import Fault, Name, Number, Positive
+from reporting.toml_file import Check, Name, Number, Positive
 from scenarios import binding_files
 
 CARRIED = tuple(primitive.kind for primitive in (*STRUCTURE, *LOADS, StiffnessDrift))
@@ -129,7 +129,7 @@ class ReleaseSection(Section):
     hold: Name | None = None
     output: Name | None = None
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a fault if there is not exactly one way of release, or no output for `hold`."""
         has_none_or_both = (self.displacement is None) == (self.hold is None)
         yield (
@@ -250,10 +250,10 @@ class FmuModelDescription(ModelDescription):
     superposition: bool = True
     isolated: bool = True
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the rules on the whole file: on names, effects and the reference temperature."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks on the whole file: on names, effects and the reference temperature."""
         for kind in ("port", "parameter", "output", "input"):
-            yield from self.repeated_name_faults(
+            yield from self.repeated_name_checks(
                 kind, [section.name for section in getattr(self, kind)]
             )
         for kind in self.effects:

@@ -1,4 +1,4 @@
-"""A lumped model as a TOML file: its content, its matrices and the faults that it may have."""
+"""A lumped model as a TOML file: its content, its matrices and the checks of both."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -31,7 +31,7 @@ from discrepancy.system.lumped_sections import (
 )
 from discrepancy.system.model_file import ModelDescription
 from reporting.choices import did_you_mean
-from reporting.toml_file import Fault, Positive
+from reporting.toml_file import Check, Positive
 from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
@@ -75,6 +75,8 @@ BLOCKS = {
     "flow_of_displacements": Block(0, rows_of_states=True, columns_of_states=False),
 }
 """Matrices in the equation of all unknowns."""
+SECTIONS_WITH_VECTORS = ("input", "output", "port", "place", "load", "controller")
+"""Tables of the file with vectors of one entry for each displacement or state."""
 ADVICE_FOR_FREE_STRUCTURE = (
     "; a structure that can float away has no static response: set `free = true` if it can"
 )
@@ -245,32 +247,33 @@ class LumpedDescription(ModelDescription):
             matrices[kind] = sign * factors.get(kind, 1.0) * sum_of_parts
         return matrices
 
-    # ------------------------------------------------------------ faults of a file
+    # ------------------------------------------------------------ checks of a file
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the rules that concern several tables of the file, each with its message."""
-        yield from self._missing_matrix_faults()
-        yield from self._name_faults()
-        yield from self._vanishing_matrix_faults()
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks that concern several tables of the file, each with its message."""
+        yield from self._missing_matrix_checks()
+        yield from self._name_checks()
+        yield from self._vanishing_matrix_checks()
         for kind in BLOCKS:
-            yield from self._matrix_faults(kind)
-        for kind in ("input", "output", "port", "place", "load", "controller"):
+            yield from self._matrix_checks(kind)
+        for kind in SECTIONS_WITH_VECTORS:
             for section in getattr(self, kind):
-                yield from self._vector_faults(kind, section)
-        n = self.displacement_count
+                yield from self._vector_checks(kind, section)
+        displacement_count = self.displacement_count
         if self.root is not None:
-            is_wrong = len(self.root.lever) != n or not any(self.root.lever)
-            yield is_wrong, f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero"
+            is_wrong = len(self.root.lever) != displacement_count or not any(self.root.lever)
+            needed_entries = counted(displacement_count, "entry", "entries")
+            yield is_wrong, f"lever of root needs {needed_entries}, not all zero"
         if self.damping is not None and self.damping.ratios is not None:
             count = len(self.damping.ratios)
             yield (
-                count != n,
-                f"damping.ratios needs one value for each mode, {n} in all, but has "
-                f"{counted(count, 'value')}",
+                count != displacement_count,
+                f"damping.ratios needs one value for each mode, {displacement_count} in all, but "
+                f"has {counted(count, 'value')}",
             )
 
-    def _missing_matrix_faults(self) -> Iterator[Fault]:
-        """Yield the rules on which matrices must be given."""
+    def _missing_matrix_checks(self) -> Iterator[Check]:
+        """Yield the checks on which matrices must be given."""
         displacement_count = self.displacement_count
         state_count = self.state_count
         yield (
@@ -286,41 +289,50 @@ class LumpedDescription(ModelDescription):
         yield lacks_conductance, "conductance is missing: give it, or [[conductance_part]]"
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
-    def _matrix_faults(self, kind: str) -> Iterator[Fault]:
-        """Yield the rules on the size, symmetry and definiteness of the matrices of a kind.
+    def _matrix_checks(self, kind: str) -> Iterator[Check]:
+        """Yield the checks on the size, symmetry and definiteness of the matrices of a kind.
 
-        Each is a pair: whether the rule is broken, and the message. The first broken rule ends the
-        check of a file, so that a later rule may rely on those before it, as on the size here.
+        Several matrices of a kind are parts of one, which is their sum. The first check that fails
+        ends those of a file, so that a later one may rely on the size.
         """
-        block = BLOCKS[kind]
-        rows = self.state_count if block.rows_of_states else self.displacement_count
-        columns = self.state_count if block.columns_of_states else self.displacement_count
         matrices = self.matrices_of(kind)
         for name, matrix in matrices.items():
-            place = self._place_of_matrix(kind, name)
-            form = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
-            yield (
-                [len(row) for row in matrix] != [columns] * rows,
-                f"{place} must be a {rows} x {columns} matrix{form}",
-            )
+            label = self._label_of_matrix(kind, name)
+            yield self._size_check(kind, label, matrix)
             values = np.array(matrix)
             tolerance = 1e-9 * np.abs(values).max()
             if kind in SYMMETRIC:
                 is_asymmetric = np.abs(values - values.T).max() > tolerance
-                yield is_asymmetric, f"{place} must be symmetric"
+                yield is_asymmetric, f"{label} must be symmetric"
             if kind == "damping":
                 feeds_energy = np.linalg.eigvalsh(values)[0] < -tolerance
-                yield feeds_energy, f"{place} must not feed energy: it has a negative eigenvalue"
+                yield feeds_energy, f"{label} must not feed energy: it has a negative eigenvalue"
         if matrices and kind in ("mass", "stiffness", "capacity"):
-            eigenvalues = np.linalg.eigvalsh(np.sum([*matrices.values()], axis=0))
-            may_be_singular = kind == "stiffness" and self.free
-            is_semidefinite = eigenvalues[0] >= -1e-9 * eigenvalues[-1]
-            is_definite = eigenvalues[0] > 0.0 or (may_be_singular and is_semidefinite)
-            advice = ADVICE_FOR_FREE_STRUCTURE if kind == "stiffness" else ""
-            yield not is_definite, f"{kind} (with its parts) must be positive definite{advice}"
+            yield self._definiteness_check(kind, np.sum([*matrices.values()], axis=0))
+
+    def _size_check(self, kind: str, label: str, matrix: Sequence[Sequence[float]]) -> Check:
+        """Return the check that a matrix has the rows and columns of its kind."""
+        block = BLOCKS[kind]
+        rows = self.state_count if block.rows_of_states else self.displacement_count
+        columns = self.state_count if block.columns_of_states else self.displacement_count
+        other_form = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
+        has_wrong_size = [len(row) for row in matrix] != [columns] * rows
+        return has_wrong_size, f"{label} must be a {rows} x {columns} matrix{other_form}"
+
+    def _definiteness_check(self, kind: str, sum_of_parts: FloatArray) -> Check:
+        """Return the check that a mass, stiffness or capacity is positive definite.
+
+        A structure that is free may have a singular stiffness.
+        """
+        eigenvalues = np.linalg.eigvalsh(sum_of_parts)
+        may_be_singular = kind == "stiffness" and self.free
+        is_semidefinite = eigenvalues[0] >= -1e-9 * eigenvalues[-1]
+        is_definite = eigenvalues[0] > 0.0 or (may_be_singular and is_semidefinite)
+        advice = ADVICE_FOR_FREE_STRUCTURE if kind == "stiffness" else ""
+        return not is_definite, f"{kind} (with its parts) must be positive definite{advice}"
 
     @staticmethod
-    def _place_of_matrix(kind: str, name: str) -> str:
+    def _label_of_matrix(kind: str, name: str) -> str:
         """Return where a matrix stands in the file, for a sentence."""
         if name != kind:
             return f"{kind}_part {name!r}"
@@ -328,7 +340,7 @@ class LumpedDescription(ModelDescription):
             return "damping.matrix"
         return kind if kind in KINDS else f"coupling.{kind}"
 
-    def _vanishing_matrix_faults(self) -> Iterator[Fault]:
+    def _vanishing_matrix_checks(self) -> Iterator[Check]:
         """Yield the parameters whose lower bound of zero makes a required matrix singular.
 
         The mass and the capacity must be positive definite, and the stiffness too unless the file
@@ -354,14 +366,14 @@ class LumpedDescription(ModelDescription):
                     "some unknown: give a low above 0",
                 )
 
-    def _vector_faults(
+    def _vector_checks(
         self, kind: str, section: NamedVector | OutputSection | ControllerSection
-    ) -> Iterator[Fault]:
-        """Yield the rules on the vectors of a section.
+    ) -> Iterator[Check]:
+        """Yield the checks on the vectors of a section.
 
         A vector must have the right length and must not be zero. That of a port or a controller
         must not read displacements and states at once. The direction `acts` of a port is checked by
-        `_flow_fault`, and a controller must not need an acceleration.
+        `_flow_check`, and a controller must not need an acceleration.
         """
         n = self.displacement_count
         unknowns = n + self.state_count
@@ -383,9 +395,9 @@ class LumpedDescription(ModelDescription):
             f"the {kind} {section.name!r} sees displacements or states, not both",
         )
         if isinstance(section, PortSection) and section.acts is not None:
-            yield self._flow_fault(section, row, np.array(section.acts))
+            yield self._flow_check(section, row, np.array(section.acts))
         if isinstance(section, InputSection) and section.prescribes_state:
-            yield self._prescribed_state_fault(section, row)
+            yield self._prescribed_state_check(section, row)
         if isinstance(section, ControllerSection):
             order = section.quantity.order
             sees_speed = order > 0 or any(row[n:])
@@ -395,7 +407,7 @@ class LumpedDescription(ModelDescription):
                 "derivative of a speed or of a state: leave `derivative` out",
             )
 
-    def _prescribed_state_fault(self, section: InputSection, row: FloatArray) -> Fault:
+    def _prescribed_state_check(self, section: InputSection, row: FloatArray) -> Check:
         """Return the rule that a prescribed state is one of the states, and no motion or load."""
         n = self.displacement_count
         is_of_states = not any(row[:n])
@@ -406,7 +418,7 @@ class LumpedDescription(ModelDescription):
             "quantity that is not a motion, and neither `through` nor `station_derivative`",
         )
 
-    def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
+    def _flow_check(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Check:
         """Return the rule that a flow at a port of states lowers the reading of the port.
 
         A unit flow along `acts` changes the states at the rate capacity^-1 acts, and the reading
@@ -422,7 +434,7 @@ class LumpedDescription(ModelDescription):
             "sees",
         )
 
-    def _name_faults(self) -> Iterator[Fault]:
+    def _name_checks(self) -> Iterator[Check]:
         """Yield the names that occur twice, and the references to names that do not exist."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [section.name for section in getattr(self, kind)] for kind in kinds}
@@ -436,7 +448,7 @@ class LumpedDescription(ModelDescription):
             "place station": [f"{place.station:g}" for place in self.place],
         }
         for kind, kind_names in unique_names.items():
-            yield from self.repeated_name_faults(kind, kind_names)
+            yield from self.repeated_name_checks(kind, kind_names)
         # the matrices of the file, and all that its parameters can scale
         kinds_there = [kind for kind in KINDS if self._has_unknowns_of(kind)]
         matrices = [*kinds_there, *part_names]
@@ -452,11 +464,11 @@ class LumpedDescription(ModelDescription):
             ("output", "controller", "is what a controller gives,", names["controller"]),
             ("parameter", "terms", "scales", scalable),
         ):
-            yield from self._reference_faults(kind, key, verb, allowed_names)
+            yield from self._reference_checks(kind, key, verb, allowed_names)
 
-    def _reference_faults(
+    def _reference_checks(
         self, kind: str, key: str, verb: str, known_names: Sequence[str]
-    ) -> Iterator[Fault]:
+    ) -> Iterator[Check]:
         """Yield the names that sections of a kind state under a key and that do not exist."""
         listed = ", ".join(known_names) or "none"
         for section in getattr(self, kind):

@@ -12,7 +12,7 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.toml_file import Fault, Name, NotNegative, Number
+from reporting.toml_file import Check, Name, NotNegative, Number
 
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; a parameter scales one under the name CONTROLLER.proportional etc."""
@@ -123,7 +123,7 @@ class Damping(Section):
     beta: NotNegative | None = None
     """Factor on the stiffness matrix [s]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a fault unless exactly one kind of damping is given."""
         has_coefficients = self.alpha is not None or self.beta is not None
         kinds = [self.ratios is not None, self.matrix is not None, has_coefficients]
@@ -193,8 +193,8 @@ class OutputSection(NamedSection):
     constant: Number = 0.0
     """Number that is added [SI]."""
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the rules on an output: it is of one kind only, and a reaction is a force."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks on an output: it is of one kind only, and a reaction is a force."""
         kinds = [kind for kind in (self.vector, self.reaction, self.controller) if kind is not None]
         yield (
             len(kinds) != 1,
@@ -242,8 +242,8 @@ class LawSection(Section):
     port: Name
     """Name of the port."""
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the rules on a law: its kind is known, and its numbers are allowed for it."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks on a law: its kind is known, and its numbers are allowed for it."""
         kinds = [law.kind for law in LAWS]
         yield (
             self.kind not in kinds,
@@ -288,7 +288,7 @@ class ControllerSection(NamedSection):
     derivative_of: Literal["error", "measurement"] = "error"
     """Whether D acts on the slope of the error, or of the measurement alone."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield the fault of a controller without a gain."""
         has_gain = self.proportional or self.derivative or self.integral
         yield not has_gain, f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}"

@@ -11,7 +11,7 @@ from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.system.interface import Model
 from reporting import toml_file
-from reporting.toml_file import Fault, Name, NotNegative, Number, read_toml, validate
+from reporting.toml_file import Check, Name, NotNegative, Number, read_toml, validate
 
 
 class Section(toml_file.Section):
@@ -41,7 +41,7 @@ class ParameterSection(NamedSection):
     unit: str = "1"
     """Unit of the parameter."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a mean out of its range."""
         where = f"low {self.low:g} and high {self.high:g}"
         yield (
@@ -82,7 +82,7 @@ class ModelDescription(Section):
         return cls.parse(read_toml(path, ModelError, what=noun), str(path))
 
     @staticmethod
-    def repeated_name_faults(kind: str, names: list[str]) -> Iterator[Fault]:
+    def repeated_name_checks(kind: str, names: list[str]) -> Iterator[Check]:
         """Yield a fault for each name that occurs twice."""
         for name in names:
             yield names.count(name) > 1, f"there is more than one {kind} named {name!r}"

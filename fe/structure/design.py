@@ -23,7 +23,7 @@ from fe.elements.elasticity import (
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Fault, read_toml, validate
+from reporting.toml_file import Check, read_toml, validate
 
 from . import tables
 from .matrix_design import MatrixDesign
@@ -119,7 +119,7 @@ class NamedSet(tables.DesignSection):
     box: tuple[tables.Vector, tables.Vector]
     """Two opposite corners of the box, the lower one first [unit of length]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a fault if the box has its corners in the wrong order."""
         lower, upper = self.box
         is_reversed = any(high < low for low, high in zip(lower, upper, strict=True))
@@ -159,9 +159,9 @@ class MeshMaterial(tables.AlternativeKeys):
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
     )
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of a material that is given in several ways, or is not stable."""
-        yield from super().faults()
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against a material that is given in several ways, or is not stable."""
+        yield from super().checks()
         is_orthotropic = self.axes is not None
         is_unstable = is_orthotropic and np.linalg.eigvalsh(self.compliance)[0] <= 0.0
         yield (
@@ -209,8 +209,8 @@ class Support(tables.DesignSection):
     rigid_about: tables.Vector | None = None
     """Point about which the set moves as a rigid body [unit of length]."""
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of a support that holds nothing, or holds a motion twice."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against a support that holds nothing, or holds a motion twice."""
         springs = self.springs or ()
         translations = tables.MOTIONS[:3]
         has_springs = any(springs)

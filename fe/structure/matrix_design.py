@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Fault
+from reporting.toml_file import Check
 
 from . import tables
 
@@ -138,9 +138,9 @@ class MatrixDesign(tables.StructureDesign):
     what = "matrix"
     scaled_table = "part"
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of tables that do not fit together, and of regions without parts."""
-        yield from super().faults()
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against tables that do not fit together and regions without parts."""
+        yield from super().checks()
         yield from self.wrong_ties(
             "part",
             "damage",

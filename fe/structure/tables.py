@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Fault, Section
+from reporting.toml_file import Check, Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -63,9 +63,9 @@ class AlternativeKeys(DesignSection):
 
     alternatives: ClassVar[tuple[tuple[str, ...], ...]]
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a fault if the table has not exactly the keys of one group."""
-        yield from super().faults()
+        yield from super().checks()
         keys_present: set[str] = set()
         for way in self.alternatives:
             keys_present.update(key for key in way if getattr(self, key) is not None)
@@ -102,7 +102,7 @@ class Ranged(Named):
             high = self.maximum
         return low, high
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a fault if the range does not contain the nominal value."""
         low, high = self.range
         yield (
@@ -134,9 +134,9 @@ class LoadControl(Ranged):
 
     usual = (-10.0, 10.0)
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of the range: without the nominal value, or of zero alone."""
-        yield from super().faults()
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks that the range holds the nominal value, and more than zero."""
+        yield from super().checks()
         yield (
             not any(self.range),
             "with its nominal value 0 it would always be 0; give its `minimum` and `maximum`",
@@ -253,8 +253,8 @@ class StructureDesign(DesignSection):
             )
         return text
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of names that do not fit together."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against names that do not fit together."""
         # The names of states and controls are read together, and so are those of outputs.
         groups_of_tables = [
             ("parameter", "damage", "mass", "control"),
@@ -277,8 +277,8 @@ class StructureDesign(DesignSection):
             untied="commands no load",
         )
 
-    def _equal_names(self, keys: tuple[str, ...]) -> Iterator[Fault]:
-        """Yield faults of rows with the same name in some tables."""
+    def _equal_names(self, keys: tuple[str, ...]) -> Iterator[Check]:
+        """Yield the checks against rows with the same name in some tables."""
         first_place: dict[str, str] = {}
         for key in keys:
             for place, row in self.numbered(key):
@@ -291,8 +291,8 @@ class StructureDesign(DesignSection):
 
     def wrong_ties(
         self, table: str, key: str, named_table: str, *, tied: str, untied: str
-    ) -> Iterator[Fault]:
-        """Yield the faults of ties: names that the other table lacks, and names without a tie.
+    ) -> Iterator[Check]:
+        """Yield the checks against ties: names that the other table lacks, and names without a tie.
 
         Parameters
         ----------

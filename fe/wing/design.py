@@ -17,7 +17,7 @@ from pydantic import Field
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, default_region_names, wing_input_names
 from fe.structure.tables import DesignSection, StructureDesign
-from reporting.toml_file import Fault, read_toml, validate
+from reporting.toml_file import Check, read_toml, validate
 from reporting.words import brief
 
 from . import parts
@@ -101,16 +101,16 @@ class WingDesign(DesignSection):
             hash=self.hash,
         )
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the faults of parts that do not fit together."""
-        yield from _web_faults(self)
-        yield from _skin_faults(self)
-        yield from _rod_faults(self)
-        yield from _rib_faults(self)
-        yield from _region_faults(self)
-        yield from _added_density_faults(self)
-        yield from _gauge_faults(self)
-        yield from _point_faults(self)
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks against parts that do not fit together."""
+        yield from _web_checks(self)
+        yield from _skin_checks(self)
+        yield from _rod_checks(self)
+        yield from _rib_checks(self)
+        yield from _region_checks(self)
+        yield from _added_density_checks(self)
+        yield from _gauge_checks(self)
+        yield from _point_checks(self)
 
     @property
     def regions(self) -> tuple[str, ...]:
@@ -175,7 +175,7 @@ def _smallest_chord(design: WingDesign) -> float:
     return min(design.planform.root_chord, design.planform.tip_chord)
 
 
-def _web_faults(design: WingDesign) -> Iterator[Fault]:
+def _web_checks(design: WingDesign) -> Iterator[Check]:
     """Yield webs that are not in order, or lie outside the chord."""
     smallest_chord = _smallest_chord(design)
     for index, (web, next_web) in enumerate(itertools.pairwise(design.webs)):
@@ -190,7 +190,7 @@ def _web_faults(design: WingDesign) -> Iterator[Fault]:
     yield is_outside, "webs[0] and the last web must lie inside the chord, between 0 and 1"
 
 
-def _skin_faults(design: WingDesign) -> Iterator[Fault]:
+def _skin_checks(design: WingDesign) -> Iterator[Check]:
     """Yield a skin that is too thick for the section at a web."""
     smallest_chord = _smallest_chord(design)
     thickness = design.skin.thickness
@@ -204,7 +204,7 @@ def _skin_faults(design: WingDesign) -> Iterator[Fault]:
         )
 
 
-def _rod_faults(design: WingDesign) -> Iterator[Fault]:
+def _rod_checks(design: WingDesign) -> Iterator[Check]:
     """Yield rods in webs that do not exist."""
     last_web = len(design.webs) - 1
     for index, rod in enumerate(design.rods):
@@ -214,7 +214,7 @@ def _rod_faults(design: WingDesign) -> Iterator[Fault]:
         )
 
 
-def _rib_faults(design: WingDesign) -> Iterator[Fault]:
+def _rib_checks(design: WingDesign) -> Iterator[Check]:
     """Yield ribs that overlap."""
     intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
     for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
@@ -224,7 +224,7 @@ def _rib_faults(design: WingDesign) -> Iterator[Fault]:
         )
 
 
-def _box_fault(design: WingDesign, subject: str, front: float, rear: float) -> Fault:
+def _box_check(design: WingDesign, subject: str, front: float, rear: float) -> Check:
     """Return whether chord fractions lie outside the box, with the sentence about the subject."""
     is_inside = design.front_chord <= front <= rear <= design.rear_chord
     return not is_inside, (
@@ -233,7 +233,7 @@ def _box_fault(design: WingDesign, subject: str, front: float, rear: float) -> F
     )
 
 
-def _region_faults(design: WingDesign) -> Iterator[Fault]:
+def _region_checks(design: WingDesign) -> Iterator[Check]:
     """Yield damage regions that lie off the box, overlap, or have names that are taken."""
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
@@ -245,7 +245,7 @@ def _region_faults(design: WingDesign) -> Iterator[Fault]:
             f"{label} ends {defect.span_end:g} m from the root, off the wing of {span:g} m",
         )
         subject = f"{label}, from chord {defect.chord_start:g} to {defect.chord_end:g},"
-        yield _box_fault(design, subject, defect.chord_start, defect.chord_end)
+        yield _box_check(design, subject, defect.chord_start, defect.chord_end)
     for first, second in itertools.combinations(range(len(design.defects)), 2):
         labels = f"defects[{first}] and defects[{second}]"
         yield _overlap(design.defects[first], design.defects[second]), f"{labels} overlap"
@@ -272,13 +272,13 @@ def _overlap(defect: parts.Defect, other_defect: parts.Defect) -> bool:
     return along_span and along_chord
 
 
-def _added_density_faults(design: WingDesign) -> Iterator[Fault]:
+def _added_density_checks(design: WingDesign) -> Iterator[Check]:
     """Yield intervals of added density that end before they begin."""
     for index, added in enumerate(design.added_density):
         yield added.end <= added.start, f"added_density[{index}] must end behind its start"
 
 
-def _gauge_faults(design: WingDesign) -> Iterator[Fault]:
+def _gauge_checks(design: WingDesign) -> Iterator[Check]:
     """Yield gauges that reach off the wing or off the box."""
     planform = design.planform
     half_length = 0.5 * design.gauges.averaging_spanwise
@@ -294,7 +294,7 @@ def _gauge_faults(design: WingDesign) -> Iterator[Fault]:
         middle = chord_fraction * planform.chord(distance / planform.semi_span)
         for end in (distance - half_length, distance + half_length):
             chord = planform.chord(end / planform.semi_span)
-            yield _box_fault(
+            yield _box_check(
                 design,
                 f"{label} at chord {chord_fraction:g}, with its averaging length,",
                 (middle - half_width) / chord,
@@ -302,12 +302,12 @@ def _gauge_faults(design: WingDesign) -> Iterator[Fault]:
             )
 
 
-def _point_faults(design: WingDesign) -> Iterator[Fault]:
+def _point_checks(design: WingDesign) -> Iterator[Check]:
     """Yield point masses and a test load that lie off the box."""
     chords = [(f"point_masses[{i}]", mass.chord) for i, mass in enumerate(design.point_masses)]
     chords.append(("tip_load", design.tip_load.chord))
     for label, chord in chords:
-        yield _box_fault(design, f"{label} at chord {chord:g}", chord, chord)
+        yield _box_check(design, f"{label} at chord {chord:g}", chord, chord)
     is_beyond_root = design.tip_load.distance_from_tip >= design.planform.semi_span
     yield is_beyond_root, "tip_load.distance_from_tip reaches beyond the root"
 

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from fe.runtime.arrays import FloatArray
 from fe.structure.tables import DesignSection, Modulus
-from reporting.toml_file import Fault
+from reporting.toml_file import Check
 
 _FOUR_DIGIT_COEFFICIENTS = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
@@ -133,8 +133,8 @@ class Skin(DesignSection):
     stations: tuple[SkinStation, ...] = ()
     """Places along the span, between which Young's modulus is linear."""
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the faults of Young's modulus along the span."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks of Young's modulus along the span."""
         has_both_or_none = bool(self.bands) == bool(self.stations)
         yield has_both_or_none, "Young's modulus must be given either in bands or at stations"
         stations = [place.station for place in self.stations]

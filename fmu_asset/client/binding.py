@@ -32,7 +32,7 @@ from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.worker.client import WorkerLimits
 from reporting.choices import require_one_of
-from reporting.toml_file import Fault, Number, Positive, Section, read_toml, validate
+from reporting.toml_file import Check, Number, Positive, Section, read_toml, validate
 from reporting.words import comma_list
 
 from .bound_variables import (
@@ -117,7 +117,7 @@ class BindingHeader(Section):
     state: StateChoice = "auto"
     description: str = ""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield an end that does not come after the start."""
         if self.stop_time is not None:
             sentence = (

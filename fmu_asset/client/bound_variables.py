@@ -7,7 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field
 
-from reporting.toml_file import Fault, Number, Section
+from reporting.toml_file import Check, Number, Section
 
 from .units import same_dimension
 
@@ -101,7 +101,7 @@ class InputBinding(ScalarBinding):
     maximum: Number | None = None
     """Largest value that may be given [unit of the entry]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield a minimum above the maximum."""
         if self.minimum is not None and self.maximum is not None:
             sentence = f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}"
@@ -162,7 +162,7 @@ class VectorBinding(Section):
         unit_of_vector = self.unit if isinstance(self.unit, str) else tuple(units)
         return self.model_copy(update={"variables": tuple(names), "unit": unit_of_vector})
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield the fault that there is neither one unit nor one for each variable."""
         count = len(self.variables)
         unit_count = len(self.units)
@@ -188,8 +188,8 @@ class PortBinding(Section):
     velocity: VectorBinding | None = None
     """Velocity or angular velocity of the port."""
 
-    def faults(self) -> Iterator[Fault]:
-        """Yield the faults of a port: a missing motion, or a unit that does not fit a quantity."""
+    def checks(self) -> Iterator[Check]:
+        """Yield the checks that a port has a motion, and units that fit its quantities."""
         has_motion = self.displacement is not None or self.velocity is not None
         yield not has_motion, "a port needs a displacement or a velocity beside its force"
         for name, vector in self.quantities.items():

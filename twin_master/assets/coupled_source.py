@@ -20,13 +20,13 @@ from fmu_asset.coupling.structure import (
 )
 from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
-from reporting.toml_file import Fault, Number, Positive
+from reporting.toml_file import Check, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError
 from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Flag, Section, repeated_name_fault
+from twin_master.scenario.section import Count, Flag, Section, repeated_name_check
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
@@ -69,7 +69,7 @@ class ComponentSection(FileSection):
             return name in COMPANION_NAMES
         return super()._is_shipped(key, name)
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: no FMU, or two."""
         has_fmu = self.fmu is not None
         has_design = self.design is not None
@@ -155,11 +155,11 @@ class CoupledSection(SeveralSection):
         """Return the source of the coupled FMUs."""
         return CoupledSource(scenario, self)
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names of components."""
-        yield from super().faults()
+        yield from super().checks()
         names = [component.name for component in self.component]
-        yield repeated_name_fault("component", names)
+        yield repeated_name_check("component", names)
 
 
 class SeveralSource(FmuSource):

@@ -19,7 +19,7 @@ from reporting.arrays import Float
 from reporting.files import hash_file
 from reporting.log import module_logger
 from reporting.progress import Progress
-from reporting.toml_file import Fault, Number, Positive
+from reporting.toml_file import Check, Number, Positive
 from reporting.units import meaning_of
 from twin_master.assets.asset_source import (
     BINDING_COPY,
@@ -79,7 +79,7 @@ class FmuSection(AssetSection):
 
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: parameters that are seeds."""
         for name in self.seeds:
             yield (

@@ -11,7 +11,7 @@ from pydantic import Field
 from reporting.files import hash_file, hash_record
 from reporting.former_names import with_present_names
 from reporting.json_file import JsonObject
-from reporting.toml_file import Fault, read_toml, validate
+from reporting.toml_file import Check, read_toml, validate
 from twin_master.assets.resolution import Overrides, OverridesOrMapping, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.members import (
@@ -36,7 +36,7 @@ from twin_master.scenario.section import (
     Probability,
     Section,
     Seed,
-    repeated_name_fault,
+    repeated_name_check,
 )
 from twin_master.watch.broker_address import is_broker
 
@@ -88,7 +88,7 @@ class GroupSection(Section):
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """The value of `truth.probability` in this group [1]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield the fault that the group has no kind of members, or several."""
         kinds = (self.count, self.fmus, self.calibrations, self.observations)
         given_kinds = [kind for kind in kinds if kind is not None]
@@ -129,9 +129,9 @@ class FleetFile(Section):
     group: Annotated[tuple[GroupSection, ...], Field(min_length=1)]
     """The groups of assets."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield the fault that two groups have one name."""
-        yield repeated_name_fault("group", [group.name for group in self.group])
+        yield repeated_name_check("group", [group.name for group in self.group])
 
 
 @dataclass(frozen=True)

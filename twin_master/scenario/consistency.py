@@ -6,17 +6,17 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
-from reporting.toml_file import Fault
+from reporting.toml_file import Check
 from reporting.words import comma_list
 from twin_master.scenario.kinds import WATCHED_KIND, AssetSection, BeliefSection
 from twin_master.scenario.mission import Calibration, Control, Mission, Reference, StateFactor
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Section,
-    incomplete_table_fault,
-    repeated_name_fault,
-    unknown_name_fault,
-    value_count_fault,
+    incomplete_table_check,
+    repeated_name_check,
+    unknown_name_check,
+    value_count_check,
 )
 from twin_master.scenario.tables import (
     Action,
@@ -145,11 +145,11 @@ class ScenarioTables(Section):
                 )
         return tuple(all_readings)
 
-    def _control_faults(self) -> Iterator[Fault]:
+    def _control_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: states and controls."""
         controls = self.control_names
-        yield repeated_name_fault("state", self.state_names)
-        yield repeated_name_fault("control", controls)
+        yield repeated_name_check("state", self.state_names)
+        yield repeated_name_check("control", controls)
         # names, and the inputs of the controls
         inputs = tuple(sorted(self.control[0].values))
         for control in self.control:
@@ -159,24 +159,24 @@ class ScenarioTables(Section):
                 f"{comma_list(inputs)} and `{control.name}` gives {comma_list(control.values)}",
             )
         first_control = self.mission.first_control
-        yield unknown_name_fault(first_control, controls, "mission.first_control", "control")
-        yield self._several_incomplete_tables_fault()
-        yield incomplete_table_fault(self.rewards.control, controls, "rewards.control", "control")
+        yield unknown_name_check(first_control, controls, "mission.first_control", "control")
+        yield self._several_incomplete_tables_check()
+        yield incomplete_table_check(self.rewards.control, controls, "rewards.control", "control")
         safest = self.planner.safest or controls[0]
-        yield unknown_name_fault(safest, controls, "planner.safest", "control")
+        yield unknown_name_check(safest, controls, "planner.safest", "control")
         normaliser = self.rewards.normalise_error_by
         if normaliser is not None:
             key = "rewards.normalise_error_by"
-            yield unknown_name_fault(normaliser, inputs, key, "control input")
+            yield unknown_name_check(normaliser, inputs, key, "control input")
             divisors = [control.values[normaliser] for control in self.control]
             yield (
                 min(divisors) <= 0.0,
                 f"`{key}` divides by `{normaliser}`, which must be positive in every control",
             )
         level_counts = {factor.name: len(factor.levels) for factor in self.state}
-        yield from self.transition.faults_beside(controls, level_counts)
+        yield from self.transition.checks_beside(controls, level_counts)
 
-    def _several_incomplete_tables_fault(self) -> Fault:
+    def _several_incomplete_tables_check(self) -> Check:
         """Return the fault that several tables lack an entry for a control, with one joint message.
 
         The separate checks would report only the first of these tables.
@@ -190,21 +190,21 @@ class ScenarioTables(Section):
             tables["truth.probability"] = self.truth.probability
         messages = []
         for key, table in tables.items():
-            is_incomplete, message = incomplete_table_fault(
+            is_incomplete, message = incomplete_table_check(
                 table, self.control_names, key, "control"
             )
             if is_incomplete:
                 messages.append(message)
         return len(messages) > 1, "; ".join(messages)
 
-    def _action_faults(self) -> Iterator[Fault]:
+    def _action_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names and costs of actions."""
         controls = self.control_names
         # `with_controls_of_actions` added the controls of the actions at the end.
         controls_of_file = controls[: -len(self.action)] if self.action else controls
         loads = {control.name: control.values for control in self.control}
         for action in self.action:
-            yield unknown_name_fault(action.control, controls, "action.control", "control")
+            yield unknown_name_check(action.control, controls, "action.control", "control")
             base_loads = loads[action.control]
             has_other_loads = loads.get(action.name, base_loads) != base_loads
             has_name_of_control = action.name in (action.control, *controls_of_file)
@@ -219,9 +219,9 @@ class ScenarioTables(Section):
             )
             for state in (*action.inspects, *action.repairs):
                 key = f"action.{action.name}"
-                yield unknown_name_fault(state, self.state_names, key, "state")
+                yield unknown_name_check(state, self.state_names, key, "state")
 
-    def _growth_faults(self) -> Iterator[Fault]:
+    def _growth_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: random growth and repairs."""
         truth = self.truth
         is_random = truth.kind == "random_growth"
@@ -232,7 +232,7 @@ class ScenarioTables(Section):
                 "`truth.probability` belongs to the kind `random_growth`, and to transitions of "
                 "the kind `independent_worsening`",
             )
-            yield incomplete_table_fault(
+            yield incomplete_table_check(
                 truth.probability, self.control_names, "truth.probability", "control"
             )
         for action in self.action:
@@ -243,7 +243,7 @@ class ScenarioTables(Section):
                 f"follows, and the kind is `{truth.kind}`",
             )
 
-    def _truth_faults(self) -> Iterator[Fault]:
+    def _truth_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: origin of the true state."""
         truth = self.truth
         if truth.kind == "asset":
@@ -252,15 +252,15 @@ class ScenarioTables(Section):
                 "`truth.kind` `asset` needs an FMU, and the kind of the asset is "
                 f"`{self.asset.kind}`",
             )
-            yield incomplete_table_fault(truth.state, self.state_names, "truth.state", "state")
+            yield incomplete_table_check(truth.state, self.state_names, "truth.state", "state")
         yield (
             truth.kind == "random_growth" and truth.gains,
             "`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`",
         )
         for gain in truth.gains:
-            yield unknown_name_fault(gain.state, self.state_names, "truth.gains.state", "state")
+            yield unknown_name_check(gain.state, self.state_names, "truth.gains.state", "state")
 
-    def _reward_faults(self) -> Iterator[Fault]:
+    def _reward_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault of the sensors that rewards name."""
         rewards = self.rewards
         sensor_count = self.observation.count
@@ -274,14 +274,14 @@ class ScenarioTables(Section):
                 f"`rewards.health_sensors` must name different sensors from 1 to {sensor_count}, "
                 f"but {comma_list(sensors)} was given",
             )
-        yield value_count_fault("rewards.health_limit", rewards.health_limit, limited_count)
-        yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
+        yield value_count_check("rewards.health_limit", rewards.health_limit, limited_count)
+        yield value_count_check("rewards.error_scale", rewards.error_scale, sensor_count)
 
-    def _sensor_faults(self) -> Iterator[Fault]:
+    def _sensor_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault of values stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
-            yield value_count_fault(
+            yield value_count_check(
                 f"learning.{key}", getattr(self.learning, key, 0.0), sensor_count
             )
         averages_inside = self.observation.average_over_draws == "inside"
@@ -297,11 +297,11 @@ class ScenarioTables(Section):
             "`learning` or `notice` fly alone: leave one of them out",
         )
         true_noise = self.truth.noise.standard_deviation
-        yield value_count_fault("truth.noise.standard_deviation", true_noise, sensor_count)
-        yield self._strain_noise_fault(
+        yield value_count_check("truth.noise.standard_deviation", true_noise, sensor_count)
+        yield self._strain_noise_check(
             "observation.standard_deviation", self.observation.standard_deviation
         )
-        yield self._strain_noise_fault("truth.noise.standard_deviation", true_noise)
+        yield self._strain_noise_check("truth.noise.standard_deviation", true_noise)
         for fault in self.truth.sensor_faults:
             largest = max(fault.sensor_indices(sensor_count)) + 1
             yield (
@@ -310,7 +310,7 @@ class ScenarioTables(Section):
                 "given",
             )
 
-    def _strain_noise_fault(self, key: str, noise: float | tuple[float, ...]) -> Fault:
+    def _strain_noise_check(self, key: str, noise: float | tuple[float, ...]) -> Check:
         """Return the fault that a noise of strains is given in microstrain without that unit.
 
         A standard deviation above `LARGEST_STRAIN_NOISE` as a strain can only be a number in
@@ -335,7 +335,7 @@ class ScenarioTables(Section):
         )
         return is_absurd, message
 
-    def _mode_faults(self) -> Iterator[Fault]:
+    def _mode_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: observation of modes."""
         modes = self.observation.modes
         record = self.truth.record
@@ -370,7 +370,7 @@ class ScenarioTables(Section):
             )
             return
         inputs = tuple(sorted(self.control[0].values))
-        yield unknown_name_fault(record.input, inputs, "truth.record.input", "control input")
+        yield unknown_name_check(record.input, inputs, "truth.record.input", "control input")
         highest_frequency = 0.5 * record.sampling_rate  # the Nyquist frequency
         _low, highest_of_bands = modes.bands[-1]
         yield (

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from reporting.toml_file import Fault, NotNegative, Number
+from reporting.toml_file import Check, NotNegative, Number
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.section import Count, Name, Probability, Section, Seed
 from twin_master.scenario.tables import ROW_SUM_TOLERANCE
@@ -48,7 +48,7 @@ class StateFactor(Section):
     prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
     """Probability of each level before the first observation [1]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: levels and prior."""
         does_not_increase = any(second <= first for first, second in pairwise(self.levels))
         listed = ", ".join(str(level) for level in self.levels)
@@ -128,7 +128,7 @@ class Calibration(FileSection):
         """The number of draws of the parameter; a fixed parameter has one."""
         return 1 if self.source == "fixed" else self.draws
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: keys of the source."""
         has_file = bool(self.file)
         yield (

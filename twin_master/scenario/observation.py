@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from reporting.arrays import Float, Index
-from reporting.toml_file import Fault, NotNegative, Positive
-from twin_master.scenario.section import Count, Name, PerSensor, Section, Table, value_count_fault
+from reporting.toml_file import Check, NotNegative, Positive
+from twin_master.scenario.section import Count, Name, PerSensor, Section, Table, value_count_check
 
 MODES_ROLE = "modes"
 """The role of an observation whose values are features of modes."""
@@ -58,7 +58,7 @@ class ModesSection(Section):
     changes between records, and the error of the model [Hz for frequencies and 1 for the
     others]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: bands, numbers and features."""
         has_empty_band = any(high <= low for low, high in self.bands)
         yield (
@@ -261,10 +261,10 @@ class ObservationSection(Section):
             return 1e6, ("microstrain",) * self.count
         return 1.0, self.sensor_units
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: numbers of values."""
         for key in ("unit", "standard_deviation", "titles"):
             value = getattr(self, key)
             # Without titles the tuple is empty, which is allowed and not a wrong number of titles.
-            yield value_count_fault(f"observation.{key}", value or None, self.count)
-        yield value_count_fault("observation.model_error_percent", self.model_error, self.count)
+            yield value_count_check(f"observation.{key}", value or None, self.count)
+        yield value_count_check("observation.model_error_percent", self.model_error, self.count)

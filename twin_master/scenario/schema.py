@@ -14,10 +14,10 @@ from typing import Self
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.toml_file import Fault
+from reporting.toml_file import Check
 from twin_master.scenario.consistency import ScenarioTables
 from twin_master.scenario.kinds import FileSection
-from twin_master.scenario.section import Section, Table, unknown_name_fault
+from twin_master.scenario.section import Section, Table, unknown_name_check
 from twin_master.scenario.tables import FigureGroup
 
 _GAIN_DECIMALS = 12
@@ -162,22 +162,22 @@ class Scenario(ScenarioTables):
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
         return self.model_dump(mode="json")
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: tables that do not fit."""
-        yield from self._control_faults()
-        yield from self._action_faults()
-        yield from self._growth_faults()
-        yield from self._reference_faults()
-        yield from self._truth_faults()
-        yield from self._reward_faults()
-        yield from self._sensor_faults()
-        yield from self._mode_faults()
+        yield from self._control_checks()
+        yield from self._action_checks()
+        yield from self._growth_checks()
+        yield from self._reference_checks()
+        yield from self._truth_checks()
+        yield from self._reward_checks()
+        yield from self._sensor_checks()
+        yield from self._mode_checks()
 
-    def _reference_faults(self) -> Iterator[Fault]:
+    def _reference_checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names of references."""
         names = [entry.figure for entry in self.reference]
         for name in names:
-            yield unknown_name_fault(
+            yield unknown_name_check(
                 name, self.figure_names, "reference.figure", "figure of the summary"
             )
             yield (

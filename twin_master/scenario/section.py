@@ -12,7 +12,7 @@ from pydantic_core import CoreSchema
 from reporting import toml_file
 from reporting.choices import nearest_word
 from reporting.json_file import JsonDocument
-from reporting.toml_file import Fault, Positive, missing_keys, short_repr
+from reporting.toml_file import Check, Positive, missing_keys, short_repr
 
 Table: TypeAlias = toml_file.TomlTable
 """A table of a TOML or JSON file before it is checked: values of any type by key."""
@@ -234,7 +234,7 @@ def _convert_to_si(value: object, divisor: float) -> object:
         return float("inf")  # no key accepts an infinity, so the value is refused later
 
 
-def value_count_fault(key: str, value: object, count: int) -> Fault:
+def value_count_check(key: str, value: object, count: int) -> Check:
     """Return the possible fault that a key has neither one value nor one value for each sensor.
 
     Parameters
@@ -255,7 +255,7 @@ def value_count_fault(key: str, value: object, count: int) -> Fault:
     return number != count, message
 
 
-def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
+def repeated_name_check(what: str, names: Sequence[str]) -> Check:
     """Return the possible fault that a name is given more than once.
 
     Parameters
@@ -270,7 +270,7 @@ def repeated_name_fault(what: str, names: Sequence[str]) -> Fault:
     return is_repeated, message
 
 
-def unknown_name_fault(name: str, known_names: Sequence[str], key: str, what: str) -> Fault:
+def unknown_name_check(name: str, known_names: Sequence[str], key: str, what: str) -> Check:
     """Return the possible fault that a name is not among the known ones.
 
     Parameters
@@ -288,9 +288,9 @@ def unknown_name_fault(name: str, known_names: Sequence[str], key: str, what: st
     return name not in known_names, message
 
 
-def incomplete_table_fault(
+def incomplete_table_check(
     table: Mapping[str, object], names: Sequence[str], key: str, what: str
-) -> Fault:
+) -> Check:
     """Return the possible fault that a table lacks an entry for a name, or has one too many.
 
     Parameters

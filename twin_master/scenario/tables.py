@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 from pydantic import BeforeValidator, Field
 
 from reporting.json_file import JsonRecord
-from reporting.toml_file import Fault, NotNegative, Number, Positive
+from reporting.toml_file import Check, NotNegative, Number, Positive
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
@@ -21,8 +21,8 @@ from twin_master.scenario.section import (
     Section,
     Step,
     Table,
-    incomplete_table_fault,
-    value_count_fault,
+    incomplete_table_check,
+    value_count_check,
 )
 
 ROW_SUM_TOLERANCE = 1e-12
@@ -85,9 +85,9 @@ class Transition(Section):
     """`independent_tables`: a square table by control and state; a row is the level before the
     step, a column the level after it [1]."""
 
-    def faults_beside(
+    def checks_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
-    ) -> Iterator[Fault]:
+    ) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names and tables.
 
         Parameters
@@ -99,32 +99,32 @@ class Transition(Section):
         """
         if self.kind == "independent_worsening":
             yield self.tables, "`transition.tables` belongs to the kind `independent_tables`"
-            yield from self._probability_faults(controls, tuple(level_counts))
+            yield from self._probability_checks(controls, tuple(level_counts))
         else:
             yield (
                 self.probability,
                 "`transition.probability` belongs to the kind `independent_worsening`",
             )
-            yield from self._table_faults(controls, level_counts)
+            yield from self._table_checks(controls, level_counts)
 
-    def _probability_faults(
+    def _probability_checks(
         self, controls: tuple[str, ...], states: tuple[str, ...]
-    ) -> Iterator[Fault]:
+    ) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names of probabilities."""
         key = "transition.probability"
-        yield incomplete_table_fault(self.probability, controls, key, "control")
+        yield incomplete_table_check(self.probability, controls, key, "control")
         for control, probability in self.probability.items():
             if isinstance(probability, dict):
-                yield incomplete_table_fault(probability, states, f"{key}.{control}", "state")
+                yield incomplete_table_check(probability, states, f"{key}.{control}", "state")
 
-    def _table_faults(
+    def _table_checks(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
-    ) -> Iterator[Fault]:
+    ) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: names and rows of tables."""
-        yield incomplete_table_fault(self.tables, controls, "transition.tables", "control")
+        yield incomplete_table_check(self.tables, controls, "transition.tables", "control")
         for control, tables in self.tables.items():
             key = f"transition.tables.{control}"
-            yield incomplete_table_fault(tables, tuple(level_counts), key, "state")
+            yield incomplete_table_check(tables, tuple(level_counts), key, "state")
             for state, size in level_counts.items():
                 rows = tables[state]
                 has_other_size = len(rows) != size or any(len(row) != size for row in rows)
@@ -166,7 +166,7 @@ class Span(Section):
     """Last step, which is included; by default only the first step, or for a fault of sensors all
     later steps."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: an early end."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
@@ -204,9 +204,9 @@ class SensorFault(Span):
     rate: Number | None = None
     """Growth of the drift in each step [unit of the sensors]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: span and rate."""
-        yield from super().faults()
+        yield from super().checks()
         needs_rate = self.kind == "drift"
         has_rate = self.rate is not None
         yield (
@@ -248,7 +248,7 @@ class TruthSection(Section):
     record: RecordSection | None = None
     """How the record of each step is made, if modes are observed."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: keys of another kind."""
         is_inside_asset = self.kind == "asset"
         has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
@@ -314,7 +314,7 @@ class Action(Section):
     ends: Flag = False
     """Whether the mission ends with that step."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: readings and effect."""
         inspects = bool(self.inspects)
         has_deviation = self.standard_deviation is not None
@@ -323,7 +323,7 @@ class Action(Section):
             f"action `{self.name}`: `inspects` and `standard_deviation` go together: the states "
             "that are read, and how well",
         )
-        yield value_count_fault(
+        yield value_count_check(
             "action.standard_deviation", self.standard_deviation, len(self.inspects)
         )
         has_effect = self.inspects or self.repairs or self.ends
@@ -366,7 +366,7 @@ class Planner(Section):
     inspections_per_step: Count | None = None
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: keys of another policy."""
         yield (
             self.limit_probability is not None and self.policy != "belief",
@@ -451,7 +451,7 @@ class Learning(Section):
     """Factors on the probabilities to leave a state, equally probable at first; by default they are
     not learnt [1]."""
 
-    def faults(self) -> Iterator[Fault]:
+    def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: transition factors."""
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
