@@ -120,26 +120,36 @@ class GaugeWatch:
             hypothesis_names=tuple(f"{wording.name_sensors([g])} off" for g in sensors),
         )
 
-    def check_readings(self, rows: Float, control_index: Index) -> CheckedReadings:
-        """Return observations without absurd readings.
+    def leave_out_absurd_readings(self, rows: Float, control_index: Index) -> CheckedReadings:
+        """Return the observations of B twins without readings that no state can explain.
 
         Parameters
         ----------
         rows : (B, G + I) array
-            The observed values, SI; NaN where nothing was received.
+            The values of G sensors and the readings of I inspections, SI; NaN where nothing was
+            received.
         control_index : (B,) array
             The controls in force.
+
+        Returns
+        -------
+        CheckedReadings
+            The sensor values with and without the absurd ones; readings of inspections are kept.
         """
-        readings, other_log_density = self._sensor_model.split_observation(rows)
-        is_absurd = self._notices.is_absurd(readings, control_index)
-        used_readings = np.where(is_absurd, np.nan, readings)
-        # The rest of the observation, such as readings of inspections, is kept.
-        used_rows = np.concatenate([used_readings, rows[:, readings.shape[1] :]], axis=1)
-        beside = np.broadcast_to(other_log_density, (len(rows), self._sensor_model.state_count))
-        observations = Observations(
-            used_readings, np.ascontiguousarray(beside), control_index.astype(np.int64)
+        values, inspections_log_density = self._sensor_model.split_observation(rows)
+        is_absurd = self._notices.is_absurd(values, control_index)
+        used_values = np.where(is_absurd, np.nan, values)
+        inspections = rows[:, values.shape[1] :]
+        used_rows = np.concatenate([used_values, inspections], axis=1)
+        inspections_log_density = np.broadcast_to(
+            inspections_log_density, (len(rows), self._sensor_model.state_count)
         )
-        return CheckedReadings(used_rows, readings, is_absurd, observations)
+        observations = Observations(
+            used_values,
+            np.ascontiguousarray(inspections_log_density),
+            control_index.astype(np.int64),
+        )
+        return CheckedReadings(used_rows, values, is_absurd, observations)
 
     def assimilate(
         self, state: WatchState, checked: CheckedReadings, model_belief: Float, step: int

@@ -111,7 +111,7 @@ class WatchfulEstimator:
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         controls = np.array([control_index])
-        checked = self.watch.check_readings(np.asarray(observation)[None], controls)
+        checked = self.watch.leave_out_absurd_readings(np.asarray(observation)[None], controls)
         estimate = self._inner.step(before, checked.rows[0], control_index, step)
 
         # Advance and correct the hypotheses about the gauges.

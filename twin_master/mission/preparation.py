@@ -388,7 +388,7 @@ def _inspected_sensor_model(
     return partial(
         InspectedSensorModel,
         asked_by=controls,
-        reading=coordinates[:, factors],
+        expected_reading=coordinates[:, factors],
         reading_deviation=np.hypot(within_level[:, factors], deviations),
     )
 

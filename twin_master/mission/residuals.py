@@ -50,6 +50,10 @@ def expected_ahead(
 ) -> tuple[Expectation, Float]:
     """Return the predicted observations and rewards in the H steps after each step of a history.
 
+    The control of each step is the one that the policy takes in its state (Kapteyn et al. 2021,
+    eqs. (37) to (39)). Where the twin has learnt while it flew, its predictions start from what it
+    had learnt up to each step; otherwise they are those of its model.
+
     Parameters
     ----------
     history : History
@@ -66,12 +70,15 @@ def expected_ahead(
     (T, H, U) array
         The probability of each control.
     """
+    # (T, S, U); the safest control as far as readings fit no state
     policy = knowledge.policy_with_doubt(history.unexplained)
-    joint = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U), eqs. (37)-(39)
-    control_probability = joint.sum(axis=-2)
+    state_and_control = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U)
+    control_probability = state_and_control.sum(axis=-2)
     learnt_expectation = knowledge.expectation
     if learnt_expectation is None:
-        expectation = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, None)
+        expectation = expectation_of_draws(
+            knowledge.sensor_model, knowledge.rewards, state_and_control, None
+        )
         return expectation, control_probability
     carried = [step.twin_step.carried for step in history.steps]
     horizon = predicted_beliefs.shape[1]

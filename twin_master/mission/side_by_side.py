@@ -337,7 +337,7 @@ class _Formation:
             beliefs = filtered_beliefs.filtered
             unexplained = np.zeros(len(beliefs))
         else:
-            checked = self._watch.check_readings(observed_rows, self._control)
+            checked = self._watch.leave_out_absurd_readings(observed_rows, self._control)
             filtered_beliefs = self._filter(step, checked.rows)
             watch_state = self._watch_gauges(self._watch, step, checked, filtered_beliefs)
             beliefs = watch_state.mixed.belief

@@ -17,6 +17,8 @@ from twin_master.network.upper_bound import UpperBound
 
 _LEAST_IMPROVEMENT = 1e-12
 """Smallest improvement of a bound that counts, so that rounding does not add vectors."""
+_LEAST_DISCOUNT = 1e-12
+"""Least factor by which an allowed gap is divided; a control may discount by zero."""
 _LONGEST_DESCENT = 1000
 """Largest number of steps that a descent looks ahead."""
 MOST_BELIEFS = 180
@@ -91,11 +93,12 @@ class _Bounds:
             self.vectors = np.vstack((self.vectors[is_needed], vector))
             self.control = np.append(self.control[is_needed], best_control)
 
-    def descend(self, belief: Float, first: int | None, gap: float) -> list[Float]:
+    def descend(self, belief: Float, first: int | None, allowed_gap: float) -> list[Float]:
         """Return a path of beliefs along which the bounds differ by more than allowed.
 
-        Each step takes the control of the largest upper bound, and the observation after which the
-        difference exceeds the allowed one most.
+        It is the descent of heuristic search value iteration (Smith and Simmons 2005). Each step
+        takes the control of the largest upper bound, and then the observation whose belief adds
+        most to the difference of the bounds beyond the allowed one.
 
         Parameters
         ----------
@@ -103,25 +106,34 @@ class _Bounds:
             The belief to begin with.
         first : int or None
             The control of the first step, if it is prescribed.
-        gap : float
+        allowed_gap : float
             The allowed difference of the bounds at the first belief.
+
+        Returns
+        -------
+        list of (S,) arrays
+            The beliefs in the order of the steps, the given one first.
         """
-        path: list[Float] = []
+        path = [belief]
         while len(path) < _LONGEST_DESCENT:
-            path.append(belief)
             if first is not None and len(path) == 1:
                 control = first
             else:
                 control = int(np.argmax(self.upper.action_bound(belief)))
-            rows = self.problem.next_beliefs(belief, control)
             # A difference one step later is discounted, so that a larger one is allowed there.
-            gap /= max(float(self.problem.discount[control]), _LEAST_IMPROVEMENT)
-            # The rows are beliefs times the probability of the observation, and so is the gap.
-            excess = self.upper.bound_at(rows) - self.lower_bound_at(rows) - gap * rows.sum(axis=1)
-            largest_excess = int(np.argmax(excess))
-            if excess[largest_excess] <= 0.0:
+            allowed_gap /= max(float(self.problem.discount[control]), _LEAST_DISCOUNT)
+            # Rows of beliefs times the probability of their observation; so are the gaps there.
+            weighted_beliefs = self.problem.next_beliefs(belief, control)
+            weighted_gaps = self.upper.bound_at(weighted_beliefs) - self.lower_bound_at(
+                weighted_beliefs
+            )
+            observation_probability = weighted_beliefs.sum(axis=1)
+            excess = weighted_gaps - allowed_gap * observation_probability
+            observation = int(np.argmax(excess))
+            if excess[observation] <= 0.0:
                 break
-            belief = rows[largest_excess] / rows[largest_excess].sum()
+            belief = weighted_beliefs[observation] / observation_probability[observation]
+            path.append(belief)
         return path
 
     def bounds_at(self, belief: Float, first: int | None) -> tuple[float, float]:

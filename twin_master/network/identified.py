@@ -140,7 +140,7 @@ class InspectedSensorModel(GaussianSensorModel):
     ----------
     *arguments, **keywords
         Those of `GaussianSensorModel`.
-    reading : (S, I) array
+    expected_reading : (S, I) array
         The value of each reading in each state without noise, SI.
     reading_deviation : (S, I) array
         The standard deviation of its noise and of the true value within the interval of the state,
@@ -152,13 +152,13 @@ class InspectedSensorModel(GaussianSensorModel):
     def __init__(
         self,
         *arguments: Any,
-        reading: Float,
+        expected_reading: Float,
         reading_deviation: Float,
         asked_by: Index,
         **keywords: Any,
     ) -> None:
         super().__init__(*arguments, **keywords)
-        self.reading = reading
+        self.expected_reading = expected_reading
         self.reading_deviation = reading_deviation
         self.asked_by = asked_by
 
@@ -166,7 +166,7 @@ class InspectedSensorModel(GaussianSensorModel):
     def extra_arguments(self) -> Mapping[str, Any]:
         """Keyword arguments that `GaussianSensorModel` does not have."""
         return {
-            "reading": self.reading,
+            "expected_reading": self.expected_reading,
             "reading_deviation": self.reading_deviation,
             "asked_by": self.asked_by,
         }
@@ -182,24 +182,43 @@ class InspectedSensorModel(GaussianSensorModel):
         shape = (len(state), len(self.asked_by))
         noise = self.reading_deviation[state] * generator.standard_normal(shape)
         is_asked = self.asked_by == control_index
-        readings = np.where(is_asked, self.reading[state] + noise, np.nan)
+        readings = np.where(is_asked, self.expected_reading[state] + noise, np.nan)
         return np.hstack((values, readings))
 
     def split_observation(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return the values of the sensors (..., G), and log p(readings | D) (..., S)."""
+        """Return the values of the sensors, and the log densities of what inspections showed.
+
+        Parameters
+        ----------
+        observation : (..., G) or (..., G + I) array
+            The values of G sensors, then the readings of I inspections, SI; NaN where a sensor is
+            lost or an inspection was not asked for.
+
+        Returns
+        -------
+        (..., G) array
+            The values of the sensors.
+        (..., S) array
+            The log density of all readings together in each of S states; zero without a reading.
+
+        Raises
+        ------
+        InvalidObservationError
+            If a row has another length, or a value is infinite.
+        """
         rows = np.asarray(observation, dtype=np.float64)
-        count = self.sensor_count
-        values = self.check_observation(rows[..., :count])
-        readings = rows[..., count:]
-        reading_count = readings.shape[-1]
-        if not reading_count:
+        sensor_count = self.sensor_count
+        inspection_count = self.expected_reading.shape[1]
+        values = self.check_observation(rows[..., :sensor_count])
+        readings = rows[..., sensor_count:]
+        if readings.shape[-1] == 0:
             return values, np.zeros((*readings.shape[:-1], self.state_count))
-        if reading_count != self.reading.shape[1] or np.isinf(readings).any():
+        if readings.shape[-1] != inspection_count or np.isinf(readings).any():
             raise InvalidObservationError(
-                f"expected {count} finite values, or {count + self.reading.shape[1]} with the "
-                f"readings of inspections, got {rows.shape[-1]}"
+                f"expected {sensor_count} finite values, or {sensor_count + inspection_count} with "
+                f"the readings of inspections, got {rows.shape[-1]}"
             )
-        residual = (readings[..., None, :] - self.reading) / self.reading_deviation
+        residual = (readings[..., None, :] - self.expected_reading) / self.reading_deviation
         log_density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
-        was_asked = ~np.isnan(readings)[..., None, :]
-        return values, np.where(was_asked, log_density, 0.0).sum(axis=-1)
+        was_inspected = ~np.isnan(readings)[..., None, :]
+        return values, np.where(was_inspected, log_density, 0.0).sum(axis=-1)
