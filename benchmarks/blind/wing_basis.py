@@ -12,6 +12,7 @@ package's reduced model, and holds ten times as many vectors.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,8 +60,8 @@ REGION_LINES = (
     (27, 30),
 )
 """Regions that may be damaged: first and last mesh line along the span."""
-REGION_LOSSES = (0.25, 0.6)
-"""Losses at which the solutions in a damaged region's basis are taken."""
+REGION_LOSSES = (0.2, 0.6)
+"""Losses at which the solutions in a damaged region's basis are taken, at two values of e."""
 
 
 @dataclass(frozen=True)
@@ -296,15 +297,16 @@ def _region_stiffness(
 def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> WingBasis:
     design = operators.wing_mesh.design
     f = _functionals(operators)
-    nominal = operators.stiffness({"young_modulus_factor": 1.0073})
     parts: list[sparse.csr_array] = []
     place = np.full(2, np.nan)
     if region >= 0:
         parts, place = _region_stiffness(operators, region)
         vectors = [snapshots]
         loads = np.vstack([f.displacement, f.corner, f.lift.sum(axis=0), f.weight, f.root]).T
-        for loss in REGION_LOSSES:
-            stiffness = (nominal - loss * (1.0073 * parts[0] + parts[1] + parts[2])).tocsr()
+        # at both ends of e: a strain beside the damage depends on the ratio of skin and spar
+        for factor, loss in itertools.product((FACTORS[0], FACTORS[-1]), REGION_LOSSES):
+            sound = operators.stiffness({"young_modulus_factor": factor})
+            stiffness = (sound - loss * (factor * parts[0] + parts[1] + parts[2])).tocsr()
             vectors.append(Factorisation(stiffness).solve(loads))
             mass = operators.mass(point_masses(*MASSES[0]))
             vectors.append(lowest_eigenpairs(stiffness, mass, MODE_COUNT)[1])
