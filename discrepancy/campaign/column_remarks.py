@@ -25,8 +25,8 @@ def remarks_on_unused_columns(
     for column, files in files_of_columns.items():
         further_files = f" and {len(files) - 1} more" if len(files) > 1 else ""
         remarks.append(
-            f"{files[0]}{further_files}: no channel has the column {column!r}, which is left out; "
-            "if that is not meant, check its spelling."
+            f"{files[0]}{further_files}: no channel reads the column {column!r}, so it is left "
+            "out; if you mean to use it, check its spelling."
         )
     return remarks
 

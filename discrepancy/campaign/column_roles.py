@@ -99,7 +99,7 @@ class ColumnReader:
             return self._channel_or_input(sheet, head, role, unit)
         except ValueError as cause:
             raise CampaignFileError(
-                f"{sheet.name}, column {head!r}: {cause}; say another."
+                f"{sheet.name}, column {head!r}: {cause}; choose another."
             ) from None
 
     def _channel_or_input(self, sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
@@ -125,19 +125,19 @@ class ColumnReader:
         )
 
     def _check_role(self, sheet: Sheet, head: str, role: str) -> None:
-        """Refuse the role of a column if it is neither an input nor an output of the model.
+        """Raise an error if the role of a column is neither an input nor an output of the model.
 
-        The unit of the column is not needed for this. So a wrong role is refused before the user is
-        asked for the unit.
+        This is checked before the user is asked for the unit of the column, which it does not need.
         """
-        is_open = not role or self._quantity_of is None
-        if is_open or role == LEFT_OUT or role in _UNITS_OF_INPUT_COLUMNS or INPUT in role:
+        is_unknown = not role or self._quantity_of is None  # no answer yet, or no model
+        names_an_input = role in _UNITS_OF_INPUT_COLUMNS or INPUT in role
+        if is_unknown or names_an_input or role == LEFT_OUT:
             return
         if self._output_quantity(role) is None:
-            it_has = f"; it has {listing(self._outputs)}" if self._outputs else ""
+            available_outputs = f"; it has {listing(self._outputs)}" if self._outputs else ""
             raise CampaignFileError(
-                f"{sheet.name}, column {head!r}: the model has no output {role!r}{it_has}; say "
-                "another."
+                f"{sheet.name}, column {head!r}: the model has no output "
+                f"{role!r}{available_outputs}; choose another."
             )
 
     def _output_quantity(self, role: str) -> Quantity | None:

@@ -262,10 +262,7 @@ class CampaignSection(Section):
         return (*self.channel, *self.input)
 
     def checks(self) -> Iterator[Check]:
-        """Yield the checks that concern several tables of the file, each with its message.
-
-        The first entry of a fault is true if the file breaks the rule.
-        """
+        """Yield the checks that concern several tables of the file, see `Section.checks`."""
         for table in ("channel", "input", "trial"):
             repeated = _first_repeated(section.name for section in getattr(self, table))
             yield repeated, f"there is more than one {table} called {repeated!r}: rename one"
@@ -278,9 +275,13 @@ class CampaignSection(Section):
         return any(trial.kind in kinds for trial in self.trial)
 
     def _column_checks(self) -> Iterator[Check]:
-        """Yield unused inputs, columns with several readers, and mixed units of temperature."""
-        have_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
-        no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*have_inputs)
+        """Yield the checks of what inputs and channels read.
+
+        Inputs are used, a column has one reader and is no input of the trial itself, and all
+        temperatures have one unit.
+        """
+        kinds_with_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
+        no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*kinds_with_inputs)
         yield (
             no_trial_has_inputs,
             '[[input]] is for trials of the kind "driven" or "static", but there is none',
@@ -291,8 +292,8 @@ class CampaignSection(Section):
             repeated,
             f"more than one {readers} reads the column {repeated!r}: give each its own `column`",
         )
-        # only static and forced trials read the column `force`: in a driven one a load cell may
-        # have it
+        # only static and forced trials read the column `force`; in a driven trial, a channel may
+        # have it for a load cell
         reads_force = self._has_trial_of(records.TrialKind.STATIC, records.TrialKind.FORCED)
         reserved = {name for name in INPUT_COLUMNS if name != "force" or reads_force}
         for channel in self.channel:
@@ -301,12 +302,12 @@ class CampaignSection(Section):
                 f"the column {channel.table_column!r} holds an input of the trial: "
                 f"give the channel {channel.name!r} another column",
             )
-        in_kelvin: set[bool] = set()
-        for recorded_input in self.columns:
-            if recorded_input.quantity is records.Quantity.TEMPERATURE:
-                in_kelvin.add(recorded_input.unit == "K")
+        temperatures = [
+            reader for reader in self.columns if reader.quantity is records.Quantity.TEMPERATURE
+        ]
+        count_in_kelvin = sum(reader.unit == "K" for reader in temperatures)
         yield (
-            len(in_kelvin) > 1,
+            0 < count_in_kelvin < len(temperatures),
             "temperatures are given in degC and in K: use one of the two units for all of them",
         )
 

@@ -104,14 +104,16 @@ def _read_force(
     campaign: schema.CampaignSection,
     inputs: Sequence[RecordedInput],
 ) -> FloatArray:
-    """Return the force of a trial [N] in each row of its table; the shape is (rows,).
+    """Return the force [N], or torque [N m], in each row of a trial's table (rows,).
 
-    It is the column `force` of a static or forced trial, else the first force or torque [N m] among
-    the inputs, else zero.
+    It is the column `force` of a static or forced trial, else the first force or torque among the
+    inputs, else zero.
     """
-    # a static trial with other inputs needs no force
-    has_other_loads = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
-    if section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not has_other_loads:
+    # a static trial may be loaded by its inputs alone, and then needs no column of force
+    reads_column = section.kind is TrialKind.FORCED or (
+        section.kind is TrialKind.STATIC and ("force" in table.columns or not inputs)
+    )
+    if reads_column:
         to_newton = conversion_factor(campaign.force_unit, schema.FORCE_UNIT)
         return table.numbers("force", f"the trial {section.name!r}") * to_newton
     for recorded_input in inputs:

@@ -32,8 +32,9 @@ def data_scales(
 
     A ratio has a sign. For readings at rest (static and flight trials) it is the robust slope of
     the readings over the prediction. For records in time it is the ratio of their amplitudes,
-    because the model need not predict their phase. A channel is left out in a trial in which its
-    predicted amplitude is too small to determine the ratio.
+    because the model need not predict their phase. A channel without a known scale is left out. In
+    a trial, a channel is also left out if its predicted amplitude is too small to determine the
+    ratio, or if the ratio is zero or so large that the prediction can only be a rounding error.
 
     Parameters
     ----------
@@ -53,7 +54,10 @@ def data_scales(
         largest_amplitudes = _largest_amplitudes(campaign, trial, prediction)
         for column, name in enumerate(trial.channels):
             channel = campaign.channels[name]
-            if np.isinf(channel.gain_deviation) or channel.quantity is Quantity.SIGNAL:
+            has_known_scale = (
+                np.isfinite(channel.gain_deviation) and channel.quantity is not Quantity.SIGNAL
+            )
+            if not has_known_scale:
                 continue
             is_used = trial.used[:, column]
             readings = trial.values[is_used, column]

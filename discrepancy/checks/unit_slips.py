@@ -156,20 +156,20 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
             slipping_trials = [trials[name] for name in trial_names]
             yield from _channel_faults(campaign, channel, slip, slipping_trials)
     for trial in trials.values():
-        keys = [key for key in scales if key[1] == trial.name and key[0] not in wrong_channels]
-        yield from _slips_in_trial(campaign, trial, keys, scales, input_slips)
+        scale_of_channel = {
+            channel: scale
+            for (channel, trial_name), scale in scales.items()
+            if trial_name == trial.name and channel not in wrong_channels
+        }
+        yield from _slips_in_trial(campaign, trial, scale_of_channel)
 
 
 def _slips_in_trial(
-    campaign: Campaign,
-    trial: Trial,
-    keys: Sequence[tuple[str, str]],
-    scales: Mapping[tuple[str, str], float],
-    input_slips: Mapping[tuple[str, str], Slip | None],
+    campaign: Campaign, trial: Trial, scale_of_channel: Mapping[str, float]
 ) -> Iterator[DataFault]:
-    """Yield the unit slip of a trial's input, or the slips of channels in this trial alone.
+    """Yield the unit slip of a trial's input; without one, the slips of its channels alone.
 
-    If all its channels have the same ratio of data to model, the input of the trial has the slip.
+    The input has a slip if all channels of the trial have the same ratio of data to model.
 
     Parameters
     ----------
@@ -177,14 +177,13 @@ def _slips_in_trial(
         The campaign: its trials, channels and noise records.
     trial : Trial
         The trial with its readings, inputs and sample times.
-    keys : sequence of (str, str)
-        The channel and trial for its channels whose own unit is right.
-    scales : mapping of (str, str) to float
-        The ratio of data to model, by channel and trial.
-    input_slips : mapping of (str, str) to Slip or None
-        The slip of the trial's input that would explain each scale.
+    scale_of_channel : mapping of str to float
+        The ratio of data to model in this trial, for the channels whose unit is right in all
+        trials together.
     """
-    common_slip = _common_slip([input_slips[key] for key in keys])
+    common_slip = _common_slip(
+        [_slip_of_input(trial, scale) for scale in scale_of_channel.values()]
+    )
     if common_slip is not None:
         sentence = (
             f"All channels of the trial {trial.name!r} are about {common_slip.factor:.6g} times "
@@ -192,11 +191,10 @@ def _slips_in_trial(
             "unit of its force, load factor, release displacement or inputs"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
-        yield from _grade_slip(fault, common_slip, agreeing=len(keys))
+        yield from _grade_slip(fault, common_slip, agreeing=len(scale_of_channel))
         return
-    for key in keys:
-        channel, _ = key
-        slip = _slip_of_channel(campaign, channel, [scales[key]])
+    for channel, scale in scale_of_channel.items():
+        slip = _slip_of_channel(campaign, channel, [scale])
         # a small factor in one trial may be physical, such as lift that shifts from the outer wing
         if slip is not None and slip.ratio >= CERTAIN_FACTOR:
             yield from _channel_faults(campaign, channel, slip, [trial])

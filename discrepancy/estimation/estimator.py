@@ -101,7 +101,7 @@ class MotionEstimator(GaussNewton):
             if estimate is None:
                 return None
             current_start = start_from_estimate(estimate)
-        return self._lower_missing_forces(laws, current_start, SPEED_WINDOWS[-1])
+        return self._estimate_with_smaller_forces(laws, current_start, SPEED_WINDOWS[-1])
 
     def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
@@ -121,7 +121,7 @@ class MotionEstimator(GaussNewton):
         MotionEstimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self._lower_missing_forces(laws, start, SPEED_WINDOWS[-1])
+        estimate = self._estimate_with_smaller_forces(laws, start, SPEED_WINDOWS[-1])
         if estimate is None:
             return None
         estimate = self.tune_processes(laws, estimate, COARSE_FACTORS)
@@ -169,7 +169,7 @@ class MotionEstimator(GaussNewton):
             The estimate with a wider window.
         """
         for speed_window in NARROWEST_WINDOWS:
-            narrower_estimate = self._lower_missing_forces(
+            narrower_estimate = self._estimate_with_smaller_forces(
                 laws, start_from_estimate(estimate), speed_window
             )
             if (
@@ -180,15 +180,15 @@ class MotionEstimator(GaussNewton):
             estimate = narrower_estimate
         return estimate
 
-    def _lower_missing_forces(
+    def _estimate_with_smaller_forces(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
         """Return the most probable of several estimates with smaller and smaller missing forces.
 
         This is a continuation. With a large missing force the trajectory follows the readings
-        whatever the laws are. Its standard deviation is then lowered to each of
-        `DEVIATION_FRACTIONS` times that at the start. Each estimate begins with the unknowns and
-        the trajectories of the previous one.
+        whatever the laws are. Then the standard deviation of the missing force is lowered, to each
+        of `DEVIATION_FRACTIONS` times its value at the start. Each estimate begins with the
+        unknowns and the trajectories of the previous one.
 
         Parameters
         ----------
@@ -196,6 +196,8 @@ class MotionEstimator(GaussNewton):
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The unknowns, trajectories and missing forces of the first estimate.
+        speed_window : float
+            The half width of the window of speeds, see `LawArguments`.
 
         Returns
         -------
@@ -220,7 +222,7 @@ class MotionEstimator(GaussNewton):
                 break
             if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
                 best_estimate = estimate
-            # far below the best evidence, still smaller forces are not expected to rise above it
+            # smaller forces will hardly raise an evidence this far below the best one above it
             elif estimate.log_evidence < best_estimate.log_evidence - LARGEST_DECLINE:
                 break
             current_start = start_from_estimate(estimate)

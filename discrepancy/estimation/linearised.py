@@ -177,7 +177,10 @@ class LinearisedTrial:
     # ------------------------------------------------------------ steps
 
     def _substep_matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return transitions, process noises and drifts of all substeps, with the laws in them.
+        """Return transitions, process noises and drifts of all substeps, the laws included.
+
+        n is the number of states, F that of fine stamps, and W that of weights: one, then the
+        unknowns.
 
         Returns
         -------
@@ -196,7 +199,7 @@ class LinearisedTrial:
         drifts = self._drift_by_system_parameters(
             by_input_at_begin, by_input_at_end, interval_of_sample
         )
-        # adds the drift by the laws
+        # `drifts` is changed in place: the drift by the laws is added to it
         transitions, noises = substep_matrices_with_laws(
             self.trial.substeps,
             interval_of_sample,

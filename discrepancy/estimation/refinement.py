@@ -214,33 +214,38 @@ def _named_laws_of_family(
 
 
 def _estimate_from_values(
-    search: ForceSearch, hypothesis: ForceHypothesis, form: _ValuedCandidate
+    search: ForceSearch, start_hypothesis: ForceHypothesis, valued_candidate: _ValuedCandidate
 ) -> ForceHypothesis | None:
-    """Return a set of effects, estimated with the motion from that of an estimated hypothesis.
+    """Estimate a set of effects, starting from the motion of another, estimated hypothesis.
 
     Parameters
     ----------
     search : ForceSearch
         The search for the missing force.
-    hypothesis : ForceHypothesis
-        The estimated hypothesis, whose motion and missing forces the estimate begins with.
-    form : _ValuedCandidate
+    start_hypothesis : ForceHypothesis
+        The estimated hypothesis. Its motion and missing forces are those to begin with.
+    valued_candidate : _ValuedCandidate
         The set of effects, with the values to begin with.
 
     Returns
     -------
     ForceHypothesis or None
-        The hypothesis; None if its laws are not possible along the motion.
+        The new hypothesis; None if its laws are not possible along the motion.
     """
-    trials = hypothesis.linear_trials
-    laws, estimator = laws_and_estimator(search, form.candidate, trials)
+    trials = start_hypothesis.linear_trials
+    laws, estimator = laws_and_estimator(search, valued_candidate.candidate, trials)
     start = EstimatorStart(
-        form.parameters, hypothesis.shared, _trajectories(hypothesis), hypothesis.processes
+        valued_candidate.parameters,
+        start_hypothesis.shared,
+        _trajectories(start_hypothesis),
+        start_hypothesis.processes,
     )
-    estimate = estimator.polish(laws, start, hypothesis.speed_window or SPEED_WINDOWS[-1])
+    # a hypothesis that was not estimated with a window of speeds gets the usual one, the last
+    speed_window = start_hypothesis.speed_window or SPEED_WINDOWS[-1]
+    estimate = estimator.polish(laws, start, speed_window)
     if estimate is None:
         return None
-    return hypothesis_of_estimate(search, form.candidate, trials, estimate)
+    return hypothesis_of_estimate(search, valued_candidate.candidate, trials, estimate)
 
 
 def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> ForceHypothesis | None:

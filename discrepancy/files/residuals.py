@@ -48,7 +48,7 @@ _DAMAGED = (
     RecursionError,
     DiscrepancyError,
 )
-_PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
+_PLAIN_FIELDS = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
 """Fields of a channel that are written unchanged."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
 _ARRAYS: dict[str, dict[str, dict[str, object]]] = tomllib.loads(
@@ -129,7 +129,7 @@ def _residual_set(tree: xr.DataTree) -> ResidualSet:
     channels = {}
     for row in json.loads(tree.attrs["channels"]):
         name = row["name"]
-        channels[name] = _channel(row, samples_at_rest.get(name))
+        channels[name] = _channel_from_row(row, samples_at_rest.get(name))
     # every other group is a trial, and its name ends with its number
     groups_of_trials = sorted(set(tree.children) - {"noise"})
     trials = [_fitted_trial(tree[group].to_dataset()) for group in groups_of_trials]
@@ -147,9 +147,9 @@ def _samples_at_rest(tree: xr.DataTree) -> dict[str, FloatArray]:
 
 
 def _channel_row(channel: Channel) -> dict[str, object]:
-    """Return a channel as a row of the attribute `channels`, without its samples at rest.
+    """Return the entries of a channel in the file's attribute `channels`, without its samples.
 
-    The row may hold infinities, which Python's JSON writes and reads.
+    They may be infinite; Python's module `json` writes infinities and reads them.
     """
     noise_row = None
     if channel.noise is not None:
@@ -160,17 +160,17 @@ def _channel_row(channel: Channel) -> dict[str, object]:
             noise.interval,
             noise.source,
         ]
-    plain_keys = {key: getattr(channel, key) for key in _PLAIN}
-    return {"quantity": channel.quantity, **plain_keys, "noise": noise_row}
+    plain_fields = {name: getattr(channel, name) for name in _PLAIN_FIELDS}
+    return {"quantity": channel.quantity, **plain_fields, "noise": noise_row}
 
 
-def _channel(row: JsonRecord, samples: FloatArray | None) -> Channel:
-    """Read a channel from its row of the attribute `channels`; inverse of `_channel_row`.
+def _channel_from_row(row: JsonRecord, samples: FloatArray | None) -> Channel:
+    """Return the channel that `_channel_row` wrote.
 
     Parameters
     ----------
     row : mapping
-        The row.
+        The entries of the channel in the attribute `channels`.
     samples : (n,) ndarray or None
         The samples of the channel's noise record [channel's unit]; None if it has none.
     """
@@ -184,8 +184,8 @@ def _channel(row: JsonRecord, samples: FloatArray | None) -> Channel:
             interval=interval,
             source=source,
         )
-    plain_keys = {key: row[key] for key in _PLAIN}
-    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **plain_keys)
+    plain_fields = {name: row[name] for name in _PLAIN_FIELDS}
+    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **plain_fields)
 
 
 def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:

@@ -232,9 +232,10 @@ def objective(
     point: Point,
     jumps: Sequence[FloatArray] | None = None,
 ) -> float:
-    """Return the negative log posterior of a candidate at a point [nat].
+    """Return the negative log posterior of a candidate at a point [nat], up to a constant.
 
-    A constant is left out, which is the same for all candidates.
+    The constant is the same for all candidates. Values of the point beyond their bounds are moved
+    to the bounds.
 
     Parameters
     ----------
@@ -245,7 +246,7 @@ def objective(
     point : Point
         The values of all unknowns.
     jumps : sequence of (N, C) array, optional
-        What jumps near the point add to the response of each trial, see
+        What the response of each trial jumps by for small changes of the unknowns, see
         `Problem.standardised_residual`.
 
     Raises

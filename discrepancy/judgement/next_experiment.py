@@ -103,9 +103,10 @@ def next_experiments(
 def mutual_information(
     problem: Problem, proposal: Proposal, fits: Sequence[CandidateFit], weights: FloatArray
 ) -> float:
-    """Return how much a new trial would tell about which hypothesis is true [nat].
+    """Return the information that a new trial is expected to give on the hypothesis [nat].
 
-    It is the mutual information of the hypothesis and the readings of the trial.
+    It is the mutual information of the hypothesis and the readings of the trial (Lindley 1956, Ann.
+    Math. Statist. 27, 986-1005).
 
     Parameters
     ----------
@@ -124,13 +125,22 @@ def mutual_information(
         else problem.model
     )
     trial_problem = problem.with_trials((proposal.trial,), model)
-    # without a noise record, the rms residual of the most probable hypothesis, which is the first,
-    # is taken for the noise deviation; a precision is (recorded / actual deviation)^2
-    recorded_over_residual_deviation = np.sqrt(problem.noise_precisions(fits[0].squares_by_channel))
-    noise_scale = np.where(problem.record_freedom > 0.0, 1.0, recorded_over_residual_deviation)
-    predictions = [_predicted_trial(trial_problem, fit, noise_scale) for fit in fits]
+    recorded_over_actual_noise = _recorded_over_actual_noise(problem, most_probable_fit=fits[0])
+    predictions = [_predicted_trial(trial_problem, fit, recorded_over_actual_noise) for fit in fits]
     gaussians = _reduce_dimensions(predictions, weights)
     return _simulate_information(gaussians, weights)
+
+
+def _recorded_over_actual_noise(problem: Problem, most_probable_fit: CandidateFit) -> FloatArray:
+    """Return the noise deviation that residuals are divided by, over the actual one, (channels,).
+
+    It is one for a channel with a noise record. Without a record, the deviation is an assumption,
+    and the rms residual of the most probable hypothesis is taken for the actual noise.
+    """
+    recorded_over_rms_residual = np.sqrt(
+        problem.noise_precisions(most_probable_fit.squares_by_channel)
+    )
+    return np.where(problem.record_freedom > 0.0, 1.0, recorded_over_rms_residual)
 
 
 class _PredictedTrial(NamedTuple):
@@ -149,7 +159,7 @@ class _PredictedTrial(NamedTuple):
 
 
 def _predicted_trial(
-    trial_problem: Problem, fit: CandidateFit, noise_scale: FloatArray
+    trial_problem: Problem, fit: CandidateFit, recorded_over_actual_noise: FloatArray
 ) -> _PredictedTrial:
     """Return the Gaussian prediction of a new trial by a hypothesis, over the noise deviation.
 
@@ -162,7 +172,7 @@ def _predicted_trial(
         The problem of the new trial alone.
     fit : CandidateFit
         The fit of the hypothesis.
-    noise_scale : (channels,) array
+    recorded_over_actual_noise : (channels,) array
         The recorded noise deviation of each channel, divided by the actual one.
     """
     data = trial_problem.trials[0]
@@ -174,7 +184,9 @@ def _predicted_trial(
         0, point, derivatives, fit.candidate
     )
     # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
-    reading_scale = np.broadcast_to(noise_scale[data.channel_indices], data.weight.shape).ravel()
+    reading_scale = np.broadcast_to(
+        recorded_over_actual_noise[data.channel_indices], data.weight.shape
+    ).ravel()
     jacobian = (
         data.standardise(derivatives_by_unknowns).reshape(
             len(derivatives_by_unknowns), reading_scale.size

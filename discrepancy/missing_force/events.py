@@ -145,7 +145,10 @@ class EventSearch(EventTrials):
         return forces(fit.x), -float(fit.fun) - price_of_changes(paths)
 
     def improve_paths(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[BoolArray]:
-        """Return more probable paths, by inverting one stretch after the other.
+        """Return more probable paths, by inverting one stretch of a path after the other.
+
+        A path tells at which samples of a trial the force of events is on; a stretch is a run of
+        samples between two of its changes.
 
         Parameters
         ----------
@@ -156,17 +159,31 @@ class EventSearch(EventTrials):
         """
         new_paths = list(paths)
         products = self.products(forces, paths)
-        for number, is_on in enumerate(paths):
-            products_of_others = products[:number] + products[number + 1 :]
-            record = SwitchedRecord(self, number, forces, products_of_others)
-            better_path: BoolArray | None = is_on
-            for _ in range(2 * MOST_EVENTS):
-                if better_path is None:
-                    break
-                new_paths[number] = record.place_changes(better_path)
-                better_path = record.invert_best_stretch(new_paths[number])
-            products[number] = record.products(new_paths[number])
+        for trial_index in range(len(new_paths)):
+            products_of_others = [*products[:trial_index], *products[trial_index + 1 :]]
+            record = SwitchedRecord(self, trial_index, forces, products_of_others)
+            new_paths[trial_index] = _improved_path(record, new_paths[trial_index])
+            products[trial_index] = record.products(new_paths[trial_index])
         return new_paths
+
+
+def _improved_path(record: SwitchedRecord, path: BoolArray) -> BoolArray:
+    """Return a path with its changes at the most probable samples, no stretch better inverted.
+
+    Parameters
+    ----------
+    record : SwitchedRecord
+        A trial with its filters.
+    path : (N,) array of bool
+        The path to begin with.
+    """
+    path = record.place_changes(path)
+    for _ in range(2 * MOST_EVENTS - 1):
+        path_with_inverted_stretch = record.invert_best_stretch(path)
+        if path_with_inverted_stretch is None:  # no inversion makes the path more probable
+            break
+        path = record.place_changes(path_with_inverted_stretch)
+    return path
 
 
 @dataclass(frozen=True, eq=False)

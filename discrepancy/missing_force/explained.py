@@ -105,16 +105,17 @@ class ForceHypothesis:
     def _covariance_of_hidden_force(self) -> FloatArray:
         """Return the covariance (E, E) that a hidden force adds to the effect parameters.
 
-        A hidden force of variance v at a port looks like a change of the parameters whose laws act
-        there. Let M hold the mean products of their forces per unit. The changes x whose force
-        has about the hidden variance, x^T M x = v, have the covariance v (M + v I)^-1. For one
-        parameter this is nearly v / M, and never more than its prior variance of one. Hidden forces
-        at several ports are independent, so that their covariances add up.
+        A hidden force at a port looks like a change of the parameters whose laws act there. It is
+        taken as one reading of these parameters: with a variance v of the hidden force, the mean
+        products M of the laws' forces per unit, and the prior variance one of each parameter, their
+        posterior covariance is (M / v + I)^-1 = v (M + v I)^-1. For one parameter this is nearly
+        v / M, and never more than its prior variance. Hidden forces at several ports are
+        independent, so their covariances add.
         """
         effect_count = len(self.effect)
         added_covariance = np.zeros((effect_count, effect_count))
         for port, process in self.processes.items():
-            forces_per_unit = self._force_by_parameter(port)
+            forces_per_unit = self._force_by_parameter(port)  # (E, T)
             acting_parameters = np.flatnonzero(forces_per_unit.any(axis=1))
             if not len(acting_parameters):
                 continue

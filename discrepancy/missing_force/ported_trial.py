@@ -215,7 +215,7 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[Ga
     trial : Trial
         The trial with its readings, inputs and sample times.
     gains : (C,) array
-        The gain of each channel of the trial at the point; 1 is a channel without an error.
+        The present gain of each channel of the trial; 1 for a channel without a gain error.
     """
     layout = problem.shared
     unknowns = []
@@ -223,10 +223,10 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[Ga
         if channel_name in trial.channels:
             unknown_index = layout.parameter_count + gain_index
             column = trial.channels.index(channel_name)
-            # the readings contain the present gain already, so that one scale of the unknown
-            # changes them by the fraction scale / gain
-            fraction = float(layout.scale[unknown_index]) / float(gains[column])
-            unknowns.append(GainUnknown(unknown_index, column, fraction))
+            # The predicted readings are multiplied by the present gain already. So a change of the
+            # gain by one scale changes them by scale / gain of their value.
+            relative_change = float(layout.scale[unknown_index]) / float(gains[column])
+            unknowns.append(GainUnknown(unknown_index, column, relative_change))
     return unknowns
 
 

@@ -172,7 +172,8 @@ class ForceShares:
             for begin, end in _blocks(len(trial.time)):
                 samples = slice(begin * trial.substeps, end * trial.substeps, trial.substeps)
                 force_sums = [
-                    _weighted_squares(forces, weights, samples) for forces in forces_of_kinds
+                    _squares_of_weighted_forces(forces, weights, samples)
+                    for forces in forces_of_kinds
                 ]
                 of_forces.append(_BlockSums(*force_sums))
                 prediction_sums = [
@@ -263,8 +264,10 @@ def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
     return pairwise(edges.tolist())
 
 
-def _weighted_squares(forces: PortForces, weights: Mapping[int, float], samples: slice) -> float:
-    """Return the weighted sum of squares of forces over all samples and ports.
+def _squares_of_weighted_forces(
+    forces: PortForces, weights: Mapping[int, float], samples: slice
+) -> float:
+    """Return the sum of the squares of the weighted forces, over the samples and all ports.
 
     Parameters
     ----------
@@ -273,7 +276,7 @@ def _weighted_squares(forces: PortForces, weights: Mapping[int, float], samples:
     weights : mapping of int to float
         The weight of each port.
     samples : slice
-        The fine stamps of the samples.
+        The fine stamps over which is summed.
     """
     total = 0.0
     for port, force in forces.items():

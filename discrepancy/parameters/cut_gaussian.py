@@ -42,22 +42,23 @@ class TruncatedGaussian:
 
     @cached_property
     def tilt(self) -> FloatArray:
-        """Shift (P,) of the standard normal variables of draws towards the mode within the range.
+        """The shift (P,) that moves standard normal draws towards the mode within the range.
 
-        If the mean is outside the range, draws without a shift would rarely be near the mode
+        If the mean is outside the range, draws without a shift are rarely near the mode
         (exponential tilting, Botev 2017, J. R. Statist. Soc. B 79 (1)).
         """
         inverse_factor = np.linalg.inv(self.factor)
         bounds = (self.low, self.high)
-        # mode within the range: least (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2
+        # the mode minimises (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2 within the range
         mode = lsq_linear(inverse_factor, inverse_factor @ self.mean, bounds, method="bvls").x
         normal_at_mode = inverse_factor @ (mode - self.mean)
-        # The mode is x = L^T l, with the Lagrange multipliers l of the ends of the range: x_i is
-        # the sum of L_ji l_j over j >= i. The truncation of parameter i itself moves a draw by
-        # L_ii l_i. The shift is the remaining part, which anticipates the later parameters.
-        return np.asarray(
-            normal_at_mode - np.diag(self.factor) * (inverse_factor.T @ normal_at_mode)
-        )
+        # The ends of the range push the mode away from the mean: with their Lagrange multipliers l
+        # the normal variables there are L^T l, of which variable i has the part L_ii l_i from its
+        # own end. A draw within its own range has this part without a shift. The shift is the rest,
+        # which comes from the ends of the parameters that are drawn later.
+        multipliers = inverse_factor.T @ normal_at_mode
+        part_of_own_end = np.diag(self.factor) * multipliers
+        return np.asarray(normal_at_mode - part_of_own_end)
 
     def weighted_draws(
         self, means: FloatArray, uniform: FloatArray

@@ -349,10 +349,11 @@ class Model(ABC):
     def respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the response of a trial without sensors; those in the patch are ignored here.
+        """Return the true response of a trial, before sensors; those of the patch are ignored.
 
-        Velocity and acceleration are derivatives of displacement, and a signal is the output
-        itself.
+        Where an output is wanted as a velocity or acceleration, it is differentiated in time; as a
+        signal, it is returned unchanged. A model with a response cache returns equal responses from
+        there.
 
         Parameters
         ----------
@@ -372,7 +373,7 @@ class Model(ABC):
         """
         if self._responses is None:
             return self._checked_response(trial, outputs, patch, conditions)
-        # the trial is kept with its response, so that no other one gets its id
+        # the cache keeps the trial alive, so that no other trial gets its id
         key = (id(trial), outputs, patch.primitives, conditions.key)
         _, response = self._responses.get(
             key, lambda: (trial, self._checked_response(trial, outputs, patch, conditions))

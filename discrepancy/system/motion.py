@@ -73,20 +73,27 @@ class Motion:
 
     @cached_property
     def acceleration(self) -> FloatArray:
-        """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
+        """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion.
+
+        The coordinates are those of M modes, then P prescribed motions. Forces of laws act against
+        the motion, and count with a minus.
+        """
         modal = self.system.modal_system
-        restoring = self.q @ modal.full_stiffness.T
-        if self.laws.stiffness_rate != 0.0:
-            restoring *= 1.0 + self.laws.stiffness_rate * (
-                self.time[:, None] - self.laws.drift_start
-            )
-        forces = self.system.modal_forces(self.excitation, self.time)
-        acceleration = forces - restoring - self.velocity @ modal.damping.T
+        applied = self.system.modal_forces(self.excitation, self.time)
+        acceleration = applied - self._restoring_forces() - self.velocity @ modal.damping.T
         if len(self.laws):
             acceleration -= self.port_forces @ self.laws.port_rows(modal.actions, self.q.shape[1])
         # samples before the release, while the structure is held
         acceleration[: self.held_samples] = 0.0
         return acceleration
+
+    def _restoring_forces(self) -> FloatArray:
+        """Return the modal forces (N, M + P) of the stiffness, which may drift with time."""
+        restoring = self.q @ self.system.modal_system.full_stiffness.T
+        if self.laws.stiffness_rate != 0.0:
+            time_of_drift = self.time[:, None] - self.laws.drift_start
+            restoring *= 1.0 + self.laws.stiffness_rate * time_of_drift
+        return np.asarray(restoring)
 
     def displacements_and_speeds_at(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the displacements and speeds (N, P) of row . u at all samples, for rows (P, n).

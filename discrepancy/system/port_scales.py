@@ -240,11 +240,10 @@ class PortScaleEstimator:
     def _measured_over_computed(
         self, motion: Motion, positions: FloatArray, readings: DisplacementReadings
     ) -> FloatArray:
-        """Return the factors (P,) that bring the computed motion of ports to the measured size.
+        """Return factors (P,) for ports whose motion was measured to be far from the computed one.
 
-        The displacement of a port is measured if it is a linear combination of displacements that
-        channels show and of prescribed motions, such as the distance of a body from a moved
-        support. It is one for all other ports, and where both motions have about the same size.
+        A factor is the largest measured displacement of a port over the largest computed one. It is
+        one for ports that are not measured, and where both displacements have about the same size.
 
         Parameters
         ----------
@@ -259,23 +258,21 @@ class PortScaleEstimator:
         reading_count = len(readings.rows)
         if not reading_count:
             return ratios
-        computed, _ = motion.displacements_and_speeds_at(readings.rows)
-        known_rows = np.vstack(
-            (readings.rows, motion.system.drives.reshape(-1, self.rows.shape[1]))
-        )
+        computed_readings, _ = motion.displacements_and_speeds_at(readings.rows)
+        drives = motion.system.drives.reshape(-1, self.rows.shape[1])
+        known_rows = np.vstack((readings.rows, drives))
         for port, row in enumerate(self.rows):
             if not np.any(row[: motion.system.displacement_count]):
                 continue  # a port of a state, whose value is a speed here
-            coefficients = np.linalg.lstsq(known_rows.T, row, rcond=None)[0]
-            unknown_part = np.abs(known_rows.T @ coefficients - row).max()
-            if unknown_part > EXACT_COMBINATION * np.abs(row).max():
+            coefficients = _combination_of(known_rows, row)
+            if coefficients is None:
                 continue
             # prescribed motions are the same in both: only readings differ from the computed motion
-            difference = (readings.values - computed) @ coefficients[:reading_count]
+            difference = (readings.values - computed_readings) @ coefficients[:reading_count]
             measured = positions[:, port] + difference
-            counts = np.isfinite(measured)
-            largest_measured = larger_magnitude(0.0, measured[counts])
-            largest_computed = larger_magnitude(0.0, positions[counts, port])
+            is_measured = np.isfinite(measured)
+            largest_measured = larger_magnitude(0.0, measured[is_measured])
+            largest_computed = larger_magnitude(0.0, positions[is_measured, port])
             if largest_measured == 0.0 or largest_computed == 0.0:
                 continue
             ratio = largest_measured / largest_computed
@@ -386,3 +383,13 @@ class PortScaleEstimator:
             static_stiffness=static_stiffness,
             largest_displacement=largest_displacement or 1.0,
         )
+
+
+def _combination_of(known_rows: FloatArray, row: FloatArray) -> FloatArray | None:
+    """Return coefficients (K,) with which known rows (K, n) add to a row (n,); None if none do.
+
+    A displacement is known, for example, as that of a body minus that of its moved support.
+    """
+    coefficients = np.asarray(np.linalg.lstsq(known_rows.T, row, rcond=None)[0])
+    unknown_part = np.abs(known_rows.T @ coefficients - row).max()
+    return None if unknown_part > EXACT_COMBINATION * np.abs(row).max() else coefficients

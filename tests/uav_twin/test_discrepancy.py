@@ -190,7 +190,7 @@ def test_a_check_lists_the_faults_of_data(faulty_campaign):
     done = command("discrepancy", "check", faulty_campaign, *RIG)
     assert done.returncode == 1
     assert "Fault:" in done.stdout
-    assert "no channel has the column 'weather'" in done.stdout
+    assert "no channel reads the column 'weather'" in done.stdout
 
 
 def test_a_search_of_faulty_data_ends_with_a_sentence_and_a_report(faulty_campaign, tmp_path):

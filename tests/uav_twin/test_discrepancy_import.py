@@ -614,7 +614,7 @@ def test_the_outputs_of_the_model_are_listed_where_a_column_may_be_one_of_them()
 def test_the_outputs_of_the_model_are_listed_where_a_column_is_said_to_be_another():
     wrong = ("--column", "Weg=deflection", "--unit", "Weg=mm")
     sentence = refused(*IMPORT, *ONE_SWING, *wrong)
-    assert f"the model has no output 'deflection'; it has {OUTPUTS_OF_RIG}; say another." in sentence
+    assert f"the model has no output 'deflection'; it has {OUTPUTS_OF_RIG}; choose another." in sentence
 
 
 @pytest.mark.usefixtures("one_swing")

@@ -212,7 +212,7 @@ def test_columns_of_no_channel_are_one_remark(tmp_path):
     campaign = read_campaign(campaign_folder(tmp_path / "a", PLAIN, with_column, tip_up))
     (remark,) = (remark for remark in campaign.remarks if "'g71'" in remark)
     assert campaign.trials[0].channels == ("tip",)
-    assert remark.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
+    assert remark.startswith("tip_up.csv and 1 more: no channel reads the column 'g71'")
 
 
 def test_a_channel_that_some_tables_lack_is_one_remark_with_its_trials(tmp_path):
