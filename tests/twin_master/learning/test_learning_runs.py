@@ -469,7 +469,7 @@ def test_the_journal_has_the_notices_of_the_summary(noticed):
 def test_the_store_has_the_suspicions_of_the_journal(noticed):
     for name, stored in noticed.store.data_vars.items():
         journalled = [line["suspicion"][name] for line in noticed.lines]
-        assert journalled == stored.values.tolist()
+        np.testing.assert_allclose(journalled, stored.values, rtol=1e-9, atol=1e-12)
 
 
 def test_the_store_says_from_when_on_a_gauge_is_left_out(noticed):

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.refusals import Inputs
-from tests.twin_master.runs import journal
+from tests.twin_master.runs import belief_in_journal, journal
 from tests.twin_master.watch.conftest import begun, ran
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import feed_of_lines, feed_of_mappings, file_feed
@@ -162,7 +162,7 @@ def timed_watch(watch: Watch) -> Watch:
 
 def check_mission(watch: Watch, mission: Any) -> None:
     """Check that the belief in each step is that of the mission."""
-    assert [line["filtered"] for line in journal(watch.folder)] == mission.filtered.tolist()
+    assert [line["filtered"] for line in journal(watch.folder)] == belief_in_journal(mission.filtered)
 
 
 @pytest.mark.parametrize("form", ["lines", "batches"])
