@@ -191,9 +191,9 @@ class PackedSuspicionRecord(TypedDict):
     the hypothesis "none of these" [1].
     """
     log_evidence_none: NotRequired[float]
-    """Log e-value that no state explains the sensors; only in a watch [nat]."""
+    """Log e-value that no state explains the sensors; only in a watch, after an alarm [nat]."""
     log_evidence_any_gauge: NotRequired[float]
-    """Log e-value that a single sensor is off; only in a watch [nat]."""
+    """Log e-value that a single sensor is off; only in a watch, after an alarm [nat]."""
 
 
 class JournalRecord(TypedDict):
@@ -254,11 +254,13 @@ class JournalRecord(TypedDict):
     """The position in the stream of messages from which the watch resumes; only in a watch."""
     settled: NotRequired[dict[str, object]]
     """The state of the twin before all steps that a late message can still change; only in a
-    watch, in every 1024th step.
+    watch, in every 2048th step.
     """
+    begin: NotRequired[int]
+    """Where the line begins in the file, if it has no `standing`; only in a watch [bytes]."""
     standing: NotRequired[dict[str, object]]
-    """Where the line begins in the file [bytes]; now and then, the state of the search for causes
-    before the line; only in a watch.
+    """Where the line begins in the file, and the state of the search for causes before the line;
+    only in a watch, in the steps with `learnt` and in events.
     """
     quiet: NotRequired[DecisionRecord]
     """The decision that was written again because no step came; only in a watch."""

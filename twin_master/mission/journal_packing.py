@@ -167,12 +167,17 @@ _PACK: dict[str, Callable[..., object]] = {
 def packed_record(record: Mapping[str, object]) -> JsonObject:
     """Return the short form of a record, as it stands in a line of the journal.
 
-    The step of an observation is left out if it is that of the line.
+    The step of an observation is left out if it is that of the line. The position at which a line
+    begins stands in it directly, if there is nothing else in its table `standing`.
     """
-    packed = dict(record)
+    packed: JsonObject = dict(record)
     for name, pack in _PACK.items():
         if name in packed:
             packed[name] = pack(packed[name])
+    standing = packed.get("standing")
+    if isinstance(standing, dict) and standing.keys() == {"begin"}:
+        del packed["standing"]
+        packed["begin"] = standing["begin"]
     if "observation_step" in packed and packed["observation_step"] == packed.get("step"):
         del packed["observation_step"]
     return packed
@@ -199,6 +204,8 @@ def full_record(packed: JsonObject) -> JsonObject:
     learnt = record.get("learnt")
     if isinstance(learnt, dict) and isinstance(learnt.get("figures"), str):
         record["learnt"] = _unpack_learnt(learnt)
+    if "begin" in record:
+        record["standing"] = {"begin": record.pop("begin")}
     if "intake" in record and "observed" in record:
         record.setdefault("observation_step", record.get("step"))
     return record

@@ -57,12 +57,8 @@ from twin_master.watch.signals import call_on_end_signal
 from twin_master.watch.teaching import Teaching
 
 WATCHED_ASSET = "watched asset"
-_KEPT_OF_SUSPICION = (
-    *KEPT_OF_SUSPICION,
-    "log_evidence_none",
-    "log_evidence_any_gauge",
-)
-"""The entries of a suspicion in every line of a watch: the search for causes needs them, too."""
+_KEPT_AFTER_ALARM = (*KEPT_OF_SUSPICION, "log_evidence_none", "log_evidence_any_gauge")
+"""The entries of a suspicion in the lines after an alarm: the search for its cause needs them."""
 FLUSH_SECONDS = 1.0
 """Seconds between two flushes of the journal to the disk while a recording is watched.
 
@@ -369,7 +365,8 @@ class Watch:
         standing: JsonObject = {"begin": self.journal.size}
         is_step = "filtered" in line
         is_whole = not is_step or is_whole_step(line["step"])
-        journal_line = short_record(line, is_whole=is_whole, kept_of_suspicion=_KEPT_OF_SUSPICION)
+        kept = _KEPT_AFTER_ALARM if self.teaching.has_alarm else KEPT_OF_SUSPICION
+        journal_line = short_record(line, is_whole=is_whole, kept_of_suspicion=kept)
         if is_whole:
             standing["teaching"] = self.teaching.as_record()
         if "settled" in line and (line["step"] + 1) % KEPT_SNAPSHOT_STEPS == 0:

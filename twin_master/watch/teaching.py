@@ -108,6 +108,11 @@ class Teaching:
     _next_search_step: int = 0  # no search begins before it
     _model_from_step: int = 0  # the first step of the model that is believed
 
+    @property
+    def has_alarm(self) -> bool:
+        """Whether there is an alarm whose cause may be searched after later steps."""
+        return self._current_alarm is not None
+
     def as_record(self) -> JsonObject:
         """Return the state by the keys of a journal."""
         return {key: getattr(self, attribute) for attribute, key in _KEYS.items()}
