@@ -34,7 +34,7 @@ from twin_master.errors import NotResumableError
 from twin_master.mission.journal_packing import (
     array_from_json,
     full_record,
-    pack_numbers,
+    json_from_array,
     packed_record,
     rounded,
     rounded_probabilities,
@@ -110,6 +110,8 @@ NoiseFree = Callable[[int, Float], Float]
 """Returns the readings of a step (G,) without their noise and drift, up to rounding [SI]."""
 LARGE_PARTS = ("asset_state", "learnt", "settled", "suspicion")
 """The entries of a record that most lines leave out, or have only in part."""
+_LONGEST_DIFFERENCE = 9
+"""Mean number of digits up to which differences are shorter than the values in base 64."""
 KEPT_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
 """The entries of a suspicion that every line has: viewers and decisions need them."""
 
@@ -123,15 +125,18 @@ def step_record(step: MissionStep) -> JsonObject:
     twin_step = step.twin_step
     record: JsonObject = {
         "step": twin_step.step,
-        "observed": plain(step.reading.observed),
+        "observed": json_from_array(step.reading.observed),
         "control_index": twin_step.control_index,
         "next_control": twin_step.next_control,
         "decision_probability": rounded_probabilities(twin_step.decision_probability.tolist()),
         "filtered": rounded_probabilities(twin_step.filtered.tolist()),
         "log_evidence": rounded(twin_step.log_evidence),
     }
-    if step.reading.ground_truth is not None:
-        record |= plain(step.reading.ground_truth._asdict())
+    ground_truth = step.reading.ground_truth
+    if ground_truth is not None:
+        record["state"] = json_from_array(ground_truth.state)
+        record["observation"] = json_from_array(ground_truth.observation)
+        record["monitors"] = plain(ground_truth.monitors)
     if twin_step.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in twin_step.learnt.items()}
     if twin_step.notices:
@@ -142,16 +147,19 @@ def step_record(step: MissionStep) -> JsonObject:
 
 
 def _suspicion_record(suspicion: Suspicion) -> JsonObject:
-    """Return the record of a suspicion, whose numbers are rounded as those of a step."""
-    record: JsonObject = plain(vars(suspicion))
-    for name in ("log_evidence_none", "log_evidence_any_gauge"):
-        record[name] = rounded(record[name])
-    for name in ("none_of_these", "gauge_off"):
-        (record[name],) = rounded_probabilities([record[name]])
-    probabilities = rounded_probabilities(record["hypotheses"].values())
-    record["hypotheses"] = dict(zip(record["hypotheses"], probabilities, strict=True))
-    record["log_evidence_gauge"] = [rounded(value) for value in record["log_evidence_gauge"]]
-    return record
+    """Return the record of a suspicion; what lines of the journal have of it is rounded."""
+    none_of_these, gauge_off = rounded_probabilities([suspicion.none_of_these, suspicion.gauge_off])
+    probabilities = rounded_probabilities(suspicion.hypotheses.values())
+    return {
+        "none_of_these": none_of_these,
+        "gauge_off": gauge_off,
+        "log_evidence_none": rounded(suspicion.log_evidence_none),
+        "log_evidence_any_gauge": rounded(suspicion.log_evidence_any_gauge),
+        "log_evidence_gauge": json_from_array(suspicion.log_evidence_gauge),
+        "left_out": suspicion.left_out.tolist(),
+        "hypotheses": dict(zip(suspicion.hypotheses, probabilities, strict=True)),
+        "decided_by": suspicion.decided_by,
+    }
 
 
 def large_parts(record: JsonRecord) -> JsonObject:
@@ -199,11 +207,12 @@ def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
     noise_free : callable
         Removes noise and drift from readings, see `NoiseFree`.
     """
-    observation = np.array(record["observation"])
+    observation = array_from_json(record["observation"])
     observed = array_from_json(record["observed"][: len(observation)])
     estimate = noise_free(record["step"], observed)
     difference = (observation.view(np.int64) - estimate.view(np.int64)).tolist()
-    if len(json.dumps(difference)) >= len(pack_numbers(record["observation"])):
+    digits = sum(len(str(number)) for number in difference)
+    if digits > _LONGEST_DIFFERENCE * len(difference):
         return record
     short = {name: value for name, value in record.items() if name != "observation"}
     return short | {"observation_difference": difference}

@@ -8,7 +8,6 @@ stream. Lines of earlier versions have the full form already, and are read uncha
 
 import base64
 import binascii
-import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -30,9 +29,9 @@ _COUNTS = ("received", "missing", "late", "duplicates", "rejected")
 _RUN_OF_STATUSES = re.compile(r"(\d)\*(\d+)")
 
 
-def rounded(value: float) -> float:
-    """Return a number rounded to ten significant digits, as journals have it."""
-    return float(f"{value:.10g}")
+def rounded(value: float) -> float | None:
+    """Return a number rounded to ten significant digits, as journals have it; null if infinite."""
+    return float(f"{value:.10g}") if math.isfinite(value) else None
 
 
 def rounded_probabilities(probabilities: Iterable[float]) -> list[float]:
@@ -43,6 +42,11 @@ def rounded_probabilities(probabilities: Iterable[float]) -> list[float]:
 def array_from_json(values: Iterable[float | None]) -> Float:
     """Return the numbers of a JSON list as an array, with NaN for null."""
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def json_from_array(values: Float) -> list[float | None]:
+    """Return the numbers of an array as a JSON list, with null for what is not finite."""
+    return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
 def pack_numbers(values: Iterable[float | None]) -> str:
@@ -59,19 +63,18 @@ def unpack_numbers(text: str) -> list[float | None]:
     ValueError
         If the text is something else.
     """
-    values = np.frombuffer(base64.b64decode(text, validate=True), _BINARY).tolist()
-    return [None if math.isnan(value) else value for value in values]
+    return json_from_array(np.frombuffer(base64.b64decode(text, validate=True), _BINARY))
 
 
 def _pack_belief(belief: list[float]) -> object:
-    """Return the states that are not ruled out, by index; or all, if that is shorter."""
+    """Return the states that are not ruled out, by index; or all, if these are the most."""
     possible_states: dict[str, float] = {_STATE_COUNT: len(belief)}
     for index, probability in enumerate(belief):
         if probability != 0.0:
             possible_states[str(index)] = probability
-    all_states = pack_numbers(belief)
-    is_shorter = len(json.dumps(possible_states)) <= len(all_states)
-    return possible_states if is_shorter else all_states
+    # In decimals, a probability takes twice the room
+    is_shorter = 2 * len(possible_states) <= len(belief) + 2
+    return possible_states if is_shorter else pack_numbers(belief)
 
 
 def _unpack_belief(packed: Mapping[str, float] | str) -> list[float | None]:

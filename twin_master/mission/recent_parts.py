@@ -176,11 +176,12 @@ class RecentPartsFile(RecentParts):
         """
         block = step // BLOCK_STEPS
         path = self._paths[block % len(self._paths)]
+        entry = _encode({**parts, "line": line_hash.decode("ascii"), "step": step})
         if block != self._block:
             self._size = 0 if self._block is not None else _size_to_keep(path, step, line_hash)
-        entry = _encode({**parts, "line": line_hash.decode("ascii"), "step": step})
-        with path.open("r+b" if path.exists() else "wb", buffering=0) as file:
-            file.truncate(self._size)
+            with path.open("ab") as file:
+                file.truncate(self._size)
+        with path.open("r+b", buffering=0) as file:
             file.seek(self._size)
             written_bytes = 0
             # The operating system may write less than it is given.
