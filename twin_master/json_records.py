@@ -201,7 +201,7 @@ class JournalRecord(TypedDict):
 
     The first line has the hash of the configuration and the format alone. A line with `quiet`,
     `refused`, `verdict` or `model` is an event between two steps. Numbers in base 64 are doubles of
-    8 bytes, little-endian; a lost sensor is NaN. Probabilities have 12 decimals. In journals of
+    8 bytes, little-endian; a lost sensor is NaN. Probabilities have 10 decimals. In journals of
     earlier versions, without `format`, each line has all entries, and numbers are JSON lists.
     """
 

@@ -18,10 +18,12 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import JsonObject
 
-PROBABILITY_DECIMALS = 12
+PROBABILITY_DECIMALS = 10
 """Number of decimals of probabilities in a journal."""
 _BINARY = "<f8"
 """The numbers in base 64: double precision, little-endian."""
+_CHARACTERS_OF_A_DOUBLE = 32 / 3
+"""Number of characters of a double in base 64, which has 6 bits a character."""
 _STATE_COUNT = "of"
 """The key of a belief with the number of states, beside the keys of the states."""
 _NONE_OF_THESE = "none of these"
@@ -67,14 +69,16 @@ def unpack_numbers(text: str) -> list[float | None]:
 
 
 def _pack_belief(belief: list[float]) -> object:
-    """Return the states that are not ruled out, by index; or all, if these are the most."""
-    possible_states: dict[str, float] = {_STATE_COUNT: len(belief)}
+    """Return the states that are not ruled out, by index; or all in base 64, if that is shorter."""
+    possible_states: dict[str, float] = {}
+    length = 0
     for index, probability in enumerate(belief):
         if probability != 0.0:
             possible_states[str(index)] = probability
-    # In decimals, a probability takes twice the room
-    is_shorter = 2 * len(possible_states) <= len(belief) + 2
-    return possible_states if is_shorter else pack_numbers(belief)
+            length += len(f'"{index}":{probability},')
+    if length > _CHARACTERS_OF_A_DOUBLE * len(belief):
+        return pack_numbers(belief)
+    return {_STATE_COUNT: len(belief), **possible_states}
 
 
 def _unpack_belief(packed: Mapping[str, float] | str) -> list[float | None]:
