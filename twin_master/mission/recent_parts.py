@@ -13,7 +13,7 @@ whole line of its journal, with the same result.
 """
 
 import json
-import os
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from hashlib import sha256
@@ -26,6 +26,7 @@ BLOCK_STEPS = 64
 """Number of successive steps whose parts one of the two files has."""
 _EARLY_STEPS = (1, 4, 16)
 _HASH_LENGTH = 64
+_NAME_OF_LINE = re.compile(rb'"line":"([0-9a-f]{64})"')
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":"))
 
 
@@ -82,7 +83,7 @@ class RecentParts:
 
     def __init__(self, folder: Path) -> None:
         self._paths = [folder / name for name in RECENT_NAMES]
-        self._contents: list[bytes]
+        self._entries: list[dict[bytes, bytes]]  # of each file, by the lines of the journal
         self._versions: list[tuple[int, int, int] | None]  # inode, size and time of change
         self._forget_files()
 
@@ -100,46 +101,39 @@ class RecentParts:
 
     def parts_of(self, line_hash: bytes) -> JsonObject:
         """Return the parts of a line of the journal by its hash; empty if they are not there."""
-        parts = self._find(line_hash)
-        if parts is None and self._read_changed_files():
-            parts = self._find(line_hash)
-        return parts or {}
-
-    def _find(self, line_hash: bytes) -> JsonObject | None:
-        key = b'"line":"' + line_hash + b'"'
-        for content in self._contents:
-            position = content.rfind(key)
-            if position < 0:
-                continue
-            begin = content.rfind(b"\n", 0, position) + 1
-            end = content.find(b"\n", position) + 1
-            parts = _decode(content[begin : end or None])
+        for index, path in enumerate(self._paths):
+            if line_hash not in self._entries[index]:
+                self._read_if_changed(index, path)
+            parts = _decode(self._entries[index].get(line_hash, b""))
             if parts is not None:
                 del parts["line"], parts["step"]
                 return parts
-        return None
+        return {}
 
     def _forget_files(self) -> None:
         """Forget the files, so that they take no memory until they are read again."""
-        self._contents = [b"", b""]
+        self._entries = [{}, {}]
         self._versions = [None, None]
 
-    def _read_changed_files(self) -> bool:
-        """Read the files that have changed since they were read; return whether any has."""
-        has_changed = False
-        for index, path in enumerate(self._paths):
-            content = b""
-            version = None
-            with suppress(FileNotFoundError), path.open("rb") as file:
-                status = os.fstat(file.fileno())
-                version = (status.st_ino, status.st_size, status.st_mtime_ns)
-                if version == self._versions[index]:
-                    continue
-                content = file.read()
-            has_changed = has_changed or version != self._versions[index]
-            self._contents[index] = content
-            self._versions[index] = version
-        return has_changed
+    def _read_if_changed(self, index: int, path: Path) -> None:
+        """Read a file, if it has changed since it was read.
+
+        Its lines are kept by the hashes of the lines of the journal that they name. They are
+        checked when they are used.
+        """
+        status = None
+        with suppress(FileNotFoundError):
+            status = path.stat()
+        version = None if status is None else (status.st_ino, status.st_size, status.st_mtime_ns)
+        if version == self._versions[index]:
+            return
+        self._versions[index] = version
+        self._entries[index] = {}
+        with suppress(FileNotFoundError), path.open("rb") as file:
+            for line in file:
+                name = _NAME_OF_LINE.search(line)
+                if name is not None:
+                    self._entries[index][name.group(1)] = line
 
 
 class RecentPartsFile(RecentParts):
