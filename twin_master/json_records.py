@@ -163,45 +163,89 @@ class SuspicionRecord(TypedDict):
     """The hypothesis that adds most to the probability of the chosen control."""
 
 
+class PackedLearntRecord(TypedDict):
+    """What was learnt so far."""
+
+    names: list[str]
+    """Names of the quantities."""
+    units: list[str]
+    """Unit of each quantity."""
+    figures: str
+    """`mean`, `standard_deviation`, `lower` and `upper` of the first quantity, then of the second,
+    and so on; doubles in base 64 [unit of the entry].
+    """
+
+
+class PackedSuspicionRecord(TypedDict):
+    """How well the model explains the sensors up to a step, in a line of the journal.
+
+    The files of recent parts have all entries of a suspicion for the last steps.
+    """
+
+    hypotheses: dict[str, float]
+    """Probability of each hypothesis by its name [1]."""
+    decided_by: NotRequired[str]
+    """The hypothesis that adds most to the probability of the chosen control."""
+    none_of_these: NotRequired[float]
+    """Posterior probability that no state of the model explains the sensors, if it is not that of
+    the hypothesis "none of these" [1].
+    """
+    log_evidence_none: NotRequired[float]
+    """Log e-value that no state explains the sensors; only in a watch, after an alarm [nat]."""
+    log_evidence_any_gauge: NotRequired[float]
+    """Log e-value that a single sensor is off; only in a watch, after an alarm [nat]."""
+
+
 class JournalRecord(TypedDict):
     """A line of `journal.jsonl` after its hash.
 
-    The first line has the hash of the configuration alone. A line with `quiet`, `refused`,
-    `verdict` or `model` is an event between two steps.
+    The first line has the hash of the configuration and the format alone. A line with `quiet`,
+    `refused`, `verdict` or `model` is an event between two steps. Numbers in base 64 are doubles of
+    8 bytes, little-endian; a lost sensor is NaN. Probabilities have 10 decimals. In journals of
+    earlier versions, without `format`, each line has all entries, and numbers are JSON lists.
     """
 
     config_hash: NotRequired[str]
     """SHA-256 of `config.json`; only in the first line."""
+    format: NotRequired[int]
+    """Version of the format, 2; only in the first line."""
     step: NotRequired[int]
     """Number of the step, from 0; for an event, the number of the last step before it."""
-    observed: NotRequired[list[float | None]]
-    """Readings of the sensors and, after them, of inspections; null if lost [SI]."""
+    observed: NotRequired[str]
+    """Readings of the sensors and, after them, of inspections, in base 64 [SI]."""
     control_index: NotRequired[int]
     """Index of the control in force, from 0."""
     next_control: NotRequired[int]
     """Index of the proposed control, from 0."""
     decision_probability: NotRequired[list[float]]
     """Probability of each control in the decision [1]."""
-    filtered: NotRequired[list[float]]
-    """Belief over all joint states after the step [1]."""
+    filtered: NotRequired[dict[str, float] | str]
+    """Belief over all joint states after the step: the probabilities that are not zero, by the
+    index of the state, and `of`, the number of states; or all in base 64, if that is shorter [1].
+    """
     log_evidence: NotRequired[float]
     """Logarithm of the probability density of the observation given the earlier ones [nat]."""
     state: NotRequired[list[float | None]]
     """True value of each factor of the state, of a simulated asset [SI]."""
-    observation: NotRequired[list[float | None]]
-    """True values at the sensors without noise, of a simulated asset [SI]."""
+    observation_difference: NotRequired[list[int]]
+    """True values at the sensors without noise, of a simulated asset: their difference to the
+    readings minus noise and drift of the simulation, in units in the last place. `run.nc` has the
+    values.
+    """
+    observation: NotRequired[str]
+    """True values at the sensors without noise, in base 64, if that is shorter [SI]."""
     monitors: NotRequired[dict[str, float | None]]
     """What a simulated asset reports beside, by name [unit of the binding]."""
     asset_state: NotRequired[str]
-    """State of the asset after the step, compressed and in base 64, from which a run resumes."""
-    learnt: NotRequired[dict[str, LearntRecord]]
-    """What was learnt so far, by the name of the quantity."""
+    """State of the asset after the step, compressed and in base 64; only in every 64th step."""
+    learnt: NotRequired[PackedLearntRecord]
+    """What was learnt so far; only in the steps 1, 4, 16 and every 64th step."""
     notices: NotRequired[list[NoticeRecord]]
     """What the operator should know."""
-    suspicion: NotRequired[SuspicionRecord]
+    suspicion: NotRequired[PackedSuspicionRecord]
     """How well the model explains the sensors."""
     observation_step: NotRequired[int]
-    """The step that the message was about; only in a watch."""
+    """The step that the message was about, if it is not `step`; only in a watch."""
     control_in_force: NotRequired[int]
     """Index of the control of the last step, if a late message changed an earlier step; only in a
     watch.
@@ -210,10 +254,14 @@ class JournalRecord(TypedDict):
     """The position in the stream of messages from which the watch resumes; only in a watch."""
     settled: NotRequired[dict[str, object]]
     """The state of the twin before all steps that a late message can still change; only in a
-    watch.
+    watch, in every 2048th step.
     """
+    begin: NotRequired[int]
+    """Where the line begins in the file, if it has no `standing`; only in a watch [bytes]."""
     standing: NotRequired[dict[str, object]]
-    """The state of the search for causes before this line; only in a watch."""
+    """Where the line begins in the file, and the state of the search for causes before the line;
+    only in a watch, in the steps with `learnt` and in events.
+    """
     quiet: NotRequired[DecisionRecord]
     """The decision that was written again because no step came; only in a watch."""
     refused: NotRequired[DecisionRecord]
@@ -222,6 +270,28 @@ class JournalRecord(TypedDict):
     """The verdict of a search for the cause of an alarm; only in a watch."""
     model: NotRequired[dict[str, object]]
     """The patched model that was adopted; only in a watch."""
+
+
+class RecentRecord(TypedDict):
+    """A line of `recent_0.jsonl` or `recent_1.jsonl` after its hash.
+
+    It has what a line of the journal leaves out. Which entries there are depends on the twin.
+    """
+
+    line: str
+    """SHA-256 with which the line of the journal begins."""
+    step: int
+    """Number of the step."""
+    asset_state: NotRequired[str]
+    """State of the asset after the step, compressed and in base 64, from which a run resumes."""
+    learnt: NotRequired[dict[str, LearntRecord]]
+    """What was learnt so far, by the name of the quantity."""
+    settled: NotRequired[dict[str, object]]
+    """The state of the twin before all steps that a late message can still change; only in a
+    watch, in every 32nd step.
+    """
+    suspicion: NotRequired[SuspicionRecord]
+    """How well the model explains the sensors."""
 
 
 class FigureRecord(TypedDict):

@@ -160,6 +160,12 @@ _FORMATS = (
         "journal", "line of `journal.jsonl`", "reference/run_folder.md", f"{_RECORDS}:JournalRecord"
     ),
     _json(
+        "recent",
+        "line of `recent_0.jsonl` or `recent_1.jsonl`",
+        "reference/run_folder.md",
+        f"{_RECORDS}:RecentRecord",
+    ),
+    _json(
         "summary",
         "summary of a run, `summary.json`",
         "reference/run_folder.md",

@@ -1,5 +1,6 @@
 """What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
+import hashlib
 import json
 import re
 import tomllib
@@ -25,12 +26,13 @@ from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     decode_state,
-    encode_line,
     encode_state,
     records,
 )
+from twin_master.mission.journal_packing import PROBABILITY_DECIMALS
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.recent_parts import RECENT_NAMES, RecentParts
 from twin_master.mission.steps import History, MissionStep
 from twin_master.network.estimator import Estimator
 from twin_master.run_folder import CONFIG_NAME, to_json
@@ -144,8 +146,36 @@ def figures_of(folder: Path) -> dict[str, Any]:
 
 
 def journal(folder: Path) -> list[dict[str, Any]]:
-    """Return the records of the journal of a run or watch."""
-    return [record for record, *_ in records(folder / JOURNAL_NAME)]
+    """Return the records of the journal of a run or watch, the last ones with their large parts."""
+    recent = RecentParts(folder)
+    return [record for record, *_ in records(folder / JOURNAL_NAME, recent=recent)]
+
+
+def belief_in_journal(filtered: np.ndarray) -> list[Any]:
+    """Return beliefs as a journal has them."""
+    return np.round(filtered, PROBABILITY_DECIMALS).tolist()
+
+
+def line_of_format_1(record: Mapping[str, Any]) -> bytes:
+    """Return a line of a journal as the first version of its format has it."""
+    text = json.dumps(record, sort_keys=True, allow_nan=False).encode("ascii")
+    return hashlib.sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
+
+
+def in_format_1(folder: Path, rename: Callable[[str], str] = str) -> None:
+    """Write the journal of a watch as the first version of its format has it, in which each line has all.
+
+    The text of each line may be changed, too.
+    """
+    path, content = folder / JOURNAL_NAME, b""
+    config_hash = hash_record(json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8")))
+    for record in [{"config_hash": config_hash}, *journal(folder)]:
+        if "standing" in record:
+            record["standing"]["begin"] = len(content)
+        content += line_of_format_1(json.loads(rename(json.dumps(record))))
+    path.write_bytes(content)
+    for name in RECENT_NAMES:
+        (folder / name).unlink(missing_ok=True)
 
 
 def with_former_names(folder: Path) -> None:
@@ -155,21 +185,17 @@ def with_former_names(folder: Path) -> None:
     for name in [name for name in notice if name.endswith("_steps")]:
         notice[name.replace("steps", "turns")] = notice.pop(name)
     (folder / CONFIG_NAME).write_text(to_json(config), encoding="utf-8")
-    path, content = folder / JOURNAL_NAME, b""
-    for line in path.read_bytes().splitlines():
-        text = re.sub(r'"(\w+_)?step(s?)":', r'"\1turn\2":', line[65:].decode("ascii"))
-        record = json.loads(text)
-        if "config_hash" in record:
-            record["config_hash"] = hash_record(config)
+
+    def renamed(text: str) -> str:
+        record = json.loads(re.sub(r'"(\w+_)?step(s?)":', r'"\1turn\2":', text))
         if "settled" in record:
             arrays = arrays_from_bytes(decode_state(record["settled"]["state"]), "the state")
             arrays = {re.sub(r"\bsteps$", "turns", name): values for name, values in arrays.items()}
             record["settled"]["state"] = encode_state(arrays_to_bytes(arrays))
-        if "standing" in record:
-            record["standing"]["begin"] = len(content)
-        content += encode_line(record)
-    assert b'"step' not in content
-    path.write_bytes(content)
+        return json.dumps(record)
+
+    in_format_1(folder, renamed)
+    assert b'"step' not in (folder / JOURNAL_NAME).read_bytes()
 
 
 @contextmanager
@@ -177,8 +203,8 @@ def cut_off_after(steps: int) -> Iterator[None]:
     """Let the run within die once so many steps are kept."""
     append = JournalFile.append
 
-    def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
-        append(self, record)
+    def dying(self: JournalFile, record: Mapping[str, Any], parts: dict[str, Any] | None = None) -> None:
+        append(self, record, parts)
         if record.get("step") == steps - 1:
             raise KeyboardInterrupt
 

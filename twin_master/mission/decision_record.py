@@ -1,7 +1,7 @@
 """The decision in a line of a journal, as a record and in words for the operator."""
 
 from reporting.json_file import JsonObject, JsonRecord
-from twin_master.mission.journal import array_from_json
+from twin_master.mission.journal_packing import array_from_json
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario

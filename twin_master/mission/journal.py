@@ -4,6 +4,10 @@ A line is the SHA-256 hash of a JSON text, a blank, and the text. The file only 
 process was killed while it wrote, the last line has no line feed and is dropped. Any other line
 that does not match its hash was changed or is damaged. The file is read line by line, so that its
 length does not matter.
+
+Lines are short (`journal_packing`). Most of them leave out their large parts, which two files
+beside the journal have for the last steps (`recent_parts`). Readers get records in their full form,
+with the large parts if the line or these files have them.
 """
 
 import base64
@@ -13,7 +17,7 @@ import math
 import os
 import time
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -24,10 +28,20 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_error
 from reporting.former_names import with_present_names
-from reporting.json_file import JsonObject, plain
+from reporting.json_file import JsonObject, JsonRecord, plain
 from reporting.operating_system import open_descriptor
 from twin_master.errors import NotResumableError
+from twin_master.mission.journal_packing import (
+    array_from_json,
+    full_record,
+    json_from_array,
+    packed_record,
+    rounded,
+    rounded_probabilities,
+)
+from twin_master.mission.recent_parts import RecentParts, RecentPartsFile
 from twin_master.mission.steps import GroundTruth, MissionStep, Reading
+from twin_master.network.estimator import Suspicion
 
 JOURNAL_NAME = "journal.jsonl"
 PRESENT_NAMES = {
@@ -55,7 +69,9 @@ _HASH_LENGTH = 64
 _BLOCK_SIZE = 1_000_000
 """Bytes that are read at once from the end of a journal."""
 _WRONG_HASH = "its hash does not fit its content"
-_ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
+JOURNAL_FORMAT = 2
+"""Version of the format, in the first line; the first version did not write it."""
+_ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":"))
 
 
 class JournalLine(NamedTuple):
@@ -90,54 +106,151 @@ def decode_state(text: str) -> bytes:
     return zlib.decompress(base64.b64decode(text))
 
 
-def array_from_json(values: Iterable[float | None]) -> Float:
-    """Return the numbers of a JSON list as an array, with NaN for null."""
-    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+NoiseFree = Callable[[int, Float], Float]
+"""Returns the readings of a step (G,) without their noise and drift, up to rounding [SI]."""
+LARGE_PARTS = ("asset_state", "learnt", "settled", "suspicion")
+"""The entries of a record that most lines leave out, or have only in part."""
+_LONGEST_DIFFERENCE = 9
+"""Mean number of digits up to which differences are shorter than the values in base 64."""
+KEPT_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
+"""The entries of a suspicion that every line has: viewers and decisions need them."""
 
 
 def step_record(step: MissionStep) -> JsonObject:
     """Return the record of a step for the journal.
 
     The record also contains the belief, so that a viewer need not filter the observations again.
+    Beliefs and evidence are rounded, see `rounded_probabilities` and `rounded`.
     """
     twin_step = step.twin_step
     record: JsonObject = {
         "step": twin_step.step,
-        "observed": plain(step.reading.observed),
+        "observed": json_from_array(step.reading.observed),
         "control_index": twin_step.control_index,
         "next_control": twin_step.next_control,
-        "decision_probability": twin_step.decision_probability.tolist(),
-        "filtered": twin_step.filtered.tolist(),
-        "log_evidence": twin_step.log_evidence,
+        "decision_probability": rounded_probabilities(twin_step.decision_probability.tolist()),
+        "filtered": rounded_probabilities(twin_step.filtered.tolist()),
+        "log_evidence": rounded(twin_step.log_evidence),
     }
-    if step.reading.ground_truth is not None:
-        record |= plain(step.reading.ground_truth._asdict())
+    ground_truth = step.reading.ground_truth
+    if ground_truth is not None:
+        record["state"] = json_from_array(ground_truth.state)
+        record["observation"] = json_from_array(ground_truth.observation)
+        record["monitors"] = plain(ground_truth.monitors)
     if twin_step.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in twin_step.learnt.items()}
     if twin_step.notices:
         record["notices"] = [notice.as_record() for notice in twin_step.notices]
     if twin_step.suspicion is not None:
-        record["suspicion"] = plain(vars(twin_step.suspicion))
+        record["suspicion"] = _suspicion_record(twin_step.suspicion)
     return record
 
 
-def reading_from_line(record: JsonObject) -> Reading:
+def _suspicion_record(suspicion: Suspicion) -> JsonObject:
+    """Return the record of a suspicion; what lines of the journal have of it is rounded."""
+    none_of_these, gauge_off = rounded_probabilities([suspicion.none_of_these, suspicion.gauge_off])
+    probabilities = rounded_probabilities(suspicion.hypotheses.values())
+    return {
+        "none_of_these": none_of_these,
+        "gauge_off": gauge_off,
+        "log_evidence_none": rounded(suspicion.log_evidence_none),
+        "log_evidence_any_gauge": rounded(suspicion.log_evidence_any_gauge),
+        "log_evidence_gauge": json_from_array(suspicion.log_evidence_gauge),
+        "left_out": suspicion.left_out.tolist(),
+        "hypotheses": dict(zip(suspicion.hypotheses, probabilities, strict=True)),
+        "decided_by": suspicion.decided_by,
+    }
+
+
+def large_parts(record: JsonRecord) -> JsonObject:
+    """Return the entries of a record that most lines of the journal leave out."""
+    return {name: record[name] for name in LARGE_PARTS if name in record}
+
+
+def short_record(
+    record: JsonRecord,
+    *,
+    is_whole: bool,
+    kept_of_suspicion: Sequence[str] = KEPT_OF_SUSPICION,
+) -> JsonObject:
+    """Return a record without its large parts, as a line of the journal has it.
+
+    Parameters
+    ----------
+    record : dict
+        The record with its large parts.
+    is_whole : bool
+        Whether the line keeps what was learnt, see `is_whole_step`.
+    kept_of_suspicion : sequence of str
+        The entries of the suspicion that the line keeps.
+    """
+    short = {name: value for name, value in record.items() if name not in LARGE_PARTS}
+    if is_whole and "learnt" in record:
+        short["learnt"] = record["learnt"]
+    if "suspicion" in record:
+        suspicion = record["suspicion"]
+        short["suspicion"] = {name: suspicion[name] for name in kept_of_suspicion}
+    return short
+
+
+def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
+    """Return the record of a simulated step with a short form of its true observation.
+
+    The true observation is the observed one without noise and drift, up to rounding. The difference
+    in units in the last place is a small number for each sensor, unless the sensor is lost. If the
+    asset has noise of its own, the record is returned as it is.
+
+    Parameters
+    ----------
+    record : dict
+        The record.
+    noise_free : callable
+        Removes noise and drift from readings, see `NoiseFree`.
+    """
+    observation = array_from_json(record["observation"])
+    observed = array_from_json(record["observed"][: len(observation)])
+    estimate = noise_free(record["step"], observed)
+    difference = (observation.view(np.int64) - estimate.view(np.int64)).tolist()
+    digits = sum(len(str(number)) for number in difference)
+    if digits > _LONGEST_DIFFERENCE * len(difference):
+        return record
+    short = {name: value for name, value in record.items() if name != "observation"}
+    return short | {"observation_difference": difference}
+
+
+def _true_observation(record: JsonObject, observed: Float, noise_free: NoiseFree | None) -> Float:
+    """Return the observation (G,) without noise in a record, to the bit."""
+    if "observation" in record or noise_free is None:
+        return array_from_json(record["observation"])
+    difference = np.array(record["observation_difference"], dtype=np.int64)
+    estimate = noise_free(record["step"], observed[: len(difference)])
+    return (estimate.view(np.int64) + difference).view(np.float64)
+
+
+def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -> Reading:
     """Return the reading in a record of the journal, with the ground truth of a simulated asset.
+
+    Parameters
+    ----------
+    record : dict
+        The record.
+    noise_free : callable, optional
+        Removes noise and drift from readings; needed for the steps of a simulated asset.
 
     Raises
     ------
     KeyError, TypeError, ValueError
         If the record has another layout.
     """
+    observed_values = array_from_json(record["observed"])
     ground_truth = None
     if "monitors" in record:
         values = array_from_json(record["monitors"].values()).tolist()
         ground_truth = GroundTruth(
             state=array_from_json(record["state"]),
-            observation=array_from_json(record["observation"]),
+            observation=_true_observation(record, observed_values, noise_free),
             monitors=dict(zip(record["monitors"], values, strict=True)),
         )
-    observed_values = array_from_json(record["observed"])
     return Reading(observed_values, int(record["control_index"]), ground_truth=ground_truth)
 
 
@@ -161,6 +274,8 @@ class JournalFile:
         The path of the file.
     size : int
         The size of all complete lines, in bytes.
+    recent : RecentPartsFile
+        The large parts of the last lines.
 
     Raises
     ------
@@ -174,6 +289,7 @@ class JournalFile:
         self.path = folder / JOURNAL_NAME
         self._flush_seconds = flush_seconds
         self._flushed_at = time.monotonic()
+        self.recent = RecentPartsFile(folder)
         with explained_write_errors(self.path):
             check_header(self.path, config_hash)
             last_line = next(records_backwards(self.path), None)
@@ -181,7 +297,7 @@ class JournalFile:
             self._descriptor = open_descriptor(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.truncate(self._descriptor, self.size)
             if self.size == 0:
-                self.append({"config_hash": config_hash})
+                self.append(_header(config_hash))
                 self.flush()
                 synchronise(folder)
 
@@ -198,8 +314,16 @@ class JournalFile:
         self.size = size
         os.truncate(self._descriptor, size)
 
-    def append(self, record: Mapping[str, object]) -> None:
+    def append(self, record: Mapping[str, object], parts: JsonObject | None = None) -> None:
         """Append a line; once this returns, the line survives if the process is killed.
+
+        Parameters
+        ----------
+        record : mapping of str to object
+            The content of the line.
+        parts : dict, optional
+            The large parts of the line, which are kept for the last steps alone. They are written
+            first: a kill between them and the line leaves parts that belong to no line.
 
         Raises
         ------
@@ -209,6 +333,10 @@ class JournalFile:
         line = encode_line(record)
         written_bytes = 0
         try:
+            if parts:
+                self.recent.append(int(str(record["step"])), line[:_HASH_LENGTH], parts)
+            else:
+                self.recent.pass_over(line[:_HASH_LENGTH])
             # The operating system may write less than it is given.
             while written_bytes < len(line):
                 written_bytes += os.write(self._descriptor, line[written_bytes:])
@@ -229,8 +357,13 @@ class JournalFile:
 
 def encode_line(record: Mapping[str, object]) -> bytes:
     """Return a record as a line of the journal: hash, blank, JSON, line feed."""
-    text = _ENCODER.encode(record).encode("ascii")
+    text = _ENCODER.encode(packed_record(record)).encode("ascii")
     return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
+
+
+def _header(config_hash: str) -> JsonObject:
+    """Return the record of the first line."""
+    return {"config_hash": config_hash, "format": JOURNAL_FORMAT}
 
 
 def check_header(path: Path, config_hash: str) -> None:
@@ -243,20 +376,23 @@ def check_header(path: Path, config_hash: str) -> None:
     NotResumableError
         If the first line was changed or is damaged, or belongs to another configuration.
     """
-    header = encode_line({"config_hash": config_hash})
+    header = encode_line(_header(config_hash))
     with suppress(FileNotFoundError), path.open("rb") as file:
         first_line = file.readline()
         if header.startswith(first_line):  # the header, or its beginning if a kill cut it off
             return
-        if record_of_line(first_line, path) is None:
+        record = record_of_line(first_line, path)
+        if record is None:
             raise damaged_line_error(path, 0, _WRONG_HASH)
+        if record == {"config_hash": config_hash}:  # of the first version of the format
+            return
         raise NotResumableError(
             f"the journal {path} belongs to another configuration than the config.json beside it: "
             "begin again with --replace."
         )
 
 
-def records(path: Path, begin: int = 0) -> Iterator[JournalLine]:
+def records(path: Path, begin: int = 0, recent: RecentParts | None = None) -> Iterator[JournalLine]:
     """Yield the lines of a journal in their order; the header is left out.
 
     A journal that does not exist, or whose header was cut off, has no lines.
@@ -267,6 +403,8 @@ def records(path: Path, begin: int = 0) -> Iterator[JournalLine]:
         The path of the journal.
     begin : int
         The position of the first line to read, in bytes.
+    recent : RecentParts, optional
+        The large parts of the last lines; if they are given, the records have them.
 
     Raises
     ------
@@ -275,16 +413,18 @@ def records(path: Path, begin: int = 0) -> Iterator[JournalLine]:
     """
     if path.exists():
         with path.open("rb") as file:
-            yield from records_in_file(file, path, begin)
+            yield from records_in_file(file, path, begin, recent)
 
 
-def records_in_file(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[JournalLine]:
+def records_in_file(
+    file: BinaryIO, path: Path, begin: int = 0, recent: RecentParts | None = None
+) -> Iterator[JournalLine]:
     """Yield the lines of an open journal in their order, as `records` does."""
     file.seek(begin)
     for line in file:
         if not line.endswith(b"\n"):
             return  # the last line, cut off by a kill
-        record = record_of_line(line, path)
+        record = record_of_line(line, path, recent)
         if record is None:
             raise damaged_line_error(path, begin, _WRONG_HASH)
         end = begin + len(line)
@@ -294,24 +434,47 @@ def records_in_file(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[Jour
         begin = end
 
 
-def record_of_line(line: bytes, path: Path) -> JsonObject | None:
+def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -> JsonObject | None:
     """Return the record of a line, or None if the line does not match the hash that it begins with.
 
     If the line was written by an earlier version, its keys are replaced by their present names.
+
+    Parameters
+    ----------
+    line : bytes
+        The line.
+    path : Path
+        The path of the journal, for messages.
+    recent : RecentParts, optional
+        The large parts of the last lines; if they are given, the record has them.
+
+    Raises
+    ------
+    NotResumableError
+        If the line is the first one of a journal that a later version wrote.
     """
+    line_hash = line[:_HASH_LENGTH]
     text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
-    if sha256(text).hexdigest().encode("ascii") != line[:_HASH_LENGTH]:
+    if sha256(text).hexdigest().encode("ascii") != line_hash:
         return None
     record = json.loads(text)
     if not isinstance(record, dict):
         return None
+    if record.get("format", JOURNAL_FORMAT) != JOURNAL_FORMAT:
+        raise NotResumableError(
+            f"the journal {path} has the format {record['format']}, but this version reads up to "
+            f"{JOURNAL_FORMAT}: read it with the version that wrote it."
+        )
     # Only earlier versions wrote the key "turn".
     if "turn" in record:
         return with_present_names(record, PRESENT_NAMES, str(path), NotResumableError)
-    return record
+    record = full_record(record)
+    return record if recent is None else recent.complete(record, line_hash)
 
 
-def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLine]:
+def records_backwards(
+    path: Path, end: int | None = None, recent: RecentParts | None = None
+) -> Iterator[JournalLine]:
     """Yield the lines of a journal from the last one back to the header.
 
     A journal that does not exist has no lines. The file is read and checked only as far back as the
@@ -323,6 +486,8 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLin
         The path of the journal.
     end : int, optional
         The end of the last line to read, in bytes; the end of the file if left out.
+    recent : RecentParts, optional
+        The large parts of the last lines; if they are given, the records have them.
 
     Raises
     ------
@@ -337,7 +502,7 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[JournalLin
         for line in _lines_backwards(file, line_end):
             line_begin = line_end - len(line)
             is_complete = line.endswith(b"\n")
-            record = record_of_line(line, path) if is_complete else None
+            record = record_of_line(line, path, recent) if is_complete else None
             was_cut_off_by_kill = not is_complete and line_end >= file_size
             if record is not None:
                 yield JournalLine(record, line_begin, line_end)

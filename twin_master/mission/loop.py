@@ -21,10 +21,14 @@ from twin_master.mission.journal import (
     damaged_line_error,
     decode_state,
     encode_state,
+    large_parts,
     records_backwards,
+    short_record,
     step_record,
+    with_short_truth,
 )
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.recent_parts import BLOCK_STEPS, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import History, MissionStep, Plant, Reading
 from twin_master.network.estimator import Notice
@@ -156,13 +160,17 @@ def early_end_sentence(scenario: Scenario, steps_flown: int, reason: str) -> str
     return f"The asset ended the mission after {steps}: {reason}"
 
 
-STATE_ALLOWANCE = 64_000_000
-"""Size of the journal up to which every step keeps the state of the asset, in bytes."""
+STATE_ALLOWANCE = 16_000_000
+"""Size of a file up to which every state of the asset is kept in it, in bytes.
+
+This holds for the files of recent parts, which have the state of every step, and for the journal,
+which has those of every `BLOCK_STEPS`-th step.
+"""
 STATE_SHARE = 4_000
 """Largest size of a state beyond it, in bytes for each step since the last state that was kept.
 
 An asset that is replayed keeps the inputs of all its steps in its state. If every step kept it, the
-journal would grow with the square of the number of steps. Steps after the last kept state are flown
+files would grow with the square of the number of steps. Steps after the last kept state are flown
 again when a mission is resumed.
 """
 
@@ -187,12 +195,13 @@ def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> 
     NotResumableError
         If the journal is damaged, or if the twin now decides otherwise than the earlier process.
     """
-    for line in records_backwards(journal.path):
+    for line in records_backwards(journal.path, recent=journal.recent):
         is_header = line.begin == 0
         if is_header or line.record.get("asset_state") is not None:
             journal.truncate(line.end)
             break
-    history, _ = replay(journal.path, [BelievedModel(0, knowledge)], None)
+    models = [BelievedModel(0, knowledge)]
+    history, _ = replay(journal.path, models, None, noise_free=plant.noise_free)
     if history.steps:
         try:
             plant.restore(history, decode_state(line.record.get("asset_state", "")))
@@ -203,23 +212,32 @@ def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> 
 
 
 def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
-    """Return a sink that appends steps to a journal, sometimes with the state of the asset.
+    """Return a sink that appends steps to a journal, and the state of the asset after each.
 
     If the process is killed, the steps after the last state are flown again, with the same results
-    to the last bit. A state is left out if it would make the journal too large.
+    to the last bit. A state is left out if it would make the files too large.
     """
     steps_since_state = 0
 
     def append_step(step: MissionStep) -> None:
         nonlocal steps_since_state
         steps_since_state += 1
+        number = step.twin_step.step
+        record = with_short_truth(step_record(step), plant.noise_free)
+        parts = large_parts(record)
         state = encode_state(plant.save_state())
-        is_within_allowance = journal.size + len(state) <= STATE_ALLOWANCE
-        is_within_share = len(state) <= STATE_SHARE * steps_since_state
-        if is_within_allowance or is_within_share:
-            journal.append(step_record(step) | {"asset_state": state})
+        if _may_keep(state, journal.recent.size_before(number), steps_since_state):
+            parts["asset_state"] = state
             steps_since_state = 0
-        else:
-            journal.append(step_record(step) | {"asset_state": None})
+        record = short_record(record, is_whole=is_whole_step(number))
+        if number % BLOCK_STEPS == 0 and _may_keep(state, journal.size, BLOCK_STEPS):
+            record["asset_state"] = state
+        journal.append(record, parts)
 
     return append_step
+
+
+def _may_keep(state: str, file_size: int, steps_since_state: int) -> bool:
+    """Return whether a state is small enough for a file of a size, see `STATE_ALLOWANCE`."""
+    is_within_allowance = file_size + len(state) <= STATE_ALLOWANCE
+    return is_within_allowance or len(state) <= STATE_SHARE * steps_since_state

@@ -11,12 +11,14 @@ from reporting.json_file import JsonObject
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import (
     JournalLine,
+    NoiseFree,
     damaged_line_error,
     decode_state,
     reading_from_line,
     records_backwards,
 )
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.recent_parts import RecentParts
 from twin_master.mission.steps import History, MissionStep, Reading
 
 
@@ -62,6 +64,7 @@ def replay(
     first_step: int | None = None,
     end: int | None = None,
     question: BelievedModel | None = None,
+    noise_free: NoiseFree | None = None,
 ) -> tuple[History, JsonObject]:
     """Filter the steps of a journal again, with late observations at the steps they belong to.
 
@@ -84,6 +87,8 @@ def replay(
     question : BelievedModel, optional
         A further model, to find what the twin would believe with it. If it is given, the decisions
         are not compared with those of the journal.
+    noise_free : callable, optional
+        Removes noise and drift from readings; needed for the steps of a simulated asset.
 
     Returns
     -------
@@ -103,8 +108,8 @@ def replay(
         required_steps.append(first_step)
     if question is not None:
         required_steps.append(question.from_step)
-    scan = _BackwardScan(path, required_steps)
-    for line in records_backwards(path, end):
+    scan = _BackwardScan(path, required_steps, noise_free)
+    for line in records_backwards(path, end, RecentParts(path.parent)):
         try:
             needs_earlier_lines = scan.take_in(line)
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
@@ -132,7 +137,8 @@ class _BackwardScan:
         The record of the last line.
     """
 
-    def __init__(self, path: Path, required_steps: list[int]) -> None:
+    def __init__(self, path: Path, required_steps: list[int], noise_free: NoiseFree | None) -> None:
+        self._noise_free = noise_free
         self.readings: dict[int, Reading] = {}
         self.settled: SettledState | None = None
         self.last_record: JsonObject = {}
@@ -192,7 +198,7 @@ class _BackwardScan:
         elif "observed" in record:
             observed_step = int(record.get("observation_step", step))
             self._first_revised_step = min(self._first_revised_step, observed_step)
-            self.readings.setdefault(observed_step, reading_from_line(record))
+            self.readings.setdefault(observed_step, reading_from_line(record, self._noise_free))
 
     def check_decisions(self, history: History) -> None:
         """Refuse a history if a decision differs from that in the journal."""

@@ -344,6 +344,10 @@ class Truth:
         sensed[..., self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
 
+    def noise_free(self, step: int, sensed: Float) -> Float:
+        """Return sensed values (G,) without noise and drift, up to rounding; 0 for lost sensors."""
+        return np.asarray(np.nan_to_num(sensed - self.drift[step] - self.noise[step]))
+
     def inspect(self, step: int, state: Float, control: Index | int) -> Float:
         """Return the readings of inspections in a step.
 
@@ -573,6 +577,10 @@ class Plant:
                 "requires"
             )
         return np.array([reading.state[name] for name in self._scenario.state_names])
+
+    def noise_free(self, step: int, sensed: Float) -> Float:
+        """Return sensed values (G,) without noise and drift, see `Truth.noise_free`."""
+        return self._truth.noise_free(step, sensed)
 
     def save_state(self) -> bytes:
         """Return the state of the asset as bytes."""

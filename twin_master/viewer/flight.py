@@ -6,6 +6,7 @@ of the run.
 """
 
 import os
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
@@ -26,8 +27,10 @@ from twin_master.learning.expectation import (
     concatenate_expectations,
     expectation_of_draws,
 )
-from twin_master.mission.journal import JOURNAL_NAME, array_from_json, records_in_file
+from twin_master.mission.journal import JOURNAL_NAME, records_in_file
+from twin_master.mission.journal_packing import array_from_json
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, load_knowledge
+from twin_master.mission.recent_parts import RecentParts
 from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import read_scenario
@@ -99,7 +102,9 @@ class _JournalledKnowledge(NamedTuple):
 class Flight:
     """A run or a watch, read from its journal, with the beliefs and decisions of each step.
 
-    Each step has the belief and the decision that the twin had at the time of the step.
+    Each step has the belief and the decision that the twin had at the time of the step. What was
+    learnt is that of the last step up to it whose line in the journal has it; for the last steps,
+    it is their own.
 
     Parameters
     ----------
@@ -143,6 +148,9 @@ class Flight:
         self._models: list[_JournalledKnowledge] = []
         self._add_model(0)
         self._lines_of_steps: list[_StepLines] = []
+        self._recent = RecentParts(self.folder)
+        self._learnt_steps: list[int] = []  # whose own lines have what was learnt
+        self._last_learnt: tuple[int, JsonObject] = (-1, {})  # where its line begins, and its entry
         # Notices of lines that are not steps, by the step before them
         self._later_notices: defaultdict[int, list[StepRecord]] = defaultdict(list)
         self.drawings: list[ForceDrawing] = []
@@ -219,6 +227,8 @@ class Flight:
         has_belief = "filtered" in record
         if has_belief and record["step"] == self.steps:
             # the line of a new step contains its belief and its observation
+            if "learnt" in record:
+                self._learnt_steps.append(self.steps)
             self._lines_of_steps.append(_StepLines(belief=begin, observation=begin))
             return
         if has_belief:
@@ -286,6 +296,10 @@ class Flight:
         """Return the record of a step from the lines with its belief and its observation."""
         lines = self._lines_of_steps[step]
         record = self._record_at(file, lines.belief)
+        earlier_steps = bisect_right(self._learnt_steps, step)
+        if "learnt" not in record and earlier_steps:
+            line_of_learnt = self._lines_of_steps[self._learnt_steps[earlier_steps - 1]].belief
+            record["learnt"] = self._learnt_in(file, line_of_learnt)
         if lines.observation != lines.belief:
             observation = self._record_at(file, lines.observation)
             for name in ("observed", "control_index"):
@@ -293,9 +307,23 @@ class Flight:
         record["notices"] = record.get("notices", []) + self._later_notices.get(step, [])
         return record
 
+    def _learnt_in(self, file: BinaryIO, begin: int) -> JsonObject:
+        """Return what was learnt up to the line that begins at a byte of the journal.
+
+        The last result is kept, because successive steps ask for the same line.
+        """
+        last_begin, learnt = self._last_learnt
+        if last_begin != begin:
+            learnt = self._record_at(file, begin)["learnt"]
+            self._last_learnt = (begin, learnt)
+        return learnt
+
     def _record_at(self, file: BinaryIO, begin: int) -> StepRecord:
-        """Return the record of the line that begins at a byte of the journal."""
-        record, _, _ = next(records_in_file(file, self._path, begin))
+        """Return the record of the line that begins at a byte of the journal.
+
+        It has what was learnt only if its line or the files of recent parts have it.
+        """
+        record, _, _ = next(records_in_file(file, self._path, begin, self._recent))
         return record
 
     def observations_in(self, records: Sequence[StepRecord]) -> Float:

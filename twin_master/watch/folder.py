@@ -19,12 +19,16 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (
     JOURNAL_NAME,
+    KEPT_OF_SUSPICION,
     JournalFile,
     check_header,
+    large_parts,
     records_backwards,
+    short_record,
 )
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import link_knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.recent_parts import RecentParts, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep
 from twin_master.network.estimator import Notice
@@ -38,7 +42,7 @@ from twin_master.run_folder import (
 )
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feed import Feed
-from twin_master.watch.intake import Counts, Intake
+from twin_master.watch.intake import KEPT_SNAPSHOT_STEPS, Counts, Intake
 from twin_master.watch.patch_trial import (
     NO_STEPS,
     ComparedSteps,
@@ -53,6 +57,8 @@ from twin_master.watch.signals import call_on_end_signal
 from twin_master.watch.teaching import Teaching
 
 WATCHED_ASSET = "watched asset"
+_KEPT_AFTER_ALARM = (*KEPT_OF_SUSPICION, "log_evidence_none", "log_evidence_any_gauge")
+"""The entries of a suspicion in the lines after an alarm: the search for its cause needs them."""
 FLUSH_SECONDS = 1.0
 """Seconds between two flushes of the journal to the disk while a recording is watched.
 
@@ -351,9 +357,21 @@ class Watch:
         self._append_line(line | fields)
 
     def _append_line(self, line: JournalLine) -> None:
-        """Add a line to the journal, and update the state of teaching with it."""
-        state_before = {"begin": self.journal.size, "teaching": self.teaching.as_record()}
-        self.journal.append({**line, "standing": state_before})
+        """Add a line to the journal, and update the state of teaching with it.
+
+        Most lines of steps are written without their large parts and without the state of teaching,
+        which follows from the lines since the last one that has it.
+        """
+        standing: JsonObject = {"begin": self.journal.size}
+        is_step = "filtered" in line
+        is_whole = not is_step or is_whole_step(line["step"])
+        kept = _KEPT_AFTER_ALARM if self.teaching.has_alarm else KEPT_OF_SUSPICION
+        journal_line = short_record(line, is_whole=is_whole, kept_of_suspicion=kept)
+        if is_whole:
+            standing["teaching"] = self.teaching.as_record()
+        if "settled" in line and (line["step"] + 1) % KEPT_SNAPSHOT_STEPS == 0:
+            journal_line["settled"] = line["settled"]
+        self.journal.append(journal_line | {"standing": standing}, large_parts(line))
         self._written_intake = line["intake"]
         self.teaching.take_line(line)
 
@@ -368,7 +386,8 @@ class Watch:
         The decision is marked with `told_again`, because it may have been sent before: after a kill
         that is not known.
         """
-        for line, _, _ in records_backwards(self.journal_path):
+        recent = RecentParts(self.folder)
+        for line, _, _ in records_backwards(self.journal_path, recent=recent):
             if "filtered" in line:
                 return {**self.decision_of(line), "told_again": True}
         return None

@@ -29,7 +29,13 @@ from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices, unit_advi
 POLL_SECONDS = 0.05
 """Seconds between two looks at a feed that may go on."""
 SNAPSHOT_STEPS = 32
-"""Number of steps between two lines of the journal that also have the state of the twin."""
+"""Number of steps between two lines with which the state of the twin is kept for the last steps."""
+KEPT_SNAPSHOT_STEPS = 2_048
+"""Number of steps between two lines of the journal that also have the state of the twin.
+
+This is a multiple of `SNAPSHOT_STEPS`. The steps since such a line are filtered again, at 1 to 4 ms
+each, to store or try again what is older than the last steps.
+"""
 
 
 @dataclass

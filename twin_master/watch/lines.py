@@ -21,7 +21,8 @@ class Position(TypedDict):
     Attributes
     ----------
     beginning : str
-        The SHA-256 of the first bytes of the file, which identifies it under any name.
+        The first digits of the SHA-256 of the first bytes of the file, which identify it under any
+        name. Earlier versions stored all digits.
     read : int
         The number of bytes up to the position.
     """
@@ -32,6 +33,8 @@ class Position(TypedDict):
 
 _PIECE_BYTES = 65_536
 """Number of bytes that are read at once, and of those at the beginning that identify a file."""
+_STORED_DIGITS = 16
+"""Number of hexadecimal digits of a hash that are stored."""
 _NUMBER_SUFFIX = re.compile(r"\.\d{1,6}")
 _DATE_AND_SECONDS = re.compile(r"\.\d{4}-\d\d-\d\d-\d{9,12}")
 _DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
@@ -108,7 +111,7 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
         return False
     file.seek(0)
     beginning = file.read(min(position["read"], _PIECE_BYTES))
-    return _hash_of_beginning(beginning) == str(position["beginning"])
+    return _hash_of_beginning(beginning).startswith(str(position["beginning"]))
 
 
 @lru_cache(1000)
@@ -238,7 +241,8 @@ class GrowingFile(Lines):
     @property
     def position(self) -> Position:
         """The end of the last line."""
-        return {"beginning": _hash_of_beginning(self._beginning[: self.end]), "read": self.end}
+        beginning = _hash_of_beginning(self._beginning[: self.end])[:_STORED_DIGITS]
+        return {"beginning": beginning, "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
         """Yield the pieces of the file; if its name is followed, also of files that replace it."""

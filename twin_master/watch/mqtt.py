@@ -9,6 +9,7 @@ from pathlib import Path
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import JsonObject
 from twin_master.mission.journal import JOURNAL_NAME, last_step, records
+from twin_master.mission.recent_parts import RecentParts
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker_address import Broker
 from twin_master.watch.feed import Feed
@@ -151,7 +152,9 @@ class Topic(Feed):
         if time.monotonic() < self._end_of_pause or self.watch is None:
             return
         with self._contained_errors():
-            for line, _, end in records(self._journal, self._sent_size):
+            has_begun = self.watch.has_begun
+            recent = self.watch.journal.recent if has_begun else RecentParts(self.watch.folder)
+            for line, _, end in records(self._journal, self._sent_size, recent):
                 if not self._session.can_send:
                     return
                 decision = self.watch.decision_of(line)

@@ -15,7 +15,8 @@ from reporting.errors import DamagedFileError
 from reporting.json_file import JsonObject
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, array_from_json, record_of_line
+from twin_master.mission.journal import JOURNAL_NAME, record_of_line
+from twin_master.mission.journal_packing import array_from_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feed import Feed
 from twin_master.watch.lines import GrowingFile, Position, contains, find_file

@@ -108,6 +108,11 @@ class Teaching:
     _next_search_step: int = 0  # no search begins before it
     _model_from_step: int = 0  # the first step of the model that is believed
 
+    @property
+    def has_alarm(self) -> bool:
+        """Whether there is an alarm whose cause may be searched after later steps."""
+        return self._current_alarm is not None
+
     def as_record(self) -> JsonObject:
         """Return the state by the keys of a journal."""
         return {key: getattr(self, attribute) for attribute, key in _KEYS.items()}
@@ -121,31 +126,35 @@ class Teaching:
     def read_journal(self, path: Path) -> None:
         """Restore the state after the last line of a journal.
 
-        Each line contains the state before it, under `standing`. So the state is restored from the
-        last line and then updated with this line. The lines in the `CHECKED_BYTES` bytes before it
-        are read only to check that each begins at the byte at which it was written.
+        Some lines contain the state before them, under `standing`. So the state is restored from
+        the last of these lines, and then updated with this line and those after it. The lines in
+        the last `CHECKED_BYTES` bytes are read in any case, to check that each begins at the byte
+        at which it was written.
 
         Raises
         ------
         NotResumableError
             If the end of the journal was changed or is damaged.
         """
-        last_line: JsonObject = {}
+        lines_since_state: list[JsonObject] = []  # the last line first
+        state_before: JsonObject | None = None
         journal_size = 0
         for line, begin, end in records_backwards(path):
             # The journal is read backwards: the first line that comes is the last one
-            last_line = last_line or line
             journal_size = journal_size or end
             is_header = begin == 0
             if not is_header and line["standing"]["begin"] != begin:
                 raise damaged_line_error(
                     path, begin, "lines before it are missing, or belong to another journal"
                 )
-            if journal_size - begin > CHECKED_BYTES:
+            if state_before is None:
+                lines_since_state.append(line)
+                state_before = line.get("standing", {}).get("teaching")
+            if state_before is not None and journal_size - begin > CHECKED_BYTES:
                 break
-        if "standing" in last_line:
-            self._restore(last_line["standing"]["teaching"])
-            self.take_line(last_line)
+        self._restore(state_before or {})
+        for line in reversed(lines_since_state):
+            self.take_line(line)
 
     def take_line(self, line: JournalLine) -> None:
         """Update the state with the next line of the journal."""

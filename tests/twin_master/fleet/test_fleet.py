@@ -184,10 +184,10 @@ def kill_after_second_chunk(monkeypatch: pytest.MonkeyPatch, fleet: Fleet, folde
     """Fly a fleet that dies when its second chunk is written, and its journal does not know yet."""
     append = JournalFile.append
 
-    def dying(self: JournalFile, record: Any) -> None:
+    def dying(self: JournalFile, record: Any, parts: Any = None) -> None:
         if record.get("rows") == [4, 8]:
             raise KeyboardInterrupt
-        append(self, record)
+        append(self, record, parts)
 
     with monkeypatch.context() as patch:
         patch.setattr(JournalFile, "append", dying)

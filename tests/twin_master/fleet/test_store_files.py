@@ -242,10 +242,10 @@ def test_a_fleet_with_a_store_elsewhere_goes_on_after_a_kill(
 ):
     append = JournalFile.append
 
-    def dying(self: JournalFile, record: Any) -> None:
+    def dying(self: JournalFile, record: Any, parts: Any = None) -> None:
         if record.get("rows") == [4, 6]:
             raise KeyboardInterrupt
-        append(self, record)
+        append(self, record, parts)
 
     fleet = growing(library_file, shard=2)
     with monkeypatch.context() as patch:

@@ -10,6 +10,7 @@ from tests.conftest import synthetic_calibration
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import JOURNAL_NAME, encode_line, records
 from twin_master.mission.preparation import load_knowledge
+from twin_master.mission.recent_parts import RECENT_NAMES
 from twin_master.run_folder import read_config, read_scenario
 from twin_master.watch.rejected import REJECTED_NAME, RejectedFile
 from uav_twin import fly
@@ -52,15 +53,19 @@ def test_the_figures_of_a_calibration_have_the_keys_of_their_format():
     check(run_record(synthetic, "young_modulus_factor"), "calibration")
 
 
-def test_lines_of_a_journal_have_the_keys_of_their_format(run):
-    lines = [line.record for line in records(run / JOURNAL_NAME)]
-    assert lines
+@pytest.mark.parametrize(("name", "file_format"), [(JOURNAL_NAME, "journal"), (RECENT_NAMES[0], "recent")])
+def test_lines_of_a_journal_have_the_keys_of_their_format(run, name, file_format):
+    lines = (run / name).read_bytes().splitlines()
+    assert len(lines) >= 50
     for line in lines:
-        check(line, "journal")
+        check(json.loads(line[65:]), file_format)
+
+
+def test_the_first_line_of_a_journal_has_its_format(run):
     header = (run / JOURNAL_NAME).read_bytes().splitlines(keepends=True)[0]
-    config_hash = json.loads(header[65:])
-    assert encode_line(config_hash) == header
-    check(config_hash, "journal")
+    record = json.loads(header[65:])
+    assert encode_line(record) == header
+    assert record.keys() == {"config_hash", "format"}
 
 
 def test_a_decision_has_the_keys_of_its_format(run):

@@ -73,8 +73,8 @@ def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Cou
 
 
 def last_line(folder: Path) -> str:
-    """The last record of a journal, as text, without its hash."""
-    return (folder / JOURNAL_NAME).read_text().splitlines()[-1][65:]
+    """The last record of a journal, as text."""
+    return json.dumps(journal(folder)[-1])
 
 
 def journalled(watch: Watch, folder: Path | None = None) -> list[Any]:

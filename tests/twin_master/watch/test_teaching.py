@@ -13,7 +13,7 @@ import pytest
 
 from fe.runtime.patch import ModelPatch, SensorGain, SensorSaturation
 from reporting.figures import new_figure, to_svg
-from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
+from tests.twin_master.runs import belief_in_journal, check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError
 from twin_master.mission.decision_record import decision_line
@@ -490,8 +490,8 @@ def test_a_model_that_was_built_beside_live_steps_is_believed_from_its_step_on_t
         if step == live_teaching.model["from_step"]:
             patched.restore_state(twin.save_state())
             twin = patched
-        belief = twin.step(row, control).filtered.tolist()
-    assert live_teaching.records[-1]["filtered"] == belief
+        belief = twin.step(row, control).filtered
+    assert live_teaching.records[-1]["filtered"] == belief_in_journal(belief)
 
 
 def test_a_watch_with_a_model_that_was_built_beside_live_steps_is_taken_up(live_teaching, tmp_path):

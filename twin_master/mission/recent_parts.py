@@ -1,0 +1,200 @@
+"""The large parts of the last lines of a journal, in two files that are begun anew by turns.
+
+What was learnt, the suspicion of each sensor and the states from which a run or watch resumes are
+ten times as long as the rest of a line, and soon nobody reads them any more. So the journal has
+them only now and then (`is_whole_step`), and these files have them for the last `BLOCK_STEPS` steps
+at least: `recent_0.jsonl` and `recent_1.jsonl`.
+
+A line of these files is a hash, a blank and a JSON object, as in the journal. Its key `line` is the
+hash of the line of the journal that it belongs to. It is written before that line. So after a kill
+each line of the journal has its parts, and parts without a line belong to nothing. The files are
+not flushed to the disk: after a loss of power, or without them, a run is resumed from the last
+whole line of its journal, with the same result.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+
+from reporting.json_file import JsonObject
+
+RECENT_NAMES = ("recent_0.jsonl", "recent_1.jsonl")
+BLOCK_STEPS = 64
+"""Number of successive steps whose parts one of the two files has."""
+_EARLY_STEPS = (1, 4, 16)
+_HASH_LENGTH = 64
+_NAME_OF_LINE = re.compile(rb'"line":"([0-9a-f]{64})"')
+_ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":"))
+
+
+def is_whole_step(step: int) -> bool:
+    """Return whether the line of a step has what was learnt itself.
+
+    Every `BLOCK_STEPS`-th step has, and the steps of `_EARLY_STEPS`: what is learnt changes by much
+    at first.
+    """
+    return step % BLOCK_STEPS == 0 or step in _EARLY_STEPS
+
+
+def _encode(parts: Mapping[str, object]) -> bytes:
+    text = _ENCODER.encode(parts).encode("ascii")
+    return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
+
+
+def _decode(line: bytes) -> JsonObject | None:
+    """Return the object of a line; None if it is incomplete or does not match its hash."""
+    text = line[_HASH_LENGTH + 1 :].rstrip(b"\n")
+    is_complete = line.endswith(b"\n")
+    if not is_complete or sha256(text).hexdigest().encode("ascii") != line[:_HASH_LENGTH]:
+        return None
+    record = json.loads(text)
+    return record if isinstance(record, dict) else None
+
+
+def _size_to_keep(path: Path, step: int, line_hash: bytes) -> int:
+    """Return the size of the parts of earlier lines in a file, before those of a line are written.
+
+    Parts of later steps, and of this line, were written by a process that was killed before it
+    wrote their lines, or whose lines were dropped.
+    """
+    size = 0
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        for line in file:
+            parts = _decode(line)
+            if parts is None or parts["step"] // BLOCK_STEPS != step // BLOCK_STEPS:
+                break
+            if parts["step"] > step or parts["line"] == line_hash.decode("ascii"):
+                break
+            size += len(line)
+    return size
+
+
+class RecentParts:
+    """The parts of the last lines of a journal, as a reader finds them.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder. The files need not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._paths = [folder / name for name in RECENT_NAMES]
+        self._entries: list[dict[bytes, bytes]]  # of each file, by the lines of the journal
+        self._versions: list[tuple[int, int, int] | None]  # inode, size and time of change
+        self._forget_files()
+
+    def complete(self, record: JsonObject, line_hash: bytes) -> JsonObject:
+        """Return a record of the journal with the parts that its line left out, if there are any.
+
+        Parameters
+        ----------
+        record : dict
+            The record.
+        line_hash : bytes
+            The hash of its line, in hexadecimal digits.
+        """
+        return record | self.parts_of(line_hash)
+
+    def parts_of(self, line_hash: bytes) -> JsonObject:
+        """Return the parts of a line of the journal by its hash; empty if they are not there."""
+        for index, path in enumerate(self._paths):
+            if line_hash not in self._entries[index]:
+                self._read_if_changed(index, path)
+            parts = _decode(self._entries[index].get(line_hash, b""))
+            if parts is not None:
+                del parts["line"], parts["step"]
+                return parts
+        return {}
+
+    def _forget_files(self) -> None:
+        """Forget the files, so that they take no memory until they are read again."""
+        self._entries = [{}, {}]
+        self._versions = [None, None]
+
+    def _read_if_changed(self, index: int, path: Path) -> None:
+        """Read a file, if it has changed since it was read.
+
+        Its lines are kept by the hashes of the lines of the journal that they name. They are
+        checked when they are used.
+        """
+        status = None
+        with suppress(FileNotFoundError):
+            status = path.stat()
+        version = None if status is None else (status.st_ino, status.st_size, status.st_mtime_ns)
+        if version == self._versions[index]:
+            return
+        self._versions[index] = version
+        self._entries[index] = {}
+        with suppress(FileNotFoundError), path.open("rb") as file:
+            for line in file:
+                name = _NAME_OF_LINE.search(line)
+                if name is not None:
+                    self._entries[index][name.group(1)] = line
+
+
+class RecentPartsFile(RecentParts):
+    """The parts of the last lines of a journal, as the process has them that writes the journal.
+
+    Parameters
+    ----------
+    folder : Path
+        The run folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._newest: tuple[bytes, JsonObject] = (b"", {})
+        self._block: int | None = None
+        self._size = 0
+
+    def append(self, step: int, line_hash: bytes, parts: JsonObject) -> None:
+        """Write the parts of a line; once this returns, they survive if the process is killed.
+
+        Parameters
+        ----------
+        step : int
+            The step of the line.
+        line_hash : bytes
+            The hash of the line, in hexadecimal digits.
+        parts : dict
+            The parts.
+
+        Raises
+        ------
+        OSError
+            If the disk is full or the folder cannot be written; the earlier parts are still there.
+        """
+        block = step // BLOCK_STEPS
+        path = self._paths[block % len(self._paths)]
+        entry = _encode({**parts, "line": line_hash.decode("ascii"), "step": step})
+        if block != self._block:
+            self._size = 0 if self._block is not None else _size_to_keep(path, step, line_hash)
+            with path.open("ab") as file:
+                file.truncate(self._size)
+        with path.open("r+b", buffering=0) as file:
+            file.seek(self._size)
+            written_bytes = 0
+            # The operating system may write less than it is given.
+            while written_bytes < len(entry):
+                written_bytes += file.write(entry[written_bytes:])
+        self._size += len(entry)
+        self._block = block
+        self._newest = (line_hash, parts)
+        self._forget_files()
+
+    def pass_over(self, line_hash: bytes) -> None:
+        """Note the newest line of the journal, which has no parts."""
+        self._newest = (line_hash, {})
+
+    def size_before(self, step: int) -> int:
+        """Return the size of the file to which the parts of a step are appended [bytes]."""
+        return self._size if step // BLOCK_STEPS == self._block else 0
+
+    def parts_of(self, line_hash: bytes) -> JsonObject:
+        """Return the parts of a line; those of the newest line are not read from the disk."""
+        newest_hash, parts = self._newest
+        return dict(parts) if line_hash == newest_hash else super().parts_of(line_hash)
