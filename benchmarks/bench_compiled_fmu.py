@@ -7,7 +7,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from benchmarks.bare_fmu import LEVELS, bare_step, fmpy_simulation, minimal_fmu
-from benchmarks.measurement import Measurement, least_seconds, median_seconds
+from benchmarks.measurement import (
+    Measurement,
+    NotAvailableError,
+    least_seconds,
+    median_seconds,
+)
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import load_binding
 from fmu_asset.client.session import FmiAsset
@@ -24,8 +29,7 @@ def run() -> list[Measurement]:
     try:
         find_compiler()
     except FmuBuildError as error:
-        print(error)
-        return []
+        raise NotAvailableError(str(error)) from None
     model = reduced_model()
     binding = load_binding(BINDING)
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:

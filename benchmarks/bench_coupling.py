@@ -3,6 +3,7 @@
 import itertools
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,26 +33,24 @@ from twin_master.scenario.reading import load_scenario
 REPEATS, INNER = 300, 5
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Measure a macro step, its overhead over the steps of the FMUs, and the saving of a state."""
     binding = load_binding(binding_files()["three_fmus"])
     with tempfile.TemporaryDirectory() as folder:
         wiring = three_fmus(Path(folder))
         coupled, alone, saved, size = _in_process(wiring, binding)
+        reference = "the three stepped one by one"
+        yield Measurement("step of three FMUs in process", coupled, "us", None, reference, alone)
+        yield Measurement("overhead of the coupling", coupled - alone, "us", 50.0)
+        yield Measurement(f"state of three FMUs saved, {size} bytes", saved, "us")
         with CoupledAsset(wiring, binding) as asset:
             loads = itertools.cycle((2.0, 3.0))
             isolated = 1e6 * median_seconds(
                 lambda: asset.step({"load_factor": next(loads)}), repeats=REPEATS, inner=INNER
             )
+        yield Measurement("step of three FMUs in three workers", isolated, "us")
         joining = 1e3 * median_seconds(lambda: Wiring(wiring.structure), repeats=5)
-    reference = "the three stepped one by one"
-    return [
-        Measurement("step of three FMUs in process", coupled, "us", None, reference, alone),
-        Measurement("overhead of the coupling", coupled - alone, "us", 50.0),
-        Measurement("step of three FMUs in three workers", isolated, "us"),
-        Measurement(f"state of three FMUs saved, {size} bytes", saved, "us"),
-        Measurement("three FMUs read, checked and joined", joining, "ms"),
-    ]
+        yield Measurement("three FMUs read, checked and joined", joining, "ms")
 
 
 def three_fmus(folder: Path) -> Wiring:
