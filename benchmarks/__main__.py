@@ -6,6 +6,7 @@ in the cache folder, or with the record of `--compare FILE`.
 
 import argparse
 import importlib
+import os
 import pkgutil
 import sys
 import traceback
@@ -19,6 +20,7 @@ import benchmarks
 from benchmarks import lines
 from benchmarks.comparison import NOTEWORTHY, Change, change_since
 from benchmarks.measurement import Measurement, NotAvailableError
+from benchmarks.peer_networks import PEER_PYTHON
 from benchmarks.record import (
     BenchmarkRecord,
     BenchmarkRecordError,
@@ -86,7 +88,7 @@ class BenchmarkRun:
                 name, f"{type(error).__name__}: {text}" if text else repr(error), failed=True
             )
             if self._show_traceback:
-                traceback.print_exc()
+                print(traceback.format_exc())
 
     def _add(self, row: Row) -> None:
         change = change_since(self._earlier.get(row.key), row.measurement)
@@ -160,6 +162,14 @@ def _last_record() -> BenchmarkRecord | None:
         return None
 
 
+def _keep(record: BenchmarkRecord, file: Path | None, last: BenchmarkRecord | None) -> None:
+    """Write the record of this run to its file, if it has one, and into that of the last run."""
+    if file is not None:
+        write_record(file, record)
+    last_record_file().parent.mkdir(parents=True, exist_ok=True)
+    write_record(last_record_file(), record if last is None else last.updated_by(record))
+
+
 def benchmark_names() -> list[str]:
     """Return the names of all benchmarks."""
     modules = (module.name for module in pkgutil.iter_modules(benchmarks.__path__))
@@ -178,7 +188,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure speed, memory and errors of uav-twin, where possible beside other "
         "programs on the same problem. Each figure is printed when it is measured.",
         epilog=f"The benchmarks are: {', '.join(benchmark_names())}. All of them take about "
-        "20 minutes on two cores. Exit code: 0 if every benchmark ran, 1 if one failed (with "
+        "25 minutes on two cores. Exit code: 0 if every benchmark ran, 1 if one failed (with "
         "--strict also if a target is missed), 2 if the command line or a file is wrong.",
     )
     parser.add_argument(
@@ -200,6 +210,11 @@ def _parser() -> argparse.ArgumentParser:
         default="",
         metavar="TEXT",
         help="what a reader of the record must know, such as other work on the machine",
+    )
+    parser.add_argument(
+        "--peer-python",
+        metavar="PYTHON",
+        help="a Python interpreter in whose environment dynamax is, if this one has none",
     )
     parser.add_argument(
         "--strict", action="store_true", help="exit with code 1 also if a target is missed"
@@ -238,24 +253,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
 
+    if options.peer_python is not None:
+        os.environ[PEER_PYTHON] = options.peer_python
     if earlier is not None:
         print(f"Compared with version {earlier.version} of {earlier.date}.")
     print(lines.HEADING)
     run = BenchmarkRun(earlier, show_traceback=options.traceback)
-    for name in names:
-        if not options.names or any(word in name for word in options.names):
-            run.measure(name, partial(load_benchmark, name))
-    print("\n".join(run.summary()))
-
-    record = run.record(options.remark)
+    chosen = [
+        name for name in names if not options.names or any(word in name for word in options.names)
+    ]
     try:
-        if options.json is not None:
-            write_record(options.json, record)
-        last_record_file().parent.mkdir(parents=True, exist_ok=True)
-        write_record(last_record_file(), record if last is None else last.updated_by(record))
+        for name in chosen:
+            run.measure(name, partial(load_benchmark, name))
+            # After each benchmark, so that an interrupted run keeps what it has measured.
+            _keep(run.record(options.remark), options.json, last)
     except (FileNotWrittenError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("Interrupted; the figures of the benchmarks before this one are kept.")
+        return 130
+    print("\n".join(run.summary()))
     return 1 if run.has_failed or (options.strict and run.missed) else 0
 
 

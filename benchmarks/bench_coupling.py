@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measurement import Measurement, median_seconds
+from benchmarks.measurement import Measurement, least_seconds_of
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import Binding, load_binding
 from fmu_asset.client.exchange import Exchange
@@ -45,11 +45,11 @@ def run() -> Iterator[Measurement]:
         yield Measurement(f"state of three FMUs saved, {size} bytes", saved, "us")
         with CoupledAsset(wiring, binding) as asset:
             loads = itertools.cycle((2.0, 3.0))
-            isolated = 1e6 * median_seconds(
+            isolated = 1e6 * least_seconds_of(
                 lambda: asset.step({"load_factor": next(loads)}), repeats=REPEATS, inner=INNER
             )
         yield Measurement("step of three FMUs in three workers", isolated, "us")
-        joining = 1e3 * median_seconds(lambda: Wiring(wiring.structure), repeats=5)
+        joining = 1e3 * least_seconds_of(lambda: Wiring(wiring.structure), repeats=5)
         yield Measurement("three FMUs read, checked and joined", joining, "ms")
 
 
@@ -119,7 +119,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
                     for _ in range(INNER):
                         function()
                     seconds.append((time.perf_counter() - begin) / INNER)
-            saved = median_seconds(coupled.save_state, repeats=REPEATS)
+            saved = least_seconds_of(coupled.save_state, repeats=REPEATS)
             medians = [1e6 * float(np.median(seconds)) for seconds in times]
             return medians[0], medians[1], 1e6 * saved, len(coupled.save_state())
         finally:

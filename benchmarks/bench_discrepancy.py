@@ -4,7 +4,7 @@ import resource
 import time
 from collections.abc import Iterator
 
-from benchmarks.measurement import Measurement, median_seconds
+from benchmarks.measurement import Measurement, least_seconds_of
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Setting
@@ -87,6 +87,6 @@ def _one_ringdown(model: WingModel) -> float:
     conditions = data.unknowns.conditions(
         data.trial, problem.shared.parameters(point.shared), point.local[number]
     )
-    return 1e3 * median_seconds(
+    return 1e3 * least_seconds_of(
         lambda: observe(model, problem.campaign, data.trial, patch, conditions)
     )

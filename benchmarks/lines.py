@@ -39,7 +39,16 @@ def line(measurement: Measurement, change: Change | None) -> str:
 
 def figure_text(measurement: Measurement) -> str:
     """Return the figure with its unit: "3.2 s"."""
-    return f"{significant(measurement.value)} {measurement.unit}"
+    return with_unit(measurement.value, measurement)
+
+
+def with_unit(value: float, measurement: Measurement) -> str:
+    """Return a value with the unit of a figure; without one if the figure is a pure number."""
+    return significant(value) + _unit_text(measurement)
+
+
+def _unit_text(measurement: Measurement) -> str:
+    return "" if measurement.unit == "1" else f" {measurement.unit}"
 
 
 def target_text(measurement: Measurement) -> str:
@@ -47,7 +56,7 @@ def target_text(measurement: Measurement) -> str:
     if measurement.target is None:
         return ""
     sign = "≥" if measurement.larger_is_better else "≤"
-    return f"{sign} {measurement.target:g} {measurement.unit}"
+    return f"{sign} {measurement.target:g}{_unit_text(measurement)}"
 
 
 def peer_text(measurement: Measurement) -> str:
@@ -55,7 +64,7 @@ def peer_text(measurement: Measurement) -> str:
     parts = []
     name = measurement.reference_name
     if measurement.reference_value is not None:
-        parts.append(f"{name}: {significant(measurement.reference_value)} {measurement.unit}")
+        parts.append(f"{name}: {with_unit(measurement.reference_value, measurement)}")
     elif name:
         parts.append(f"{name}: not measured")
     if measurement.peer and measurement.peer != name:

@@ -4,7 +4,7 @@ import resource
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from math import isfinite
 
@@ -95,6 +95,14 @@ class Measurement:
         """The figure over that of the reference; None without a reference."""
         return self.value / self.reference_value if self.reference_value else None
 
+    def beside(
+        self, name: str, value: float, *, peer: str = "", agreement: Agreement | None = None
+    ) -> "Measurement":
+        """Return the figure with what ran beside it; the parameters are the attributes above."""
+        return replace(
+            self, reference_name=name, reference_value=value, peer=peer, agreement=agreement
+        )
+
 
 def compared(quantity: str, ours: ArrayLike, theirs: ArrayLike, tolerance: float) -> Agreement:
     """Return how far our answer differs from that of another program.
@@ -115,13 +123,17 @@ def compared(quantity: str, ours: ArrayLike, theirs: ArrayLike, tolerance: float
     """
     reference = np.asarray(theirs, dtype=np.float64)
     difference = np.abs(np.asarray(ours, dtype=np.float64) - reference).max()
-    relative_difference = float(difference / np.abs(reference).max())
-    if not relative_difference <= tolerance:
+    return agreement_within(quantity, float(difference / np.abs(reference).max()), tolerance)
+
+
+def agreement_within(quantity: str, difference: float, tolerance: float) -> Agreement:
+    """Return an agreement whose relative difference is known; raises as `compared`."""
+    if not difference <= tolerance:
         raise DisagreementError(
-            f"{quantity} differ by {relative_difference:.2g} of the largest value between ours and "
-            f"the peer's; expected at most {tolerance:g}."
+            f"{quantity} differ by {difference:.2g} of the largest value between ours and the "
+            f"peer's; expected at most {tolerance:g}."
         )
-    return Agreement(quantity, relative_difference, tolerance)
+    return Agreement(quantity, difference, tolerance)
 
 
 def peer_version(distribution: str) -> str:
@@ -140,25 +152,19 @@ def peer_version(distribution: str) -> str:
         ) from None
 
 
-def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: int = 1) -> float:
-    """Return the median wall-clock seconds of one call, over `repeats` batches of `inner` calls."""
-    function()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        for _ in range(inner):
-            function()
-        times.append((time.perf_counter() - begin) / inner)
-    return float(np.median(times))
+def least_seconds_of(function: Callable[[], object], *, repeats: int = 15, inner: int = 1) -> float:
+    """Return the least wall-clock seconds of one call, over `repeats` batches of `inner` calls.
+
+    One call before the first batch warms the function. On a busy machine the least of many short
+    batches is one that nothing has interrupted.
+    """
+    return least_seconds({"": function}, repeats=repeats, inner=inner)[""]
 
 
 def least_seconds(
     functions: Mapping[str, Callable[[], object]], *, repeats: int, inner: int
 ) -> dict[str, float]:
-    """Return the least seconds of one call of each function, over alternating batches of calls.
-
-    On a busy machine the least of many short batches is one that nothing has interrupted.
-    """
+    """Return the least seconds of one call of each function, over alternating batches of calls."""
     least = dict.fromkeys(functions, float("inf"))
     for function in functions.values():
         function()
@@ -182,22 +188,51 @@ def least_processor_seconds(function: Callable[[], object], *, repeats: int) -> 
     return min(times)
 
 
-def processor_seconds_of(command: Sequence[str], environment: Mapping[str, str]) -> float:
-    """Return the processor seconds of a command and of all its processes.
+@dataclass(frozen=True)
+class FinishedCommand:
+    """A command that has ended.
+
+    Attributes
+    ----------
+    processor_seconds : float
+        The processor time of the command and of all processes that it started [s].
+    output : str
+        All that it printed.
+    """
+
+    processor_seconds: float
+    output: str
+
+
+def run_command(command: Sequence[str], environment: Mapping[str, str]) -> FinishedCommand:
+    """Run a command in a process of its own.
 
     Parameters
     ----------
     command : sequence of str
-        The program and its arguments. Its output is discarded.
+        The program and its arguments.
     environment : mapping of str to str
         All environment variables of the command.
 
     Raises
     ------
-    subprocess.CalledProcessError
-        If the command ends with another exit code than 0.
+    RuntimeError
+        If the command ends with another exit code than 0; with the last line that it printed.
     """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, capture_output=True, env=dict(environment))
+    finished = subprocess.run(
+        command,
+        check=False,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=dict(environment),
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    if finished.returncode:
+        last_line = (finished.stdout.strip().splitlines() or ["nothing was printed"])[-1]
+        raise RuntimeError(
+            f"{' '.join(command[:3])!r} ended with exit code {finished.returncode}: {last_line}"
+        )
+    seconds = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return FinishedCommand(seconds, finished.stdout)
