@@ -8,6 +8,7 @@ import argparse
 import importlib
 import os
 import pkgutil
+import shutil
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
@@ -188,7 +189,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Measure speed, memory and errors of uav-twin, where possible beside other "
         "programs on the same problem. Each figure is printed when it is measured.",
         epilog=f"The benchmarks are: {', '.join(benchmark_names())}. All of them take about "
-        "25 minutes on two cores. Exit code: 0 if every benchmark ran, 1 if one failed (with "
+        "25 minutes of processor time. Exit code: 0 if every benchmark ran, 1 if one failed (with "
         "--strict also if a target is missed), 2 if the command line or a file is wrong.",
     )
     parser.add_argument(
@@ -243,6 +244,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         print(
             f"No benchmark has {unknown[0]!r} in its name; there are: {', '.join(names)}.",
+            file=sys.stderr,
+        )
+        return 2
+    if options.peer_python is not None and shutil.which(options.peer_python) is None:
+        print(
+            f"--peer-python {options.peer_python} is not a program; give the Python interpreter of "
+            "an environment that has dynamax, such as peers/bin/python.",
             file=sys.stderr,
         )
         return 2

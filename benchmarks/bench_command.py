@@ -15,35 +15,38 @@ SCENARIO = "paper_level_turns"
 REPEATS = 5
 COMPILATION_NOTE = "Compiling loops"
 """What a command prints before it compiles."""
-SEARCH_CODE = "from benchmarks.bench_long_record import investigation_of; investigation_of(600)"
-"""A search for a missing effect in a short record, which uses most of the compiled loops."""
+FIT_CODE = "from benchmarks.bench_estimation import fit_law; fit_law()"
+"""A fit of a law to a record by simulation, as a search makes it for each hypothesis."""
 
 
 def run() -> Iterator[Measurement]:
     """Measure the same commands with machine code that is kept, and from an empty folder."""
     command = [sys.executable, "-m", "uav_twin"]
     help_text = [*command, "--help"]
-    search = [sys.executable, "-c", SEARCH_CODE]
+    yield Measurement("uav-twin --help", least_seconds_of_command(help_text, os.environ), "s", 0.2)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         flight = [*command, "run", SCENARIO, "--no-report", "--out", str(folder / "run")]
         flight += ["--replace"]
         kept = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept")}
         run_command(flight, os.environ)  # builds models, which are kept
-        first_flight = run_announced(flight, kept)
-        warm_flight = least_seconds_of_command(flight, kept)
-        first_search = run_command(search, kept).processor_seconds
-        warm_search = least_seconds_of_command(search, kept)
-    yield Measurement("uav-twin --help", least_seconds_of_command(help_text, os.environ), "s", 0.2)
-    yield Measurement(
-        f"uav-twin run {SCENARIO} --no-report, everything kept", warm_flight, "s", 1.5
-    )
-    yield Measurement(
-        "first compilation of a run, announced", first_flight - warm_flight, "s", 20.0
-    )
-    yield Measurement(
-        "first compilation of a search, after that of a run", first_search - warm_search, "s", 20.0
-    )
+        first_seconds = run_announced(flight, kept)
+        warm_seconds = least_seconds_of_command(flight, kept)
+        yield Measurement(
+            f"uav-twin run {SCENARIO} --no-report, everything kept", warm_seconds, "s", 1.5
+        )
+        yield Measurement(
+            "first compilation of a run, announced", first_seconds - warm_seconds, "s", 20.0
+        )
+        fit = [sys.executable, "-c", FIT_CODE]
+        first_seconds = run_command(fit, kept).processor_seconds
+        warm_seconds = run_command(fit, kept).processor_seconds
+        yield Measurement(
+            "first compilation of a fit, after that of a run",
+            first_seconds - warm_seconds,
+            "s",
+            20.0,
+        )
 
 
 def least_seconds_of_command(command: list[str], environment: Mapping[str, str]) -> float:

@@ -144,6 +144,12 @@ def run() -> Iterator[Measurement]:
     yield filter_beside_statsmodels()
 
 
+def fit_law() -> CandidateFit:
+    """Return our fit of the cubic spring to its record."""
+    problem, candidate = fit_problem(pushed_spring())
+    return fit(problem, candidate, problem.prior_mean_point(candidate))
+
+
 def pushed_spring() -> PushedSpring:
     """Return a record of the true rig from rest, under a force of six sines."""
     generator = np.random.default_rng(4)

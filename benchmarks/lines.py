@@ -67,7 +67,7 @@ def peer_text(measurement: Measurement) -> str:
         parts.append(f"{name}: {with_unit(measurement.reference_value, measurement)}")
     elif name:
         parts.append(f"{name}: not measured")
-    if measurement.peer and measurement.peer != name:
+    if measurement.peer:
         parts.append(measurement.peer)
     if measurement.agreement is not None:
         parts.append(agreement_text(measurement))

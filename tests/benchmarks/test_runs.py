@@ -10,7 +10,7 @@ import pytest
 from benchmarks import __main__ as command
 from benchmarks.__main__ import BenchmarkRun, last_record_file, main
 from benchmarks.comparison import change_since
-from benchmarks.lines import line
+from benchmarks.lines import figure_text, line, target_text
 from benchmarks.measurement import (
     DisagreementError,
     Measurement,
@@ -18,6 +18,7 @@ from benchmarks.measurement import (
     compared,
     run_command,
 )
+from benchmarks.peer_networks import PEER_PYTHON, python_with_dynamax
 from benchmarks.record import BenchmarkRecord, Row, read_record, this_machine, write_record
 
 ROOT = Path(__file__).parents[2]
@@ -185,6 +186,45 @@ def test_a_record_that_cannot_be_written_is_told(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").touch()
     assert main(["--json", str(tmp_path / "file" / "record.json")]) == 2
     assert "record.json" in capsys.readouterr().err
+
+
+def test_an_interpreter_that_does_not_exist_is_refused(monkeypatch, tmp_path, capsys):
+    with_benchmarks(monkeypatch, tmp_path, tank=sound)
+    assert main(["--peer-python", str(tmp_path / "python")]) == 2
+    assert "is not a program" in capsys.readouterr().err
+
+
+def interrupted():
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_run_keeps_the_figures_of_the_benchmarks_before(monkeypatch, tmp_path):
+    with_benchmarks(monkeypatch, tmp_path, tank=sound, wing=interrupted)
+    assert main(["--json", str(tmp_path / "record.json")]) == 130
+    assert [row.key for row in read_record(tmp_path / "record.json").rows] == [("tank", "a step")]
+    assert [row.key for row in read_record(last_record_file()).rows] == [("tank", "a step")]
+
+
+@pytest.mark.parametrize(
+    ("figure", "text"),
+    [
+        (Measurement("a", 3289.4, "us", 5.0), "3289 us ≤ 5 us"),
+        (Measurement("a", 1e-4, "1", 1e-3), "0.0001 ≤ 0.001"),
+        (Measurement("a", 3.0, "x", 2.0, larger_is_better=True), "3 x ≥ 2 x"),
+    ],
+    ids=["time", "pure number", "speed-up"],
+)
+def test_figure_and_target_stand_with_their_unit(figure, text):
+    assert f"{figure_text(figure)} {target_text(figure)}" == text
+
+
+def test_without_dynamax_a_figure_stands_alone_and_says_how_to_install_it(monkeypatch):
+    monkeypatch.delenv(PEER_PYTHON, raising=False)
+    monkeypatch.setattr("benchmarks.peer_networks.find_spec", lambda name: None)
+    with pytest.raises(NotAvailableError, match="peers/bin/pip install dynamax"):
+        python_with_dynamax()
+    figure = Measurement("smooth", 2.0, "ms", peer="dynamax", remark="dynamax is not installed")
+    assert line(figure, None).endswith("dynamax; dynamax is not installed")
 
 
 def test_the_processor_time_of_a_command_counts_the_processes_that_it_starts(tmp_path):
