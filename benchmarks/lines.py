@@ -4,7 +4,7 @@ from benchmarks.comparison import Change
 from benchmarks.measurement import Measurement
 from reporting.words import significant
 
-_NAME_WIDTH = 58
+_NAME_WIDTH = 64
 _FIGURE_WIDTH = 12
 _TARGET_WIDTH = 14
 _SHORT_WIDTH = 7
@@ -48,7 +48,9 @@ def with_unit(value: float, measurement: Measurement) -> str:
 
 
 def _unit_text(measurement: Measurement) -> str:
-    return "" if measurement.unit == "1" else f" {measurement.unit}"
+    if measurement.unit == "1":
+        return ""
+    return f" {'µs' if measurement.unit == 'us' else measurement.unit}"
 
 
 def target_text(measurement: Measurement) -> str:

@@ -208,7 +208,7 @@ def test_an_interrupted_run_keeps_the_figures_of_the_benchmarks_before(monkeypat
 @pytest.mark.parametrize(
     ("figure", "text"),
     [
-        (Measurement("a", 3289.4, "us", 5.0), "3289 us ≤ 5 us"),
+        (Measurement("a", 3289.4, "us", 5.0), "3289 µs ≤ 5 µs"),
         (Measurement("a", 1e-4, "1", 1e-3), "0.0001 ≤ 0.001"),
         (Measurement("a", 3.0, "x", 2.0, larger_is_better=True), "3 x ≥ 2 x"),
     ],
