@@ -177,6 +177,19 @@ def benchmark_names() -> list[str]:
     return sorted(name.removeprefix(_PREFIX) for name in modules if name.startswith(_PREFIX))
 
 
+def chosen_benchmarks(words: Sequence[str]) -> list[str]:
+    """Return the names of the benchmarks that words choose; all of them without a word.
+
+    A word that is the name of a benchmark chooses this one; another word chooses all whose name
+    contains it.
+    """
+    names = benchmark_names()
+    chosen = set() if words else set(names)
+    for word in words:
+        chosen.update([word] if word in names else [name for name in names if word in name])
+    return sorted(chosen)
+
+
 def load_benchmark(name: str) -> Benchmark:
     """Import a benchmark and return the function that measures it."""
     benchmark: Benchmark = importlib.import_module(f"benchmarks.{_PREFIX}{name}").run
@@ -196,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
         "names",
         nargs="*",
         metavar="NAME",
-        help="run the benchmarks whose name contains NAME; without a name all of them",
+        help="run the benchmark NAME, or those whose name contains it; without a name all of them",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the record of the run")
     parser.add_argument(
@@ -267,11 +280,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"Compared with version {earlier.version} of {earlier.date}.")
     print(lines.HEADING)
     run = BenchmarkRun(earlier, show_traceback=options.traceback)
-    chosen = [
-        name for name in names if not options.names or any(word in name for word in options.names)
-    ]
     try:
-        for name in chosen:
+        for name in chosen_benchmarks(options.names):
             run.measure(name, partial(load_benchmark, name))
             # After each benchmark, so that an interrupted run keeps what it has measured.
             _keep(run.record(options.remark), options.json, last)

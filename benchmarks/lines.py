@@ -83,4 +83,4 @@ def agreement_text(measurement: Measurement) -> str:
     agreement = measurement.agreement
     if agreement is None:
         return ""
-    return f"{agreement.quantity} agree to {agreement.difference:.1g} (≤ {agreement.tolerance:g})"
+    return f"{agreement.quantity} agree to {agreement.difference:.1g} (≤ {agreement.tolerance:.2g})"

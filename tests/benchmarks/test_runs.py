@@ -162,6 +162,20 @@ def test_the_exit_code_tells_failures(benchmarks, options, code, monkeypatch, tm
     assert main(options) == code
 
 
+@pytest.mark.parametrize(
+    ("words", "chosen"),
+    [
+        ([], ["compiled_fmu", "fmu", "tank"]),
+        (["fmu"], ["fmu"]),
+        (["fm", "tank"], ["compiled_fmu", "fmu", "tank"]),
+    ],
+    ids=["none", "a name", "parts of names"],
+)
+def test_words_choose_a_benchmark_of_this_name_or_those_that_contain_them(words, chosen, monkeypatch):
+    monkeypatch.setattr(command, "benchmark_names", lambda: ["compiled_fmu", "fmu", "tank"])
+    assert command.chosen_benchmarks(words) == chosen
+
+
 def test_a_run_is_compared_with_the_last_one(monkeypatch, tmp_path, capsys):
     with_benchmarks(monkeypatch, tmp_path, tank=lambda: [STEP])
     assert main([]) == 0
