@@ -24,8 +24,9 @@ _INTRODUCTION = """\
 
 **How long does each computation take, and how long does another program take for the same
 problem?** This page lists the figures of `make bench`, each with its target and with what ran
-beside it in the same run; what was not run stands at the end. [Benchmarks](../explanation/benchmarks.md) says what the figures mean for a
-user, and how reliably the twin steers.
+beside it in the same run; what was not run stands at the end.
+[Benchmarks](../explanation/benchmarks.md) says what the figures mean for a user, and how reliably
+the twin steers.
 
 {circumstances}
 
