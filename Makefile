@@ -33,9 +33,11 @@ lint: $(VENV)/.dev ## Check style, docstrings, types and the direction of import
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+BENCH ?=
+
 .PHONY: bench
-bench: $(VENV)/.dev ## Measure speed and memory, as ratios within one run
-	$(BIN)/python -m benchmarks
+bench: $(VENV)/.dev ## Measure speed, memory and errors beside other programs (BENCH="NAME --json FILE ...": what and how)
+	$(BIN)/python -m benchmarks $(BENCH)
 
 PICTURES ?=
 

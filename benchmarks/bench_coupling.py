@@ -3,11 +3,12 @@
 import itertools
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measurement import Measurement, median_seconds
+from benchmarks.measurement import Measurement, least_seconds_of
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import Binding, load_binding
 from fmu_asset.client.exchange import Exchange
@@ -32,26 +33,25 @@ from twin_master.scenario.reading import load_scenario
 REPEATS, INNER = 300, 5
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Measure a macro step, its overhead over the steps of the FMUs, and the saving of a state."""
     binding = load_binding(binding_files()["three_fmus"])
     with tempfile.TemporaryDirectory() as folder:
         wiring = three_fmus(Path(folder))
         coupled, alone, saved, size = _in_process(wiring, binding)
+        reference = "the three stepped one by one"
+        yield Measurement("step of three FMUs in process", coupled, "us", None, reference, alone)
+        yield Measurement("overhead of the coupling", coupled - alone, "us", 50.0)
+        yield Measurement("state of three FMUs saved", saved, "us")
+        yield Measurement("size of a state of three FMUs", size, "bytes")
         with CoupledAsset(wiring, binding) as asset:
             loads = itertools.cycle((2.0, 3.0))
-            isolated = 1e6 * median_seconds(
+            isolated = 1e6 * least_seconds_of(
                 lambda: asset.step({"load_factor": next(loads)}), repeats=REPEATS, inner=INNER
             )
-        joining = 1e3 * median_seconds(lambda: Wiring(wiring.structure), repeats=5)
-    reference = "the three stepped one by one"
-    return [
-        Measurement("step of three FMUs in process", coupled, "us", None, reference, alone),
-        Measurement("overhead of the coupling", coupled - alone, "us", 50.0),
-        Measurement("step of three FMUs in three workers", isolated, "us"),
-        Measurement(f"state of three FMUs saved, {size} bytes", saved, "us"),
-        Measurement("three FMUs read, checked and joined", joining, "ms"),
-    ]
+        yield Measurement("step of three FMUs in three workers", isolated, "us")
+        joining = 1e3 * least_seconds_of(lambda: Wiring(wiring.structure), repeats=5)
+        yield Measurement("three FMUs read, checked and joined", joining, "ms")
 
 
 def three_fmus(folder: Path) -> Wiring:
@@ -120,7 +120,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
                     for _ in range(INNER):
                         function()
                     seconds.append((time.perf_counter() - begin) / INNER)
-            saved = median_seconds(coupled.save_state, repeats=REPEATS)
+            saved = least_seconds_of(coupled.save_state, repeats=REPEATS)
             medians = [1e6 * float(np.median(seconds)) for seconds in times]
             return medians[0], medians[1], 1e6 * saved, len(coupled.save_state())
         finally:

@@ -10,9 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.bare_fmu import LEVELS, bare_step, fmpy_simulation, minimal_fmu
-from benchmarks.measurement import Measurement, least_seconds
+from benchmarks.measurement import (
+    Agreement,
+    Measurement,
+    NotAvailableError,
+    compared,
+    least_seconds,
+    peer_version,
+)
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.observations import ObservationHistory
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
@@ -29,8 +37,7 @@ def run() -> list[Measurement]:
     try:
         find_compiler()
     except FmuBuildError as error:
-        print(error)
-        return []
+        raise NotAvailableError(str(error)) from None
     binding = load_binding(BINDING)
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         folder = Path(place)
@@ -51,6 +58,7 @@ def run() -> list[Measurement]:
             "worker": lambda: _simulation(wing, binding, isolated=True),
         }
         simulation_seconds = least_seconds(simulations, repeats=12, inner=1)
+        strains_of_simulations = _compared_strains(wing, binding)
         opened = {
             kind: stack.enter_context(FmiAsset(wing, binding, isolated=kind == "worker"))
             for kind in ("in process", "worker")
@@ -71,7 +79,7 @@ def run() -> list[Measurement]:
             least["bare wing"],
         ),
         Measurement(
-            "the same, through the worker",
+            "compiled FMU step through the worker",
             least["worker wing"],
             "us",
             60.0,
@@ -79,7 +87,7 @@ def run() -> list[Measurement]:
             least["worker empty"],
         ),
         Measurement(
-            "master, over bare calls",
+            "master over bare calls, empty FMU",
             least["in process empty"] - least["bare empty"],
             "us",
             3.0,
@@ -87,7 +95,7 @@ def run() -> list[Measurement]:
             least["bare empty"],
         ),
         Measurement(
-            "the same, the compiled wing",
+            "master over bare calls, compiled wing",
             least["in process wing"] - least["bare wing"],
             "us",
             3.0,
@@ -102,10 +110,18 @@ def run() -> list[Measurement]:
             larger_is_better=True,
         ),
         Measurement(
-            "the same, through the worker",
+            "simulate through the worker, times faster than fmpy",
             simulation_seconds["fmpy"] / simulation_seconds["worker"],
             "x",
             larger_is_better=True,
+        ),
+        Measurement(
+            f"simulate, {STEPS} steps, in process", simulation_seconds["in process"], "s"
+        ).beside(
+            "simulate_fmu",
+            simulation_seconds["fmpy"],
+            peer=peer_version("fmpy"),
+            agreement=strains_of_simulations,
         ),
         *(
             Measurement(
@@ -126,11 +142,20 @@ def _stepper(asset: FmiAsset) -> Callable[[], object]:
     return lambda: asset.step({"load_factor": 3.0}, {"z1": 0.001 * next(damage), "z2": 0.2})
 
 
-def _simulation(path: Path, binding: Binding, *, isolated: bool) -> None:
+def _simulation(path: Path, binding: Binding, *, isolated: bool) -> ObservationHistory:
     """Simulate as fmpy does, extraction, start and all outputs included."""
     with FmiAsset(path, binding, isolated=isolated) as asset:
-        _simulate(asset, STEPS)
+        return _simulate(asset, STEPS)
 
 
-def _simulate(asset: FmiAsset, steps: int) -> None:
-    asset.simulate({"load_factor": 3.0}, {"z1": 0.001 * (np.arange(steps) % LEVELS), "z2": 0.0})
+def _simulate(asset: FmiAsset, steps: int) -> ObservationHistory:
+    damage = 0.001 * (np.arange(steps) % LEVELS)
+    return asset.simulate({"load_factor": 3.0}, {"z1": damage, "z2": 0.0})
+
+
+def _compared_strains(path: Path, binding: Binding) -> Agreement:
+    """Return how far the strains of all steps of both simulations differ."""
+    ours = _simulation(path, binding, isolated=False).values
+    theirs = fmpy_simulation(path, STEPS)
+    gauges = [f"strain[{number + 1}]" for number in range(ours.shape[1])]
+    return compared("strains", ours, np.stack([theirs[name][1:] for name in gauges], axis=1), 1e-12)

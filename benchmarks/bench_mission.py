@@ -45,7 +45,7 @@ def run() -> list[Measurement]:
             "the same, cache warm",
             fastest,
         ),
-        Measurement("largest process of it", largest, "MiB", 2048.0),
+        Measurement("largest process of a mission from nothing", largest, "MiB", 2048.0),
         Measurement("mission with the cache warm", fastest, "s", 10.0, "its 50 steps", steps),
         Measurement("50 steps through the worker, checkpoints included", steps, "s", 1.0),
     ]

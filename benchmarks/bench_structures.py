@@ -11,10 +11,11 @@ import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from math import log
 from pathlib import Path
 
-from benchmarks.measurement import Measurement
+from benchmarks.measurement import Measurement, agreement_within, peer_version
 from fe.verification.calculix_run import calculix_program
 
 DIVISIONS = ((36, 8, 4), (54, 11, 6))
@@ -151,45 +152,44 @@ def _measured(divisions: tuple[int, int, int], *, superlu: bool) -> dict[str, fl
     return figures
 
 
-def run() -> list[Measurement]:
+def run() -> Iterator[Measurement]:
     """Measure assembly, factorisation with solution, and reduction, and how they grow with size."""
-    sizes = [_measured(divisions, superlu=True) for divisions in DIVISIONS]
+    sizes = []
+    for divisions in DIVISIONS:
+        figures = _measured(divisions, superlu=True)
+        sizes.append(figures)
+        yield from _rows_of_size(figures)
     if os.environ.get("UAV_TWIN_BENCH_LARGE"):
-        sizes.append(_measured(LARGE, superlu=False))
-    rows = []
-    for figures in sizes:
-        size = f"{int(figures['unknowns']):,} unknowns"
-        assembly_and_solution = figures["assembly"] + figures["solution"]
-        rows += [
-            Measurement(f"structure: mesh and assembly, {size}", figures["assembly"], "s"),
-            Measurement(
-                f"structure: factorisation and solution, {size}",
-                figures["solution"],
-                "s",
-                None,
-                "SuperLU" if "superlu" in figures else "",
-                figures.get("superlu"),
-            ),
-            Measurement(f"structure: reduction, {size}", figures["reduction"], "s"),
-            Measurement(f"structure: its certified bound, {size}", figures["bound"], "1", 6e-4),
-            Measurement(f"structure: peak memory of all that, {size}", figures["memory"], "GiB"),
-        ]
-        if "calculix" in figures:
-            name = f"structure: CalculiX's run with two loads, {size}"
-            rows.append(
-                Measurement(
-                    name,
-                    figures["calculix"],
-                    "s",
-                    None,
-                    "assembly, factors, one load",
-                    assembly_and_solution,
-                )
-            )
-    first, second = sizes[:2]
+        yield from _rows_of_size(_measured(LARGE, superlu=False))
+    first, second = sizes
     growth = log(second["unknowns"] / first["unknowns"])
     for name in ("assembly", "solution", "reduction", "superlu", "calculix"):
         if name in first:
             exponent = log(second[name] / first[name]) / growth
-            rows.append(Measurement(f"structure: exponent of growth, {name}", exponent, "1"))
-    return rows
+            yield Measurement(f"structure: exponent of growth, {name}", exponent, "1")
+
+
+def _rows_of_size(figures: dict[str, float]) -> Iterator[Measurement]:
+    """Yield the figures of one size."""
+    size = f"{int(figures['unknowns']):,} unknowns"
+    yield Measurement(f"structure: mesh and assembly, {size}", figures["assembly"], "s")
+    solution = Measurement(
+        f"structure: factorisation and solution, {size}", figures["solution"], "s"
+    )
+    if "superlu" in figures:
+        solution = solution.beside(
+            "SuperLU",
+            figures["superlu"],
+            peer=peer_version("scipy"),
+            agreement=agreement_within("displacements", figures["difference"], 1e-5),
+        )
+    yield solution
+    yield Measurement(f"structure: reduction, {size}", figures["reduction"], "s")
+    yield Measurement(f"structure: its certified bound, {size}", figures["bound"], "1", 6e-4)
+    yield Measurement(f"structure: peak memory of all that, {size}", figures["memory"], "GiB")
+    if "calculix" in figures:
+        yield Measurement(
+            f"structure: assembly, factorisation and one load, {size}",
+            figures["assembly"] + figures["solution"],
+            "s",
+        ).beside("static run with two loads", figures["calculix"], peer="CalculiX")
