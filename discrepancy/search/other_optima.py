@@ -1,19 +1,26 @@
 """Starting points of fits near other optima than the one that was found.
 
-They have another magnitude of a single effect, or another place of one effect of a set.
+They have another magnitude of a single effect, another stretch of the structure that an effect
+covers, or another place of one effect of a set.
 """
 
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
+from scipy.special import ndtr, ndtri
+
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.fitting import objective
+from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.search_settings import SEARCH
+
+LEAST_TAIL = 0.02
+"""Prior probability that is left beyond a moved end of a stretch."""
 
 
 def canonical_relatives(
@@ -70,6 +77,35 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
             valued_points.append((objective(problem, candidate, point), point))
     valued_points.sort(key=lambda valued_point: valued_point[0])
     return [point for _, point in valued_points[: SEARCH.most_restarts]]
+
+
+def points_at_other_stretches(fit: CandidateFit) -> list[Point]:
+    """Return points at which an effect covers another stretch of the structure, to begin fits at.
+
+    Both ends of a stretch are unknowns of such an effect, and the catalogue gives the number of
+    levels that the screen tries of each. The points have one of these unknowns half a level higher
+    or lower, in units of its prior probability. They are none if no effect covers a stretch.
+
+    Parameters
+    ----------
+    fit : CandidateFit
+        The fit that was found.
+    """
+    points = []
+    first_parameter = 0
+    for term in fit.candidate.terms:
+        numbers_with_levels = [k for k, item in enumerate(term.parameters) if item.levels]
+        if len(numbers_with_levels) > 1:  # both ends
+            for number in numbers_with_levels:
+                half_level = 0.5 / term.parameters[number].levels
+                index = first_parameter + number
+                for move in (-half_level, half_level):
+                    probability = float(ndtr(fit.effect[index])) + move
+                    effect = fit.effect.copy()
+                    effect[index] = ndtri(np.clip(probability, LEAST_TAIL, 1.0 - LEAST_TAIL))
+                    points.append(replace(fit.point, effect=effect))
+        first_parameter += len(term.parameters)
+    return points
 
 
 def sets_at_other_places(candidate: Candidate, setting: Setting) -> list[Candidate]:

@@ -28,7 +28,12 @@ from discrepancy.search_settings import SEARCH
 
 from .fitted_candidates import FittedCandidates
 from .free_shapes import fits_of_free_shape
-from .other_optima import canonical_relatives, points_at_other_magnitudes, sets_at_other_places
+from .other_optima import (
+    canonical_relatives,
+    points_at_other_magnitudes,
+    points_at_other_stretches,
+    sets_at_other_places,
+)
 from .starts import (
     FitStart,
     OnProgress,
@@ -335,6 +340,7 @@ class Search(FittedCandidates):
             self.fit_pairs()
         self.move_effects()
         self.drop_effects()
+        self.refit_from_other_stretches()
         self.refine_time_steps()
 
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
@@ -500,6 +506,20 @@ class Search(FittedCandidates):
             if self.best() is best_fit:
                 break
             best_fit = self.best()
+
+    def refit_from_other_stretches(self) -> None:
+        """Fit the best set again from other stretches of the structure that its effect may cover.
+
+        The response has a kink where an end of a stretch passes a line of the mesh. A fit may end
+        in an optimum on the wrong side of a line, where the stretch seems to be known far better
+        than it is.
+        """
+        best_fit = self.best()
+        for point in points_at_other_stretches(best_fit):
+            self.on_progress(f"fitting {best_fit.candidate.description} from other stretches")
+            fit = try_fit(self.problem, best_fit.candidate, point)
+            if fit is not None:
+                self.record_fit(fit, exact=True)
 
     def drop_effects(self) -> None:
         """Drop one effect at a time from the best set, as long as the score rises.

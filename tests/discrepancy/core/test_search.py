@@ -5,12 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
-from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.gates import whiteness_tests
 from discrepancy.judgement import in_part
+from discrepancy.search.other_optima import points_at_other_stretches
 from discrepancy.search.strategy import Search
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -129,6 +131,28 @@ def test_an_effect_of_a_set_that_fails_is_tried_at_its_other_places():
     assert search.best() is wrong
     search.move_effects()
     assert set(search.best().candidate.key) == {("coulomb_friction", "joint"), ("gauge_gain", "g1")}
+
+
+# ---------------------------------------------------------------- stretches of a structure
+
+
+def fit_of(identifier, effect):
+    """Return the part of a fit that other starting points need."""
+    candidate = Candidate((EffectTerm(*kit.chosen(identifier), ""),))
+    return SimpleNamespace(candidate=candidate, effect=effect, point=Point(np.zeros(0), (), effect))
+
+
+def test_each_end_of_a_stretch_is_moved_by_half_a_level_of_its_prior():
+    found = np.array([0.2, -0.5, -0.9])  # loss, begin and length
+    points = points_at_other_stretches(fit_of("local_stiffness_loss", found))
+    moves = np.array([ndtr(point.effect) - ndtr(found) for point in points])
+    begin, length = 0.5 / 14, 0.5 / 3
+    expected = [[0, -begin, 0], [0, begin, 0], [0, 0, 0.02 - ndtr(-0.9)], [0, 0, length]]
+    np.testing.assert_allclose(moves, expected, atol=1e-12)
+
+
+def test_an_effect_at_one_place_has_no_other_stretches():
+    assert points_at_other_stretches(fit_of("point_mass", np.array([0.2, -0.5]))) == []
 
 
 # ---------------------------------------------------------------- groups
