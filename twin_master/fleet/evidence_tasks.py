@@ -246,7 +246,8 @@ class GroupEvidence:
         """
         total = GridSums([np.zeros([len(axis) for axis in axes]) for axes in grids], 0)
         questions = self._tasks(blocks_apart, grids=grids)
-        for sums in self._answers(_grid_sums, questions):
+        twin_count = sum(len(_some_blocks(rows, blocks_apart)) for _, rows in self._flights)
+        for sums in self._answers(_grid_sums, questions, twin_count):
             for total_on_grid, sum_on_grid in zip(
                 total.log_likelihood, sums.log_likelihood, strict=True
             ):
@@ -262,7 +263,9 @@ class GroupEvidence:
         probability : (K,) array
             The probabilities to worsen.
         """
-        yield from self._answers(_evidence_of_draws, self._tasks(1, probability=probability))
+        tasks = self._tasks(1, probability=probability)
+        twin_count = sum(len(rows) for _, rows in self._flights)
+        yield from self._answers(_evidence_of_draws, tasks, twin_count)
 
     def _tasks(
         self,
@@ -273,16 +276,19 @@ class GroupEvidence:
     ) -> Iterator[_Task]:
         """Yield the tasks of all twins, or of those in one block of the store in so many."""
         for kit, rows in self._flights:
-            chosen_rows = rows[(rows // BLOCK_TWINS) % blocks_apart == 0]
+            chosen_rows = _some_blocks(rows, blocks_apart)
             number = chosen_rows // TASK_TWINS
             for rows_of_task in np.split(chosen_rows, np.flatnonzero(np.diff(number)) + 1):
                 if len(rows_of_task):
                     yield _Task(kit, rows_of_task, grids=grids, probability=probability)
 
     def _answers(
-        self, function: Callable[[_Task], _Answer | None], tasks: Iterator[_Task]
+        self,
+        function: Callable[[_Task], _Answer | None],
+        tasks: Iterator[_Task],
+        twin_count: int,
     ) -> Iterator[_Answer]:
-        """Yield the results of tasks, in their order.
+        """Yield the results of tasks, in their order; they have so many twins in all.
 
         Workers read the observations themselves if they see the folder of the fleet. From the first
         one on that does not, this process sends the observations with the tasks.
@@ -294,7 +300,6 @@ class GroupEvidence:
                 unanswered.append(task)
                 yield _with_observations(task) if self._sends_observations else task
 
-        twin_count = sum(len(rows) for _, rows in self._flights)
         title = f"Learning from {self._group}"
         with self._progress.stage(title, total=twin_count, unit="twins") as stage:
             for answer in self._pool.results(function, tasks_to_send()):
@@ -305,6 +310,12 @@ class GroupEvidence:
                 if answer is not None:
                     yield answer
                 stage.advance(len(task.rows))
+
+
+def _some_blocks(rows: Index, blocks_apart: int) -> Index:
+    """Return the rows (B,) that are in one block of the store in so many."""
+    chosen: Index = rows[(rows // BLOCK_TWINS) % blocks_apart == 0]
+    return chosen
 
 
 def _with_observations(task: _Task) -> _Task:

@@ -13,8 +13,6 @@ import numpy as np
 from reporting.arrays import Float
 from twin_master.fleet.posterior import Axes, LikelihoodGrid, likelihood_grid
 
-BLOCKS_APART = 16
-"""The first grids are expected by one block of twins in so many."""
 MOST_GRIDS = 8
 """The largest number of grids that are computed in one reading."""
 

@@ -28,7 +28,7 @@ from twin_master.fleet.evidence_tasks import (
     FlightsOfScenario,
     GroupEvidence,
 )
-from twin_master.fleet.grid_search import BLOCKS_APART, GridSearch
+from twin_master.fleet.grid_search import GridSearch
 from twin_master.fleet.lessons import LESSONS_NAME, write_learnt
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.noise import (
@@ -56,6 +56,9 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
+_LEAST_BLOCKS_APART = 16
+_EXPECTING_TWINS = 16_384
+"""The first grids are expected by one block of twins in 16, or by about 16,384 twins."""
 _TWINS_WORTH_WORKERS = 10_000
 """The smallest number of twins of a fleet that is worth worker processes."""
 _MEMBERS_TOGETHER = 4096
@@ -510,13 +513,14 @@ def _probability_grid(
 
     def expected_log_likelihood(axes: Axes) -> Float:
         """Return the log likelihood of some blocks of twins, in proportion to their number."""
-        sums = evidence.grid_sums((_probabilities(axes),), BLOCKS_APART)
+        sums = evidence.grid_sums((_probabilities(axes),), blocks_apart)
         return sums.log_likelihood[0] * (flown_count / max(1, sums.explained))
 
-    has_many_blocks = flown_count >= BLOCKS_APART * BLOCK_TWINS
+    # One block in sixteen, or some 16,000 twins, which say well enough where the first grids lie.
+    blocks_apart = max(_LEAST_BLOCKS_APART, flown_count // _EXPECTING_TWINS)
     search = GridSearch(
         log_likelihoods,
-        expected_log_likelihood if has_many_blocks else None,
+        expected_log_likelihood if flown_count >= blocks_apart * BLOCK_TWINS else None,
         count=len(family.names),
     )
     grid = search.likelihood()
