@@ -37,7 +37,7 @@ from twin_master.scenario.schema import Scenario
 
 _Answer = TypeVar("_Answer")
 
-TASK_TWINS = 1024
+TASK_TWINS = 4096
 """The number of rows of the store that belong to a task."""
 _LEAST_PROBABILITY = 1e-3
 _LARGEST_PROBABILITY = 0.9
