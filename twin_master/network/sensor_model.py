@@ -28,6 +28,8 @@ Averaging = Literal["outside", "inside"]
 """Whether the likelihoods of the draws are averaged, or those of each sensor."""
 _WORST_LISTED = 3
 """Number of sensors in the list of those that fit worst."""
+_MANY_STEPS = 32
+"""From so many steps on it is tried first whether all have the same sensors, to group them fast."""
 LARGEST_DISTANCE = 1e140
 """Distances are cut to this; its square is still a number."""
 LEAST_ONE_MINUS_LEVERAGE = 1e-12
@@ -392,15 +394,8 @@ class GaussianSensorModel(QuantityModel):
             The log densities of values in SI.
         """
         result = np.empty((len(observations), self.state_count, draws))
-        # The row of `is_present` is a key as bytes, because an array cannot be a key.
-        steps_by_group: dict[tuple[int, bytes], list[int]] = {}
-        for step, control_in_force in enumerate(control.tolist()):
-            group = (control_in_force, is_present[step].tobytes())
-            steps_by_group.setdefault(group, []).append(step)
-        for (control_in_force, present_key), steps in steps_by_group.items():
-            self._fill_log_densities(
-                observations, np.array(steps), control_in_force, present_key, result
-            )
+        for (control_in_force, present_key), steps in _steps_by_group(control, is_present).items():
+            self._fill_log_densities(observations, steps, control_in_force, present_key, result)
         return result
 
     def _fill_log_densities(
@@ -567,6 +562,34 @@ class GaussianSensorModel(QuantityModel):
         """
         variance = np.tensordot(self.check_joint(joint), self.total_standard_deviation**2, axes=2)
         return np.asarray(np.sqrt(variance))
+
+
+def _steps_by_group(
+    control: Index, is_present: NDArray[np.bool_]
+) -> dict[tuple[int, bytes], Index]:
+    """Return the steps that have the same control and the same present sensors, by both.
+
+    The present sensors are given as the bytes of an array of bool, because an array cannot be a
+    key.
+
+    Parameters
+    ----------
+    control : (T,) array
+        The control in force in each step.
+    is_present : (T, G) array of bool
+        Whether a sensor counts in a step.
+    """
+    if len(control) > _MANY_STEPS and bool(np.all(is_present == is_present[0])):
+        present_key = is_present[0].tobytes()
+        return {
+            (value, present_key): np.flatnonzero(control == value)
+            for value in np.unique(control).tolist()
+        }
+    steps_by_group: dict[tuple[int, bytes], list[int]] = {}
+    for step, control_in_force in enumerate(control.tolist()):
+        group = (control_in_force, is_present[step].tobytes())
+        steps_by_group.setdefault(group, []).append(step)
+    return {group: np.array(steps) for group, steps in steps_by_group.items()}
 
 
 def check_noise(
