@@ -61,7 +61,7 @@ _EXPECTING_TWINS = 16_384
 """The first grids are expected by one block of twins in 16, or by about 16,384 twins."""
 _TWINS_WORTH_WORKERS = 10_000
 """The smallest number of twins of a fleet that is worth worker processes."""
-_MEMBERS_TOGETHER = 4096
+_MEMBERS_TOGETHER = 1024
 """Number of members of a population whose log evidence is in memory at the same time."""
 _MOST_SHARED = 2
 """Largest number of probabilities to worsen for which groups share a distribution."""

@@ -50,8 +50,11 @@ POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
-_MEMBERS_TOGETHER = 64
-"""Members whose evidence in all populations is in the fast memory of a processor."""
+_MEMBERS_TOGETHER = 1024
+"""Members whose evidence in all populations is computed in one product of matrices, 14 MB.
+
+Threads of the product that wait for each other cost more than the product of a few members.
+"""
 _TINY = 1e-300
 """Smallest number whose logarithm is taken."""
 
