@@ -73,7 +73,7 @@ def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     def log_likelihood(axes: Axes) -> Float:
         probabilities = tuple(logistic(axis) for axis in axes)
         evidence = grid_evidence(worsening, probabilities, likelihood, flown.control_index)
-        return evidence.sum(axis=0).reshape([len(axis) for axis in axes])
+        return np.asarray(evidence.sum(axis=0).reshape([len(axis) for axis in axes]))
 
     return likelihood_grid(log_likelihood, len(worsening.names))
 
