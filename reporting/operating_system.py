@@ -5,6 +5,7 @@ of resources, priorities, the processors that a process may use) is called from 
 worker of FMUs, which needs Linux. A substitute that is weaker says so once, in the log.
 """
 
+import math
 import os
 import queue
 import select
@@ -221,14 +222,18 @@ def usable_processors() -> int:
     return os.cpu_count() or 1
 
 
-def allow_many_files() -> None:
-    """Raise this process's limit of open files to the largest allowed, where there is one."""
+def allow_many_files() -> float:
+    """Raise this process's limit of open files to the largest allowed, and return it.
+
+    It is infinite where there is none.
+    """
     try:
         import resource
     except ImportError:
-        return
+        return math.inf
     _, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard_limit, hard_limit))
+    return math.inf if hard_limit == resource.RLIM_INFINITY else hard_limit
 
 
 def lower_priority(niceness: int, process_id: int = 0) -> None:

@@ -5,6 +5,7 @@ equal runs have equal provenance.
 """
 
 import platform
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -115,6 +116,12 @@ def plug_in_versions() -> dict[str, str]:
         The distributions, such as ``my-laws 1.2``, by the group and the name of the entry point,
         such as ``uav_twin.laws: my_law``, in sorted order.
     """
+    return dict(_plug_in_versions_on(tuple(sys.path)))
+
+
+@cache
+def _plug_in_versions_on(_search_path: tuple[str, ...]) -> dict[str, str]:
+    """Return `plug_in_versions` for a search path; to read all distributions takes 30 ms."""
     versions = {}
     groups = [name for name in metadata.entry_points().groups if name.startswith(_PLUG_IN_GROUPS)]
     for group in groups:

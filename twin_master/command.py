@@ -26,10 +26,11 @@ from twin_master.command_options import (
     StoreOption,
     ViewOption,
     WorkersOption,
+    choose_engine,
     complete_scenario,
 )
 from twin_master.errors import TwinMasterError
-from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
+from twin_master.fleet_command import fly_and_print_fleet, view_beside
 
 if TYPE_CHECKING:
     from reporting.json_file import JsonObject

@@ -1,11 +1,15 @@
 """Arguments and options that several commands on missions share, as annotations for Typer."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reporting.operating_system import usable_processors
 from scenarios import scenario_files
+
+if TYPE_CHECKING:
+    from twin_master.fleet.engine import Engine
 
 
 def complete_scenario(incomplete: str) -> list[str]:
@@ -55,6 +59,22 @@ ClusterOption = Annotated[
     typer.Option(
         "--cluster",
         help="Fly on the Dask cluster of this scheduler, such as tcp://host:8786.",
+    ),
+]
+LearningClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Compute on the Dask cluster of this scheduler, such as tcp://host:8786.",
+    ),
+]
+LearningWorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=0,
+        show_default="one for each processor, 0 for a small fleet",
+        help="Worker processes; 0 computes in this process.",
     ),
 ]
 FleetFolderOption = Annotated[
@@ -121,3 +141,30 @@ WorkersOption = Annotated[
         help="Worker processes; 0 flies in this process.",
     ),
 ]
+
+
+def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
+    """Return the engine that runs the missions of a fleet, in local processes or on a cluster.
+
+    Parameters
+    ----------
+    workers : int or None
+        The number of processes on this machine. None means one for each processor that this process
+        may use.
+    cluster : str or None
+        The address of the scheduler of a Dask cluster; None runs the fleet on this machine.
+
+    Raises
+    ------
+    typer.BadParameter
+        If both are given.
+    """
+    from twin_master.fleet.engine import Engine
+
+    if cluster is not None:
+        if workers is not None:
+            raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
+        return Engine(cluster=cluster)
+    if workers is None:
+        workers = usable_processors()
+    return Engine(workers)

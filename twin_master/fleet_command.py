@@ -17,7 +17,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
 from reporting.former_options import accepts_former_options
-from reporting.operating_system import lower_priority, usable_processors
+from reporting.operating_system import lower_priority
 from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
@@ -25,12 +25,15 @@ from twin_master.command_options import (
     EstimatorOption,
     FleetFolderOption,
     FleetSeedOption,
+    LearningClusterOption,
+    LearningWorkersOption,
     MetricsOption,
     PolicyOption,
     SensorModelOption,
     StoreOption,
     ViewOption,
     WorkersOption,
+    choose_engine,
 )
 from twin_master.errors import TwinMasterError
 
@@ -316,6 +319,8 @@ def learn(
             help="The file to write.",
         ),
     ] = Path("learnt.toml"),
+    workers: LearningWorkersOption = None,
+    cluster: LearningClusterOption = None,
     no_report: NoReportOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -323,10 +328,13 @@ def learn(
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
-    from twin_master.fleet.learn import learn_from_fleet
+    from twin_master.fleet.learn import is_worth_workers, learn_from_fleet
     from twin_master.fleet.lessons import lesson_rows
 
-    lessons = learn_from_fleet(folder, out, progress=terminal.progress())
+    if workers is None and cluster is None and not is_worth_workers(folder):
+        workers = 0
+    engine = choose_engine(workers, cluster)
+    lessons = learn_from_fleet(folder, out, engine=engine, progress=terminal.progress())
     if not no_report:
         _write_report(folder)
     if json:
@@ -337,33 +345,6 @@ def learn(
         headings = ["group", "learnt", "assumed", "mean", "95 % interval"]
         terminal.print_table(headings, rows)
     terminal.say(f"Learnt: {out}")
-
-
-def choose_engine(workers: int | None, cluster: str | None) -> "Engine":
-    """Return the engine that runs the missions of a fleet, in local processes or on a cluster.
-
-    Parameters
-    ----------
-    workers : int or None
-        The number of processes on this machine. None means one for each processor that this process
-        may use.
-    cluster : str or None
-        The address of the scheduler of a Dask cluster; None runs the fleet on this machine.
-
-    Raises
-    ------
-    typer.BadParameter
-        If both are given.
-    """
-    from twin_master.fleet.engine import Engine
-
-    if cluster is not None:
-        if workers is not None:
-            raise typer.BadParameter("a cluster has its own workers.", param_hint="--workers")
-        return Engine(cluster=cluster)
-    if workers is None:
-        workers = usable_processors()
-    return Engine(workers)
 
 
 def fly_and_print_fleet(

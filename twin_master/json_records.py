@@ -123,6 +123,10 @@ class HeartbeatRecord(TypedDict):
     """Number of messages that were received; of a single asset."""
     refused: int
     """Number of messages that were refused."""
+    busy: NotRequired[float]
+    """Fraction of the time since the last heartbeat in which messages were processed [1]."""
+    keeps_up: NotRequired[bool]
+    """Whether, at some time since the last heartbeat, no message waited to be processed."""
     assets: NotRequired[int]
     """Number of assets; of a fleet."""
     steps: NotRequired[int]

@@ -293,6 +293,7 @@ def new_run_folder(
     replace: bool,
     watched: bool = False,
     parts: Mapping[str, str] | None = None,
+    inputs: Mapping[str, str] | None = None,
 ) -> Iterator[LockedRun]:
     """Create and lock the folder of a run or a watch.
 
@@ -313,6 +314,9 @@ def new_run_folder(
         Whether a real asset is watched.
     parts : mapping of str to str, optional
         How the parts of the twin are called that a user has given in the place of the scenario's.
+    inputs : mapping of str to str, optional
+        The SHA-256 hash of each input, if asset and belief are prepared already; see
+        `record_inputs`.
 
     Raises
     ------
@@ -327,6 +331,8 @@ def new_run_folder(
     config["scenario"] = resolved_scenario.portable().to_dict()
     config["scenario_file"] = dict(file)
     config["provenance"] = collect_provenance(resolved_scenario.mission.seed).as_dict()
+    if inputs is not None:
+        config["inputs"] = dict(inputs)
     with create_run_folder(folder, config, files, replace=replace):
         yield LockedRun(config, resolved_scenario.portable().with_paths_from(folder))
 

@@ -17,9 +17,15 @@ from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
+from twin_master.fleet.evidence import TransitionFamily, grid_evidence, scaled_likelihood
 from twin_master.fleet.members import Member
-from twin_master.fleet.posterior import LikelihoodGrid, likelihood_grid, shared_posterior
+from twin_master.fleet.posterior import (
+    Axes,
+    LikelihoodGrid,
+    likelihood_grid,
+    logistic,
+    shared_posterior,
+)
 from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
@@ -64,9 +70,10 @@ def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
         known.sensor_model, flown.observation_rows, flown.control_index
     )
 
-    def log_likelihood(points: Float) -> Float:
-        evidence = transition_evidence(worsening, points, likelihood, flown.control_index)
-        return np.asarray(evidence.sum(axis=0))
+    def log_likelihood(axes: Axes) -> Float:
+        probabilities = tuple(logistic(axis) for axis in axes)
+        evidence = grid_evidence(worsening, probabilities, likelihood, flown.control_index)
+        return np.asarray(evidence.sum(axis=0).reshape([len(axis) for axis in axes]))
 
     return likelihood_grid(log_likelihood, len(worsening.names))
 

@@ -1,17 +1,18 @@
-"""Distribution of the shards of a fleet: to this process, to local workers, or to a Dask cluster.
+"""Distribution of the work on a fleet: to this process, to local workers, or to a Dask cluster.
 
-Results of workers come back in any order.
+Shards that were flown come back in any order, the results of tasks in the order of the tasks.
 """
 
 import logging
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from reporting.files import hash_record
 from reporting.progress import Progress
@@ -30,15 +31,18 @@ CONNECTING = 10.0
 ALLOWED_DEATHS = 2
 """Number of workers that may die while they fly a shard before its twins are flown one by one."""
 
+_Task = TypeVar("_Task")
+_Result = TypeVar("_Result")
+
 
 @dataclass(frozen=True)
 class Engine:
-    """The processes in which the shards of a fleet are flown.
+    """The processes in which the shards of a fleet are flown, and in which lessons are computed.
 
     Attributes
     ----------
     workers : int
-        The number of worker processes of this machine; with 0 this process flies.
+        The number of worker processes of this machine; with 0 this process does all.
     cluster : str or None
         The address of a Dask scheduler, which takes the place of workers of this machine.
     """
@@ -48,7 +52,7 @@ class Engine:
 
     @property
     def needs_dask(self) -> bool:
-        """Whether shards are flown by other processes, which Dask manages."""
+        """Whether other processes do the work, which Dask manages."""
         return self.workers > 0 or self.cluster is not None
 
 
@@ -98,7 +102,7 @@ def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> I
     """
     if not engine.needs_dask:
         for piece in pieces:
-            yield FlownPiece(piece, fly_shard(piece.kit, piece.members))
+            yield FlownPiece(piece, _fly_piece(piece))
         return
     with _connected_client(engine) as client:
         progress.note(f"Dask dashboard: {client.dashboard_link}")
@@ -121,7 +125,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         futures = []
         for piece in some_pieces:
             future = client.submit(
-                _fly_on_worker, piece.kit, piece.members, program_version(), pure=False
+                _call_on_worker, _fly_piece, piece, program_version(), pure=False
             )
             piece_of_key[future.key] = piece
             futures.append(future)
@@ -151,6 +155,85 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
         running_flights.update(submit(islice(pieces, 1)))
 
 
+class TaskPool:
+    """Computes a function of many tasks, by the processes of an engine.
+
+    Parameters
+    ----------
+    client : Client or None
+        The client of the workers; None if this process computes.
+    """
+
+    def __init__(self, client: "Client | None") -> None:
+        self._client = client
+
+    def results(
+        self, function: Callable[[_Task], _Result], tasks: Iterable[_Task]
+    ) -> Iterator[_Result]:
+        """Yield the results of tasks in the order of the tasks, however many workers there are.
+
+        Parameters
+        ----------
+        function : callable
+            The function of one task, at the top of a module.
+        tasks : iterable
+            The tasks; the next one is taken from the iterator when a worker is free for it.
+
+        Raises
+        ------
+        FleetError
+            If the scheduler is lost, if workers die over the same task again and again, or if they
+            run another version of the program.
+        """
+        if self._client is None:
+            yield from map(function, tasks)
+            return
+        from distributed import CancelledError
+        from distributed.comm import CommClosedError
+        from distributed.scheduler import KilledWorker
+
+        remaining_tasks = iter(tasks)
+        running: deque[Future] = deque()
+        most_running = max(1, sum(self._client.nthreads().values())) * (1 + WAITING_PER_CORE)
+        while True:
+            for task in islice(remaining_tasks, most_running - len(running)):
+                running.append(
+                    self._client.submit(
+                        _call_on_worker, function, task, program_version(), pure=False
+                    )
+                )
+            if not running:
+                return
+            try:
+                # The scheduler gives a task to another worker if its worker died.
+                result: _Result = running.popleft().result()
+            except KilledWorker:
+                raise FleetError(
+                    f"{ALLOWED_DEATHS + 1} workers died over the same twins, most likely because "
+                    "memory was short: repeat the command with fewer workers."
+                ) from None
+            except (CancelledError, CommClosedError):
+                raise FleetError("the scheduler was lost: repeat the command.") from None
+            yield result
+
+
+@contextmanager
+def open_task_pool(engine: Engine, progress: Progress) -> Iterator[TaskPool]:
+    """Return a context with a pool of the processes of an engine.
+
+    Raises
+    ------
+    FleetError
+        If the scheduler does not answer.
+    """
+    if not engine.needs_dask:
+        yield TaskPool(None)
+        return
+    with _connected_client(engine) as client:
+        progress.note(f"Dask dashboard: {client.dashboard_link}")
+        yield TaskPool(client)
+
+
 @cache
 def program_version() -> str:
     """Return a hash of this program, Python and all packages that can change results."""
@@ -160,8 +243,8 @@ def program_version() -> str:
     return hash_record([*parts, python])
 
 
-def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> ShardResult:
-    """Fly a shard in a worker process, if it runs the given version of the program.
+def _call_on_worker(function: Callable[[_Task], _Result], task: _Task, version: str) -> _Result:
+    """Return the result of a task in a worker process, if it runs the given program version.
 
     Raises
     ------
@@ -174,7 +257,12 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
             "package that numbers depend on: install the same lock file there. "
             "What was flown before is kept."
         )
-    return fly_shard(kit, members)
+    return function(task)
+
+
+def _fly_piece(piece: Piece) -> ShardResult:
+    """Fly a piece."""
+    return fly_shard(piece.kit, piece.members)
 
 
 @contextmanager

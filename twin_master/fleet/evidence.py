@@ -5,84 +5,32 @@ exactly the sum over its twins. The probability of the chosen controls is not a 
 evidence, because they depend on past observations alone.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.fleet.posterior import GRID_POINTS
-from twin_master.network.kernels import PredecessorLists, apply_blocks
+from twin_master.fleet.evidence_kernels import (
+    LANES_TOGETHER,
+    LEAST_EVIDENCE,
+    SubGrids,
+    evidence_at_draws,
+    evidence_at_points,
+    evidence_on_grid,
+)
+from twin_master.fleet.posterior import GRID_POINTS, Axes
+from twin_master.network.kernels import PredecessorLists
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
 
 _LEARNABLE_KIND = "independent_worsening"
-
-
-@compiled
-def _evidence_at_points(
-    prior: Float,
-    lists: PredecessorLists,
-    probability: Float,
-    control: Index,
-    likelihood: Float,
-    result: Float,
-) -> None:
-    """Fill `result` with the log evidence of B twins in T steps for P transition models.
-
-    This is the normalised forward pass of a hidden Markov model with S joint states. In each step
-    the belief is propagated through the transition, multiplied by the likelihood, and divided by
-    its sum; the log evidence is the sum of the logarithms of these sums.
-
-    Parameters
-    ----------
-    prior : (S,) array
-        The belief before the first step.
-    lists : PredecessorLists
-        The predecessors of the levels of each factor; their probabilities are not used.
-    probability : (P, non-zeros) array
-        The probabilities of the entries of the lists, for each of the P models.
-    control : (B, T) array
-        The control in force in each step.
-    likelihood : (B, T, S) array
-        The likelihood of the states in each step, divided by its largest value.
-    result : (B, P) array
-        The log evidence; -inf if the observations are impossible.
-    """
-    twins, steps, state_count = likelihood.shape
-    levels, first_row, start, source, _, _ = lists
-    belief = np.empty(state_count)
-    work = np.empty(state_count)
-    for twin in range(twins):
-        for point in range(len(probability)):
-            # `apply_blocks` does not read the last field, the log probabilities, so that the
-            # probabilities can be passed in its place.
-            point_lists = levels, first_row, start, source, probability[point], probability[point]
-            belief[:] = prior
-            result[twin, point] = 0.0
-            for t in range(steps):
-                if t > 0:
-                    apply_blocks(
-                        point_lists,  # type: ignore[arg-type]  # numba takes a plain tuple, too
-                        control[twin, t - 1],
-                        belief,
-                        belief,
-                        work,
-                    )
-                predictive_probability = 0.0
-                for state in range(state_count):
-                    belief[state] *= likelihood[twin, t, state]
-                    predictive_probability += belief[state]
-                if predictive_probability <= 0.0:
-                    result[twin, point] = -np.inf
-                    break
-                result[twin, point] += np.log(predictive_probability)
-                for state in range(state_count):
-                    belief[state] /= predictive_probability
+VALUES_TOGETHER = 300_000
+"""Log densities of draws that are in memory at the same time at most, 2.4 MB."""
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
@@ -204,6 +152,26 @@ class TransitionFamily:
             prior=build_graphical_model(scenario).prior,
         )
 
+    @property
+    def axes_of_control(self) -> Index:
+        """For each control, (U,), the probabilities on which its transition depends.
+
+        They are a number whose bit k says whether probability k is among them.
+        """
+        levels, first_row, start, _, _, _ = self.lists
+        is_changed = self.entries_at_zero != self.entries_at_one
+        # Each block has a row for each control and level.
+        end_row = np.append(first_row[1:], len(start) - 1)
+        control_count = int((end_row[0] - first_row[0]) // levels[0])
+        axes = np.zeros(control_count, dtype=np.int64)
+        for block_row, level_count in zip(first_row.tolist(), levels.tolist(), strict=True):
+            for control in range(control_count):
+                row = block_row + control * level_count
+                entries = slice(int(start[row]), int(start[row + level_count]))
+                for k in self.parameter_index[entries][is_changed[entries]].tolist():
+                    axes[control] |= 1 << k
+        return axes
+
     def entries(self, points: Float) -> Float:
         """Return the entries of the lists, (P, non-zeros), for P values of K probabilities."""
         if not self.names:
@@ -304,7 +272,77 @@ def transition_evidence(
     """
     result = np.empty((len(control), len(points)))
     entries = family.entries(points)
-    _evidence_at_points(family.prior, family.lists, entries, control, likelihood, result)
+    evidence_at_points(family.prior, family.lists, entries, control, likelihood, result)
+    return result
+
+
+def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
+    """Return the grid of K axes of probabilities to worsen, with the transitions at its points.
+
+    Parameters
+    ----------
+    family : TransitionFamily
+        The transitions as a function of K probabilities.
+    axes : tuple of (N,) array
+        The values of each probability.
+    """
+    first = [0]
+    strides = []
+    indices = []
+    entries = []
+    for number in range(2 ** len(axes)):
+        has_axis = [bool(number >> k & 1) for k in range(len(axes))]
+        lengths = [len(axis) if has else 1 for axis, has in zip(axes, has_axis, strict=True)]
+        index = np.indices(lengths).reshape(len(axes), -1).T  # (lanes, K)
+        # The stride of the last axis is 1, and that of another the product of the later lengths.
+        stride = np.append(np.cumprod(lengths[:0:-1])[::-1], 1)[: len(axes)]
+        strides.append(np.where(has_axis, stride, 0))
+        missing = -len(index) % LANES_TOGETHER
+        index = np.concatenate((index, np.repeat(index[-1:], missing, axis=0)))
+        points = np.column_stack([axis[column] for axis, column in zip(axes, index.T, strict=True)])
+        first.append(first[-1] + len(index))
+        indices.append(index)
+        entries.append(family.entries(points).T)
+    return SubGrids(
+        axes_of_control=family.axes_of_control,
+        first=np.array(first),
+        stride=np.array(strides, dtype=np.int64),
+        index_on_axis=np.concatenate(indices),
+        entries=np.ascontiguousarray(np.concatenate(entries, axis=1)),
+    )
+
+
+def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, control: Index) -> Float:
+    """Return the log evidence of B twins on a tensor grid of the probabilities to worsen.
+
+    It is that of `transition_evidence` at the points of the grid, to rounding.
+
+    Parameters
+    ----------
+    family : TransitionFamily
+        The transitions as a function of K probabilities, at least one.
+    axes : tuple of (N,) array
+        The values of each probability, between 0 and 1.
+    likelihood : (B, T, S) array
+        The values of `scaled_likelihood`.
+    control : (B, T) array
+        The control in force in each step.
+
+    Returns
+    -------
+    (B, N^K) array
+        The log evidence, the last axis varies fastest; -inf if the observations of a twin are
+        impossible.
+    """
+    result = np.empty((len(control), math.prod(len(axis) for axis in axes)))
+    grids = sub_grids(family, axes)
+    evidence_on_grid(family.prior, family.lists, grids, control, likelihood, result)
+    is_improbable = ~(result > LEAST_EVIDENCE).all(axis=1)
+    if is_improbable.any():
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        result[is_improbable] = transition_evidence(
+            family, points, likelihood[is_improbable], control[is_improbable]
+        )
     return result
 
 
@@ -337,15 +375,55 @@ def parameter_evidence(
     (B, E) array
         The log evidence; -inf if the observations of a twin are impossible.
     """
-    result = np.empty((len(control), model.draw_count))
-    for twin in range(len(control)):
-        log_density = model.log_density_of_draws(observations[twin], control[twin])  # (T, S, E)
-        log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
-        # The E values take the place of twins: all have the same controls.
-        likelihood = _scaled(log_density_by_draw)
-        control_of_draws = np.tile(control[twin], (model.draw_count, 1))
-        evidence = transition_evidence(
-            family, probability[None], likelihood.values, control_of_draws
+    twin_count, step_count = control.shape
+    lanes = model.draw_count + -model.draw_count % LANES_TOGETHER
+    entries = np.repeat(family.entries(probability[None]).T, lanes, axis=1)
+    result = np.empty((twin_count, model.draw_count))
+    log_scale = np.empty_like(result)
+    values_of_twin = max(1, step_count * model.state_count * model.draw_count)
+    twins_together = max(1, VALUES_TOGETHER // values_of_twin)
+    for first in range(0, twin_count, twins_together):
+        twins = slice(first, first + twins_together)
+        all_steps = observations[twins].reshape(-1, observations.shape[-1])
+        log_density = model.log_density_of_draws(all_steps, control[twins].ravel())
+        log_density = log_density.reshape(-1, step_count, model.state_count, model.draw_count)
+        evidence_at_draws(
+            family.prior,
+            family.lists,
+            entries,
+            control[twins],
+            log_density,
+            result[twins],
+            log_scale[twins],
         )
-        result[twin] = evidence[:, 0] + likelihood.log_scale
-    return result
+        is_improbable = ~(result[twins] > LEAST_EVIDENCE).all(axis=1)
+        for twin in np.flatnonzero(is_improbable).tolist():
+            exact = _evidence_of_draws(
+                family, probability, log_density[twin], control[first + twin]
+            )
+            result[first + twin], log_scale[first + twin] = exact
+    return result + log_scale
+
+
+def _evidence_of_draws(
+    family: TransitionFamily, probability: Float, log_density: Float, control: Index
+) -> tuple[Float, Float]:
+    """Return what `evidence_at_draws` fills in for one twin, with a belief that is divided.
+
+    Parameters
+    ----------
+    family : TransitionFamily
+        The transitions as a function of K probabilities.
+    probability : (K,) array
+        The probabilities to worsen.
+    log_density : (T, S, E) array
+        log p(o_t | D_t, u_t, e).
+    control : (T,) array
+        The control in force in each step.
+    """
+    log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
+    # The E draws take the place of twins: all have the same controls.
+    likelihood = _scaled(log_density_by_draw)
+    control_of_draws = np.tile(control, (len(log_density_by_draw), 1))
+    evidence = transition_evidence(family, probability[None], likelihood.values, control_of_draws)
+    return evidence[:, 0], likelihood.log_scale

@@ -3,83 +3,76 @@
 The results are a record for the report, and `learnt.toml`, which replaces values of a scenario.
 """
 
-from collections.abc import Iterator, Sequence
+import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from uuid import uuid4
 
 import numpy as np
 
-from fe.runtime.errors import OutsideModelError
-from reporting.arrays import Float, Index
+from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_record
 from reporting.json_file import JsonObject
 from reporting.progress import Progress, SilentProgress
-from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
-from twin_master.fleet.checks import source_of
 from twin_master.fleet.configuration import fleet_config
+from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
 from twin_master.fleet.evidence import (
     TransitionFamily,
-    parameter_evidence,
     reason_transitions_are_fixed,
-    scaled_likelihood,
-    transition_evidence,
 )
+from twin_master.fleet.evidence_tasks import (
+    EvidenceKit,
+    FlightsOfScenario,
+    GroupEvidence,
+)
+from twin_master.fleet.grid_search import GridSearch
 from twin_master.fleet.lessons import LESSONS_NAME, write_learnt
+from twin_master.fleet.members import RecordedMembers
+from twin_master.fleet.noise import (
+    ParameterNodes,
+    flights_by_scenario,
+    noise_factor,
+    parameter_nodes,
+    with_noise_factor,
+)
 from twin_master.fleet.posterior import (
     Axes,
     Distribution,
     LikelihoodGrid,
-    cell_probabilities,
-    likelihood_grid,
+    logistic,
     population_posterior,
-    resolve_density,
     shared_posterior,
 )
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.row_file import RowFile
-from twin_master.fleet.store import flown_rows, open_group
-from twin_master.fleet.store_layout import (
-    row_blocks,
-    stored_values,
-)
-from twin_master.fleet.stored_observations import ObservedTwins, StoredObservations
-from twin_master.mission.preparation import Knowledge
-from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.fleet.store import check_installed, flown_rows, open_group
+from twin_master.fleet.store_layout import BLOCK_TWINS, row_blocks, stored_values
 from twin_master.run_folder import to_json
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-NOISE_TWINS = 100
-"""Largest number of twins of a group from which the noise is learnt.
-
-They determine the factor on the noise to a few parts in a thousand.
-"""
-LARGEST_NOISE = 3.0
-"""Largest factor on the assumed noise that is considered; the smallest is its inverse."""
-NOISE_POINTS = 13
-"""Number of points of the grid of the factor on the noise."""
-NODES = 61
-"""Number of values of the calibrated parameter at which the evidence is computed."""
-NODE_DEVIATIONS = 6.0
-"""Distance of the first and the last of these values from the calibrated mean.
-
-The unit is the standard deviation of the calibration.
-"""
-_MEMBERS_TOGETHER = 4096
+_LEAST_BLOCKS_APART = 16
+_EXPECTING_TWINS = 16_384
+"""The first grids are expected by one block of twins in 16, or by about 16,384 twins."""
+_TWINS_WORTH_WORKERS = 10_000
+"""The smallest number of twins of a fleet that is worth worker processes."""
+_MEMBERS_TOGETHER = 1024
 """Number of members of a population whose log evidence is in memory at the same time."""
-_LEAST_PROBABILITY = 1e-3
-_LARGEST_PROBABILITY = 0.9
-"""Probabilities of worsening under which damage may grow or stay in any step."""
 _MOST_SHARED = 2
 """Largest number of probabilities to worsen for which groups share a distribution."""
 
 
 def learn_from_fleet(
-    folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
+    folder: Path | str,
+    out: Path | str = "learnt.toml",
+    *,
+    engine: Engine | None = None,
+    progress: Progress | None = None,
 ) -> JsonObject:
     """Learn from all twins of a fleet, and write what was learnt to a file.
 
@@ -93,6 +86,8 @@ def learn_from_fleet(
     out : Path or str
         The file to write, for the override ``learnt`` of a mission or the key of that name of a
         group.
+    engine : Engine, optional
+        The processes that compute; by default this one. Their number does not change the results.
     progress : Progress, optional
         Shows how far the work has come.
 
@@ -108,15 +103,29 @@ def learn_from_fleet(
     ------
     RunFolderError, FleetError
         If the folder holds no fleet, if no twin has flown to its end, or if no course of states
-        explains the observations of any twin of a group.
+        explains the observations of any twin of a group. If the cluster cannot be used.
     """
-    record = learn_fleet(folder, progress=progress)
+    record = learn_fleet(folder, engine=engine, progress=progress)
     write_learnt(Path(out), Path(folder), record)
     atomic_write_text(Path(folder) / LESSONS_NAME, to_json(record))
     return record
 
 
-def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> JsonObject:
+def is_worth_workers(folder: Path) -> bool:
+    """Return whether it saves time to start worker processes to learn from a fleet.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder holds no fleet.
+    """
+    records = fleet_config(folder)["fleet"]["groups"]
+    return sum(len(RecordedMembers(record)) for record in records) >= _TWINS_WORTH_WORKERS
+
+
+def learn_fleet(
+    folder: Path | str, *, engine: Engine | None = None, progress: Progress | None = None
+) -> JsonObject:
     """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
 
     The prior of each probability is uniform; if there are several groups, it is a Beta
@@ -126,6 +135,8 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> Json
     ----------
     folder : Path or str
         The folder of the fleet, which may still fly.
+    engine : Engine, optional
+        The processes that compute; by default this one.
     progress : Progress, optional
         Shows how far the work has come.
 
@@ -133,7 +144,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> Json
     ------
     RunFolderError, FleetError
         If the folder holds no fleet, if no twin has flown to its end, or if no course of states
-        explains the observations of any twin of a group.
+        explains the observations of any twin of a group. If the cluster cannot be used.
     """
     folder = Path(folder)
     config = fleet_config(folder)
@@ -143,7 +154,11 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> Json
             f"the fleet in {folder} flew with the sensor model {own_sensor_model}, and `fleet "
             "learn` knows only those of scenarios: fly it without `sensor_model` to learn from it."
         )
-    lessons = _lessons_of_groups(folder, config["fleet"]["groups"], progress or SilentProgress())
+    progress = progress or SilentProgress()
+    engine = engine or Engine()
+    check_installed("zarr", *(["distributed"] if engine.needs_dask else []))
+    with open_task_pool(engine, progress) as pool:
+        lessons = _lessons_of_groups(folder, config, pool, progress)
     if not lessons:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
     record = _records(lessons)
@@ -209,17 +224,23 @@ class _GroupLessons:
 
 
 def _lessons_of_groups(
-    folder: Path, records: Sequence[JsonObject], progress: Progress
+    folder: Path, config: JsonObject, pool: TaskPool, progress: Progress
 ) -> dict[str, _GroupLessons]:
     """Learn from each group by itself; groups without a flown twin are left out."""
     lessons = {}
-    with progress.stage("Learning", total=len(records), unit="groups") as stage:
-        for record in records:
-            group = open_group(folder, record["name"], names=False)
-            twins_by_scenario = list(flown_twins(folder, record, group))
-            if twins_by_scenario:
-                lessons[record["name"]] = _learn_group(folder, record, group, twins_by_scenario)
-            stage.advance()
+    for record in config["fleet"]["groups"]:
+        group = open_group(folder, record["name"], names=False)
+        twins_by_scenario = list(flown_twins(folder, record, group))
+        if twins_by_scenario:
+            flown_group = _FlownGroup(
+                folder=folder,
+                fleet_hash=hash_record(config),
+                record=record,
+                group=group,
+                twins_by_scenario=twins_by_scenario,
+                reading=uuid4().hex,
+            )
+            lessons[record["name"]] = flown_group.learn(pool, progress)
     return lessons
 
 
@@ -261,86 +282,152 @@ def _records_with_shared_distribution(
     return {"groups": records, "shared": shared_distribution}
 
 
-class _Flights(NamedTuple):
-    """The flights of B twins of one scenario, whose observations are in the store.
+@dataclass(frozen=True)
+class _FlownGroup:
+    """A group of a fleet with its twins that have flown.
 
     Attributes
     ----------
-    knowledge : Knowledge
-        The knowledge that the twins share: model, policy and calibration draws.
-    store : StoredObservations
-        The observations of their group.
-    rows : (B,) array
-        The rows of the twins in the store, in ascending order.
-    """
-
-    knowledge: Knowledge
-    store: StoredObservations
-    rows: Index
-
-    def first_twins(self, count: int) -> "_Flights":
-        """Return the flights of the first twins."""
-        return self._replace(rows=self.rows[:count])
-
-    def blocks(self) -> Iterator[ObservedTwins]:
-        """Yield the observations of the twins, some twins at a time."""
-        return self.store.blocks(self.rows)
-
-
-def _learn_group(
-    folder: Path,
-    record: JsonObject,
-    group: "xr.DataTree",
-    twins_by_scenario: Sequence[TwinsOfScenario],
-) -> _GroupLessons:
-    """Learn from the twins of one group.
-
-    The noise is learnt first, because the likelihoods for the other two need it; then the
-    probabilities to worsen, and then the distribution of the calibrated parameter.
-
-    Parameters
-    ----------
     folder : Path
         The folder of the fleet.
+    fleet_hash : str
+        The hash of its `config.json`.
     record : dict
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group.
     twins_by_scenario : sequence of TwinsOfScenario
         The twins that have flown, by scenario.
+    reading : str
+        Differs from call to call; see `EvidenceKit`.
     """
-    scenario = twins_by_scenario[0].knowledge.scenario
-    family = _transition_family(scenario)
-    flights_by_scenario = _flights_by_scenario(group, twins_by_scenario)
-    # With several scenarios each twin has its own calibration, and no common distribution of the
-    # parameter is learnt.
-    nodes = None
-    if len(twins_by_scenario) == 1:
-        nodes = _parameter_nodes(twins_by_scenario[0], is_real="recordings" in record)
-    noise = _noise_factor(flights_by_scenario, family, nodes)
-    explained = _explained_flights(flights_by_scenario, family, noise.mean)
-    twin_count = sum(len(flights.rows) for flights in explained)
-    if not twin_count:
-        raise FleetError(
-            f"no state of the twins explains what was observed in group {record['name']}: nothing "
-            "can be learnt from it; check its model and its noise."
+
+    folder: Path
+    fleet_hash: str
+    record: JsonObject
+    group: "xr.DataTree"
+    twins_by_scenario: Sequence[TwinsOfScenario]
+    reading: str
+
+    def learn(self, pool: TaskPool, progress: Progress) -> _GroupLessons:
+        """Learn from the twins.
+
+        The noise is learnt first, because the likelihoods for the other two need it; then the
+        probabilities to worsen, and then the distribution of the calibrated parameter.
+        """
+        scenario = self.twins_by_scenario[0].knowledge.scenario
+        family = _transition_family(scenario)
+        # With several scenarios each twin has its own calibration, and no common distribution of
+        # the parameter is learnt.
+        nodes = None
+        if len(self.twins_by_scenario) == 1:
+            nodes = parameter_nodes(self.twins_by_scenario[0], is_real="recordings" in self.record)
+        name = self.record["name"]
+        with progress.stage(f"Learning the noise of {name}"):
+            noise = noise_factor(
+                flights_by_scenario(self.group, self.twins_by_scenario), family, nodes
+            )
+        flights = [self._flights(twins, family, noise.mean) for twins in self.twins_by_scenario]
+        grid, twin_count = _probability_grid(
+            family, GroupEvidence(pool, name, flights, progress), self._flown_count
         )
-    grid = _probability_grid(family, explained, noise.mean) if family.names else None
-    counts = _counts(group, scenario.control_names)
-    flown_count = sum(len(twins.rows) for twins in twins_by_scenario)
-    lessons: JsonObject = {
-        "twins": twin_count,
-        "left_out": flown_count - twin_count,
-        "alarmed": counts.alarmed,
-        "noise_factor": noise.summary,
-    }
-    if family.reason_fixed:
-        lessons["transitions_kept_because"] = family.reason_fixed
-    if nodes is not None:
-        lessons["population"] = _population(
-            folder, flights_by_scenario[0], family, grid, nodes, noise.mean
+        if not twin_count:
+            raise FleetError(
+                f"no state of the twins explains what was observed in group {name}: nothing can be "
+                "learnt from it; check its model and its noise."
+            )
+        counts = _counts(self.group, scenario.control_names)
+        lessons: JsonObject = {
+            "twins": twin_count,
+            "left_out": self._flown_count - twin_count,
+            "alarmed": counts.alarmed,
+            "noise_factor": noise.summary,
+        }
+        if family.reason_fixed:
+            lessons["transitions_kept_because"] = family.reason_fixed
+        if nodes is not None:
+            (twins,) = self.twins_by_scenario
+            at_nodes = [self._flights(twins, family, noise.mean, nodes.predicted)]
+            evidence = GroupEvidence(pool, name, at_nodes, progress)
+            lessons["population"] = self._population(evidence, family, grid, nodes)
+        return _GroupLessons(family, grid, counts.followed_controls, lessons)
+
+    @property
+    def _flown_count(self) -> int:
+        """The number of twins that have flown."""
+        return sum(len(twins.rows) for twins in self.twins_by_scenario)
+
+    def _flights(
+        self,
+        twins: TwinsOfScenario,
+        family: TransitionFamily,
+        noise_factor: float,
+        value_per_draw: Float | None = None,
+    ) -> FlightsOfScenario:
+        """Return the flights of the twins of a scenario, with what their evidence needs.
+
+        Parameters
+        ----------
+        twins : TwinsOfScenario
+            The twins.
+        family : TransitionFamily
+            The transitions.
+        noise_factor : float
+            The factor on the assumed noise.
+        value_per_draw : (E, S, U, G) array, optional
+            The noise-free readings at other values of the parameter; by default those of the model.
+        """
+        kit = EvidenceKit(
+            folder=str(self.folder.absolute()),
+            fleet_hash=self.fleet_hash,
+            group=self.record["name"],
+            reading=self.reading,
+            family=family,
+            sensor_model=with_noise_factor(
+                twins.knowledge.sensor_model, noise_factor, value_per_draw
+            ),
         )
-    return _GroupLessons(family, grid, counts.followed_controls, lessons)
+        return FlightsOfScenario(pickle.dumps(kit, pickle.HIGHEST_PROTOCOL), twins.rows)
+
+    def _population(
+        self,
+        evidence: GroupEvidence,
+        family: TransitionFamily,
+        grid: LikelihoodGrid | None,
+        nodes: ParameterNodes,
+    ) -> JsonObject:
+        """Return the record of the population of the calibrated parameter in the group.
+
+        The log evidence of the twins is read several times. It is kept in a temporary file, because
+        that of many twins would not fit in memory.
+
+        Parameters
+        ----------
+        evidence : GroupEvidence
+            The evidence of the twins at the values of the parameter.
+        family : TransitionFamily
+            The transitions.
+        grid : LikelihoodGrid or None
+            The likelihood of the probabilities to worsen, whose posterior means are used; the
+            assumed ones if it is None.
+        nodes : ParameterNodes
+            The values of the parameter.
+        """
+        probability = family.assumed
+        if grid is not None:
+            probability = np.array([marginal.mean for marginal in grid.marginals])
+        draws = self.twins_by_scenario[0].knowledge.draws
+        with RowFile(
+            self.folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER
+        ) as log_evidence:
+            for rows in evidence.evidence_of_draws(probability):
+                log_evidence.append(rows)
+            population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
+        return {
+            "parameter": draws.name,
+            "mean": population.mean.summary,
+            "spread": population.deviation.summary,
+        }
 
 
 def _transition_family(scenario: Scenario) -> TransitionFamily:
@@ -349,14 +436,6 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     if reason:
         return TransitionFamily.fixed(scenario, reason)
     return TransitionFamily.learnable(scenario)
-
-
-def _flights_by_scenario(
-    group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
-) -> list[_Flights]:
-    """Return the flights of the twins of a group that have flown, for each scenario."""
-    store = StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
-    return [_Flights(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
 
 
 class _GroupCounts(NamedTuple):
@@ -388,243 +467,66 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
     return _GroupCounts(alarmed, followed_controls)
 
 
-def _explained_flights(
-    flights_by_scenario: Sequence[_Flights], family: TransitionFamily, noise_factor: float
-) -> list[_Flights]:
-    """Return the flights without the twins whose observations are impossible under the model.
-
-    The likelihoods are computed with a factor on the assumed noise.
-    """
-    point = _with_all_transitions_possible(family.assumed)[None]
-    explained = []
-    for flights in flights_by_scenario:
-        sensor_model = with_noise_factor(flights.knowledge.sensor_model, noise_factor)
-        is_explained = []
-        for observed, control in flights.blocks():
-            likelihood = scaled_likelihood(sensor_model, observed, control).values
-            log_evidence = transition_evidence(family, point, likelihood, control)  # (twins, 1)
-            is_explained.append(np.isfinite(log_evidence[:, 0]))
-        explained.append(flights._replace(rows=flights.rows[np.concatenate(is_explained)]))
-    return explained
-
-
-def _with_all_transitions_possible(probability: Float) -> Float:
-    """Return probabilities of worsening that are neither near 0 nor near 1.
-
-    So any course of the damage is possible, and observations that are impossible with these
-    probabilities contradict the sensor model.
-    """
-    return probability.clip(_LEAST_PROBABILITY, _LARGEST_PROBABILITY)
-
-
-def _probability_grid(
-    family: TransitionFamily, flights_by_scenario: Sequence[_Flights], noise_factor: float
-) -> LikelihoodGrid:
-    """Return, on a grid, the likelihood of the probabilities with which a state worsens.
-
-    It is the likelihood given the observations of all twins of a group. `likelihood_grid` narrows
-    the grid and so calls `log_likelihood` several times. Each call reads the observations again and
-    computes the likelihoods of the states anew, because those of many twins do not fit in memory.
-    """
-    sensor_models = [
-        with_noise_factor(flights.knowledge.sensor_model, noise_factor)
-        for flights in flights_by_scenario
-    ]
-
-    def log_likelihood(points: Float) -> Float:
-        """Return the log likelihood (P,) at P points (P, K) of K probabilities to worsen."""
-        total = np.zeros(len(points))
-        for flights, sensor_model in zip(flights_by_scenario, sensor_models, strict=True):
-            for observed, control in flights.blocks():
-                likelihood = scaled_likelihood(sensor_model, observed, control).values
-                log_evidence = transition_evidence(family, points, likelihood, control)
-                total += log_evidence.sum(axis=0)  # over the twins; the other axis is the points
-        return total
-
-    return likelihood_grid(log_likelihood, len(family.names))
-
-
-@dataclass(frozen=True)
-class _ParameterNodes:
-    """Values of the calibrated parameter at which the evidence of twins is computed.
+class _GridOfTwins(NamedTuple):
+    """The likelihood of the probabilities to worsen given the observations of twins.
 
     Attributes
     ----------
-    values : (E,) array
-        The equally spaced values.
-    prior : (E,) array
-        Their probabilities by the calibration, a normal distribution.
-    predicted : (E, S, U, G) array
-        The noise-free readings of the sensors for each value, state and control, in SI units.
-    """
-
-    values: Float
-    prior: Float
-    predicted: Float
-
-
-def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNodes | None:
-    """Return values of the calibrated parameter, with the readings that a model predicts for each.
-
-    Return None if the calibration has no uncertainty, or if the source of the readings cannot
-    compute them at chosen values of the parameter.
-
-    Raises
-    ------
-    FleetError
-        If some of the values are outside the range of the model.
-    """
-    knowledge = twins.knowledge
-    draws = knowledge.draws
-    if draws.standard_deviation <= 0.0:
-        return None
-    deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
-    values = draws.mean + draws.standard_deviation * deviations
-    prior = np.exp(-0.5 * deviations**2)
-    source = source_of(knowledge.scenario, is_real=is_real)
-    source.prepare(twins.folder, SilentProgress())
-    nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
-    try:
-        predicted_readings = source.observation_table(nodes, knowledge.model)
-    except OutsideModelError as error:
-        raise FleetError(
-            f"{error} `fleet learn` computes the readings at values of {draws.name} up to "
-            f"{NODE_DEVIATIONS:g} standard deviations from the mean of the calibration, which is "
-            f"{draws.mean:.4g} ± {draws.standard_deviation:.2g} here: give `[calibration]` a "
-            "smaller standard deviation, or a model with a wider range, and fly the fleet again."
-        ) from error
-    if len(predicted_readings) != NODES:  # a stored library of observations has fixed draws
-        return None
-    return _ParameterNodes(values, prior / prior.sum(), predicted_readings)
-
-
-def with_noise_factor(
-    model: GaussianSensorModel, factor: float, value_per_draw: Float | None = None
-) -> GaussianSensorModel:
-    """Return a copy of a sensor model with its noise multiplied by a factor.
-
-    Parameters
-    ----------
-    model : GaussianSensorModel
-        The model.
-    factor : float
-        The factor on the standard deviation of the noise.
-    value_per_draw : (E, S, U, G) array, optional
-        The noise-free readings at other values of the parameter; by default those of the model.
-    """
-    return type(model)(
-        model.value_per_draw if value_per_draw is None else value_per_draw,
-        model.standard_deviation * factor,
-        average="inside" if model.averages_inside else "outside",
-        model_error=model.model_error,
-        interval=model.interval,
-        **model.extra_arguments,
-    )
-
-
-def _noise_factor(
-    flights_by_scenario: Sequence[_Flights],
-    family: TransitionFamily,
-    nodes: _ParameterNodes | None,
-) -> Distribution:
-    """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
-
-    The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
-    it in each step separately would attribute a part of the noise to the parameter. With nodes, the
-    evidence of all steps is computed at each value first and averaged over the values then.
-    """
-    flights_of_first_twins = [
-        flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
-    ]
-
-    def log_likelihood(axes: Axes) -> Float:
-        log_evidence = [
-            _evidence_of_noise(flights_of_first_twins, family, nodes, factor)
-            for factor in np.exp(axes[0]).tolist()
-        ]
-        return np.array(log_evidence)
-
-    largest_log_factor = np.log(LARGEST_NOISE)
-    widest_axis = np.linspace(-largest_log_factor, largest_log_factor, NOISE_POINTS)
-    (axis,), values = resolve_density(log_likelihood, (widest_axis,))
-    return Distribution(axis, cell_probabilities(values), np.exp)
-
-
-def _evidence_of_noise(
-    flights_by_scenario: Sequence[_Flights],
-    family: TransitionFamily,
-    nodes: _ParameterNodes | None,
-    factor: float,
-) -> float:
-    """Return the log evidence of twins for a factor on the noise.
-
-    Twins whose observations no course of states explains are left out.
-    """
-    probability = _with_all_transitions_possible(family.assumed)
-    total_log_evidence = 0.0
-    for flights in flights_by_scenario:
-        value_per_draw = None if nodes is None else nodes.predicted
-        model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
-        for observed, control in flights.blocks():
-            if nodes is None:
-                likelihood = scaled_likelihood(model, observed, control)
-                at_point = transition_evidence(
-                    family, probability[None], likelihood.values, control
-                )
-                log_evidence = at_point[:, 0] + likelihood.log_scale
-            else:
-                at_nodes = parameter_evidence(family, probability, model, observed, control)
-                log_evidence = _average_over_nodes(at_nodes, nodes.prior)
-            total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
-    return total_log_evidence
-
-
-def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
-    """Return the log evidence of B twins averaged over E nodes, whose prior is given."""
-    largest = log_evidence.max(axis=1, keepdims=True)  # keeps the exponential from underflowing
-    return np.asarray(largest[:, 0] + np.log(np.exp(log_evidence - largest) @ prior))
-
-
-def _population(
-    folder: Path,
-    flights: _Flights,
-    family: TransitionFamily,
-    grid: LikelihoodGrid | None,
-    nodes: _ParameterNodes,
-    noise_factor: float,
-) -> JsonObject:
-    """Return the record of the population of the calibrated parameter in a group.
-
-    The log evidence of the twins is read several times. It is kept in a temporary file, because
-    that of many twins would not fit in memory.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder of the fleet, which has room for the temporary file.
-    flights : _Flights
-        The flights of the group, which has one scenario.
-    family : TransitionFamily
-        The transitions.
     grid : LikelihoodGrid or None
-        The likelihood of the probabilities to worsen, whose posterior means are used; the assumed
-        ones if it is None.
-    nodes : _ParameterNodes
-        The values of the parameter.
-    noise_factor : float
-        The factor on the assumed noise.
+        The likelihood; None if the transitions are not learnt.
+    twin_count : int
+        The number of twins whose observations are possible under the model; the others are left
+        out.
     """
-    probability = family.assumed
-    if grid is not None:
-        probability = np.array([marginal.mean for marginal in grid.marginals])
-    draws = flights.knowledge.draws
-    model = with_noise_factor(flights.knowledge.sensor_model, noise_factor, nodes.predicted)
-    with RowFile(folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER) as log_evidence:
-        for observed, control in flights.blocks():
-            log_evidence.append(parameter_evidence(family, probability, model, observed, control))
-        population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
-    return {
-        "parameter": draws.name,
-        "mean": population.mean.summary,
-        "spread": population.deviation.summary,
-    }
+
+    grid: LikelihoodGrid | None
+    twin_count: int
+
+
+def _probability_grid(
+    family: TransitionFamily, evidence: GroupEvidence, flown_count: int
+) -> _GridOfTwins:
+    """Return, on a grid, the likelihood of the probabilities with which a state worsens.
+
+    The twins are read for several grids at once, and for each reading the likelihoods of the states
+    are computed anew, because those of many twins do not fit in memory.
+
+    Parameters
+    ----------
+    family : TransitionFamily
+        The transitions as a function of the probabilities.
+    evidence : GroupEvidence
+        The evidence of all twins of a group.
+    flown_count : int
+        The number of these twins.
+    """
+    if not family.names:
+        return _GridOfTwins(None, evidence.grid_sums(()).explained)
+    twin_count = 0
+
+    def log_likelihoods(grids: tuple[Axes, ...]) -> list[Float]:
+        """Return the log likelihood of all twins on grids of log odds."""
+        nonlocal twin_count
+        sums = evidence.grid_sums(tuple(_probabilities(axes) for axes in grids))
+        twin_count = sums.explained
+        return sums.log_likelihood
+
+    def expected_log_likelihood(axes: Axes) -> Float:
+        """Return the log likelihood of some blocks of twins, in proportion to their number."""
+        sums = evidence.grid_sums((_probabilities(axes),), blocks_apart)
+        return sums.log_likelihood[0] * (flown_count / max(1, sums.explained))
+
+    # One block in sixteen, or some 16,000 twins, which say well enough where the first grids lie.
+    blocks_apart = max(_LEAST_BLOCKS_APART, flown_count // _EXPECTING_TWINS)
+    search = GridSearch(
+        log_likelihoods,
+        expected_log_likelihood if flown_count >= blocks_apart * BLOCK_TWINS else None,
+        count=len(family.names),
+    )
+    grid = search.likelihood()
+    return _GridOfTwins(grid, twin_count)
+
+
+def _probabilities(axes: Axes) -> Axes:
+    """Return the probabilities for the axes of a grid of log odds."""
+    return tuple(logistic(axis) for axis in axes)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 
@@ -51,6 +50,11 @@ POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
+_MEMBERS_TOGETHER = 1024
+"""Members whose evidence in all populations is computed in one product of matrices, 14 MB.
+
+Threads of the product that wait for each other cost more than the product of a few members.
+"""
 _TINY = 1e-300
 """Smallest number whose logarithm is taken."""
 
@@ -282,7 +286,7 @@ def marginal_distributions(
     return tuple(marginals)
 
 
-def likelihood_grid(log_likelihood: Callable[[Float], Float], count: int) -> LikelihoodGrid:
+def likelihood_grid(log_likelihood: LogDensity, count: int) -> LikelihoodGrid:
     """Return the likelihood of K probabilities on a grid that resolves their posterior.
 
     The prior is uniform in the probabilities. The axes of the grid are log odds.
@@ -290,22 +294,18 @@ def likelihood_grid(log_likelihood: Callable[[Float], Float], count: int) -> Lik
     Parameters
     ----------
     log_likelihood : callable
-        Returns the log likelihood (P,) at P points (P, K), which hold probabilities.
+        Returns the log likelihood at all points of a grid of log odds.
     count : int
         The number K of probabilities, from 1 to 4.
     """
-    points_per_axis = GRID_POINTS[count]
-    grid_shape = (points_per_axis,) * count
 
     def log_posterior(axes: Axes) -> Float:
         """Return the log posterior density of the log odds at all points of a grid."""
-        log_odds_of_points = np.array(list(product(*axes)))  # (P, K), the last axis varies fastest
-        log_likelihood_of_points = log_likelihood(logistic(log_odds_of_points))  # (P,)
-        return log_likelihood_of_points.reshape(grid_shape) + _log_uniform_prior(axes)
+        return log_likelihood(axes) + _log_uniform_prior(axes)
 
     lowest_log_odds = logit(np.array(LOWEST))
     highest_log_odds = logit(np.array(HIGHEST))
-    widest_axis = np.linspace(lowest_log_odds, highest_log_odds, points_per_axis)
+    widest_axis = np.linspace(lowest_log_odds, highest_log_odds, GRID_POINTS[count])
     axes, log_density = resolve_density(log_posterior, (widest_axis,) * count)
     return LikelihoodGrid(axes, log_density - _log_uniform_prior(axes))
 
@@ -538,16 +538,21 @@ def population_posterior(
     def log_density(axes: Axes) -> Float:
         """Return the log posterior (means, deviations) of the population, up to a constant."""
         means, deviations = axes
-        # The probability of each value in populations of all means, (values, means).
-        probabilities = [
-            np.diff(ndtr((edges[:, None] - means) / deviation), axis=0) for deviation in deviations
-        ]
-        log_evidence_of_all = np.zeros((POPULATION_POINTS, POPULATION_POINTS))
+        # The probability of each value in the populations of all means and deviations, in columns.
+        probabilities = np.hstack(
+            [
+                np.diff(ndtr((edges[:, None] - means) / deviation), axis=0)
+                for deviation in deviations
+            ]
+        )
+        log_evidence_by_column = np.zeros(len(deviations) * len(means))
         for members in log_evidence:
             likelihood = _member_likelihood(nodes, members, values)
-            for column, probability in enumerate(probabilities):
-                evidence_of_members = np.maximum(likelihood @ probability, _TINY)
-                log_evidence_of_all[:, column] += np.log(evidence_of_members).sum(axis=0)
+            for first in range(0, len(likelihood), _MEMBERS_TOGETHER):
+                evidence = likelihood[first : first + _MEMBERS_TOGETHER] @ probabilities
+                np.maximum(evidence, _TINY, out=evidence)
+                log_evidence_by_column += np.log(evidence, out=evidence).sum(axis=0)
+        log_evidence_of_all = log_evidence_by_column.reshape(len(deviations), len(means)).T
         # The density of Student's t is (1 + (x / scale)^2 / freedom)^(-(freedom + 1) / 2).
         minus_log_prior = (
             0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)

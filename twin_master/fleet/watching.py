@@ -30,7 +30,7 @@ from twin_master.watch.opening import begin_watch, resume_watch
 SEARCH_SECONDS = 2.0
 """Time between two searches for new assets [s]."""
 STATE_SECONDS = 2.0
-"""Time between two writings of the state [s]."""
+"""Shortest time between two writings of the state [s]."""
 AGAIN_SECONDS = 30.0
 """Time until the watch of an asset is resumed after an error [s].
 
@@ -44,6 +44,12 @@ LONGEST_IDLE = 1.0
 """Longest pause if no message has come [s]."""
 BUSY_SHARE = 0.2
 """Fraction of a processor's time that polling sources without new messages may take."""
+FILES_OF_ASSET = 2
+"""Files that an asset keeps open: its journal, and its folder for the lock."""
+FURTHER_FILES = 60
+"""Files beside those of assets: what is opened for a moment, and connections."""
+STATE_SHARE = 0.1
+"""Fraction of the time that the writing of the state may take."""
 _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")
 
 
@@ -142,7 +148,10 @@ class FleetWatch:
         self.folder_locks.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
         self.standing = read_standing(folder)
         self._records_of_lost = dict(self.standing["assets"])
-        allow_many_files()  # each asset needs three
+        self._most_assets = LARGEST_FLEET
+        most_files = allow_many_files()
+        if most_files < LARGEST_FLEET * FILES_OF_ASSET:
+            self._most_assets = int(most_files - FURTHER_FILES) // FILES_OF_ASSET
 
     def note(self, sentence: str) -> None:
         """Tell the operator a sentence."""
@@ -179,8 +188,8 @@ class FleetWatch:
             If a broker does not answer, or refuses the twin.
         """
         # Negative, so that the first poll searches for assets.
-        last_state = -SEARCH_SECONDS
         last_search = -SEARCH_SECONDS
+        next_state = 0.0
         # The final actions run before the folders are released, into which they may still write.
         with self.folder_locks, self.final_actions:
             try:
@@ -192,9 +201,10 @@ class FleetWatch:
                     steps = sum(
                         source.look(for_new_assets=is_search_due) for source in self._sources
                     )
-                    if begin - last_state > STATE_SECONDS:
+                    if begin >= next_state:
                         self._write_state()
-                        last_state = begin
+                        seconds = time.monotonic() - begin
+                        next_state = begin + max(STATE_SECONDS, seconds / STATE_SHARE)
                     after_look()
                     if steps == 0:
                         if all(source.has_ended for source in self._sources):
@@ -269,8 +279,12 @@ class FleetWatch:
                 "the name of an asset must consist of letters, digits, dots and hyphens, but "
                 f"{name!r} was given."
             )
-        if len(self.assets) == LARGEST_FLEET:
-            raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
+        if len(self.assets) >= self._most_assets:
+            raise FleetError(
+                f"a process watches {self._most_assets} assets at most, because each keeps "
+                f"{FILES_OF_ASSET} files open: allow more open files by `ulimit -n`, or watch the "
+                "others in another process."
+            )
         key = f"{group.name}/{name}"
         asset = self._open_asset(group, name, feed)
         self.folder_locks.callback(asset.close)

@@ -4,6 +4,8 @@ Observations are taken by blocks. The innermost loop of each sum runs over the o
 block, so that they are computed side by side, each as it would be alone.
 """
 
+from functools import partial
+
 import numpy as np
 
 from fe.compilation import callable_when_compiled, compiled
@@ -65,14 +67,36 @@ def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
     )
 
 
+@partial(callable_when_compiled, makes_arrays=False, inline=True)
+def fill_exponentials(
+    exponent: Float, subtracted: Float, mantissa: Float, power_bits: Index
+) -> None:
+    """Fill `mantissa` and `power_bits` with exp(`exponent` - `subtracted`), (B,) arrays.
+
+    The exponential function is the mantissa times a power of two, whose bits are a whole number; it
+    is written out because the compiler does not vectorise calls of a library function. Differences
+    below `LEAST_EXPONENT` are replaced by it.
+    """
+    for b in range(len(exponent)):
+        value = max(exponent[b] - subtracted[b], LEAST_EXPONENT)
+        # value = whole * log 2 + fraction, the product in two parts to be exact.
+        power_of_two = np.floor(value * INVERSE_LOG_TWO + 0.5)
+        fraction = (value - power_of_two * LOG_TWO_HIGH) - power_of_two * LOG_TWO_LOW
+        # exp(fraction) by a rational approximation, times 2^whole by its bits.
+        square = fraction * fraction
+        even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
+        odd = fraction * ((ODD[0] * square + ODD[1]) * square + ODD[2])
+        mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
+        power_bits[b] = (np.int64(power_of_two) + EXPONENT_BIAS) << FRACTION_BITS
+
+
 @callable_when_compiled
 def _log_sum_exp(
     exponent: Float, largest: Float, total: Float, mantissa: Float, power_bits: Index
 ) -> None:
     """Fill `total` (B,) with the log of the sum of exp(`exponent`) over its E rows (E, B).
 
-    The other arrays (B,) are work space. The exponential function is written out, as a number times
-    a power of two, because the compiler does not vectorise calls of a library function.
+    The other arrays (B,) are work space.
     """
     largest[:] = -np.inf
     total[:] = 0.0
@@ -81,17 +105,7 @@ def _log_sum_exp(
             largest[b] = max(largest[b], exponent[e, b])
     power = power_bits.view(np.float64)
     for e in range(len(exponent)):
-        for b in range(len(total)):
-            value = max(exponent[e, b] - largest[b], LEAST_EXPONENT)
-            # value = whole * log 2 + fraction, the product in two parts to be exact.
-            power_of_two = np.floor(value * INVERSE_LOG_TWO + 0.5)
-            fraction = (value - power_of_two * LOG_TWO_HIGH) - power_of_two * LOG_TWO_LOW
-            # exp(fraction) by a rational approximation, times 2^whole by its bits.
-            square = fraction * fraction
-            even = ((EVEN[0] * square + EVEN[1]) * square + EVEN[2]) * square + EVEN[3]
-            odd = fraction * ((ODD[0] * square + ODD[1]) * square + ODD[2])
-            mantissa[b] = 1.0 + 2.0 * odd / (even - odd)
-            power_bits[b] = (np.int64(power_of_two) + EXPONENT_BIAS) << FRACTION_BITS
+        fill_exponentials(exponent[e], largest, mantissa, power_bits)
         for b in range(len(total)):
             total[b] += mantissa[b] * power[b]
     for b in range(len(total)):
@@ -108,11 +122,12 @@ def log_densities(
     draw_coefficients: Float,
     draw_offset: Float,
     log_scale: Float,
+    row: Index,
     result: Float,
 ) -> None:
-    """Fill `result` with the log density of observations in each state, for each draw or their sum.
+    """Fill rows of `result` with log densities in each state, for each draw or their sum.
 
-    With d = (observation - mean) / deviation it is for a draw e
+    With d = (observation - mean) / deviation that of an observation is for a draw e
 
         (|I d|² - |d|²) / 2 + (d A) b_e - offset_e + log scale,
 
@@ -121,7 +136,7 @@ def log_densities(
 
     Parameters
     ----------
-    observation : (G, T) array
+    observation : (G, N) array
         The sensor values, any number if a sensor is lost.
     mean, inverse_deviation : (S, G) array
         The mean over the draws, and one over the standard deviation; the latter is zero if a sensor
@@ -136,8 +151,11 @@ def log_densities(
         The term of each draw that is subtracted whatever is observed.
     log_scale : (S,) array
         The log of the normalising factor of the density.
+    row : (N,) array
+        The row of the result of each observation.
     result : (T, S, E) or (T, S, 1) array
-        To be filled: the log density of each draw, or the log of the sum over the draws.
+        To be filled in these rows: the log density of each draw, or the log of the sum over the
+        draws.
     """
     sensors, observation_count = observation.shape
     directions, draws = draw_coefficients.shape
@@ -189,4 +207,4 @@ def log_densities(
                 exponent[0] = square
             for b in range(size):
                 for e in range(result.shape[2]):
-                    result[first + b, s, e] = exponent[e, b] + log_scale[s]
+                    result[row[first + b], s, e] = exponent[e, b] + log_scale[s]

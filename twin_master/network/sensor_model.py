@@ -28,6 +28,8 @@ Averaging = Literal["outside", "inside"]
 """Whether the likelihoods of the draws are averaged, or those of each sensor."""
 _WORST_LISTED = 3
 """Number of sensors in the list of those that fit worst."""
+_MANY_STEPS = 32
+"""From so many steps on it is tried first whether all have the same sensors, to group them fast."""
 LARGEST_DISTANCE = 1e140
 """Distances are cut to this; its square is still a number."""
 LEAST_ONE_MINUS_LEVERAGE = 1e-12
@@ -330,7 +332,9 @@ class GaussianSensorModel(QuantityModel):
         """
         values, other_log_density = self.split_observation(observations)
         log_density = self._log_densities(values, control_index, self.draw_count)
-        return log_density + other_log_density[..., None]
+        if np.any(other_log_density):  # the array is large, and mostly there is nothing to add
+            log_density += other_log_density[..., None]
+        return log_density
 
     def _log_densities(
         self, observations: ArrayLike, control_index: ArrayLike, draws: int
@@ -357,20 +361,19 @@ class GaussianSensorModel(QuantityModel):
         check_shape("observations", observations.shape, control.size, self.sensor_count)
         check_controls(control, self.control_count)
         is_present = ~np.isnan(observations)
-        result = np.zeros((len(observations), self.state_count, draws))
         if not self.averages_inside or draws != 1:
-            self._add_log_densities(observations, control, is_present, result)
-            return result
+            return self._log_densities_of_sensors(observations, control, is_present, draws)
         # The average inside the product over sensors: each sensor is averaged by itself, eq. (32).
+        result = np.zeros((len(observations), self.state_count, 1))
         for is_averaged_sensor in np.eye(self.sensor_count, dtype=bool):
             is_counted = is_averaged_sensor & is_present
-            self._add_log_densities(observations, control, is_counted, result)
+            result += self._log_densities_of_sensors(observations, control, is_counted, 1)
         return result
 
-    def _add_log_densities(
-        self, observations: Float, control: Index, is_present: NDArray[np.bool_], result: Float
-    ) -> None:
-        """Add to `result` the log density of each observation, over its present sensors only.
+    def _log_densities_of_sensors(
+        self, observations: Float, control: Index, is_present: NDArray[np.bool_], draws: int
+    ) -> Float:
+        """Return the log density of each observation, over its present sensors only.
 
         Steps with the same control and the same present sensors are computed together.
 
@@ -382,42 +385,40 @@ class GaussianSensorModel(QuantityModel):
             The control in force in each step.
         is_present : (T, G) array of bool
             Whether a sensor counts in a step.
-        result : (T, S, draws) array
-            The log densities, for each draw or, with a last axis of length 1, their average.
-        """
-        # The row of `is_present` is a key as bytes, because an array cannot be a key.
-        steps_by_group: dict[tuple[int, bytes], list[int]] = {}
-        for step, control_in_force in enumerate(control.tolist()):
-            group = (control_in_force, is_present[step].tobytes())
-            steps_by_group.setdefault(group, []).append(step)
-        for (control_in_force, present_key), steps in steps_by_group.items():
-            result[steps] += self._log_densities_of_same_sensors(
-                observations[steps], control_in_force, present_key, result.shape[-1]
-            )
+        draws : int
+            The number E of draws for the density of each draw; 1 for their average.
 
-    def _log_densities_of_same_sensors(
-        self, observations: Float, control: int, present_key: bytes, draws: int
-    ) -> Float:
-        """Return log densities of steps with the same control and the same present sensors.
+        Returns
+        -------
+        (T, S, draws) array
+            The log densities of values in SI.
+        """
+        result = np.empty((len(observations), self.state_count, draws))
+        for (control_in_force, present_key), steps in _steps_by_group(control, is_present).items():
+            self._fill_log_densities(observations, steps, control_in_force, present_key, result)
+        return result
+
+    def _fill_log_densities(
+        self, observations: Float, steps: Index, control: int, present_key: bytes, result: Float
+    ) -> None:
+        """Fill in log densities of steps with the same control and the same present sensors.
 
         The terms that they share are kept for each control until other sensors are present: mostly
         the same sensors are present in the next step.
 
         Parameters
         ----------
-        observations : (N, G) array
-            The sensor values in N steps, SI; those of absent sensors are ignored.
+        observations : (T, G) array
+            The sensor values, SI; those of absent sensors are ignored.
+        steps : (N,) array
+            The steps with this control and these sensors.
         control : int
             The control in force.
         present_key : bytes
             Whether each sensor is present, as the bytes of an array of bool (G,).
-        draws : int
-            The number E of draws for the density of each draw; 1 for their average.
-
-        Returns
-        -------
-        (N, S, draws) array
-            The log densities of values in SI.
+        result : (T, S, E) or (T, S, 1) array
+            To be filled in these steps: the log density of each draw, or that of their average, of
+            values in SI.
         """
         is_present = np.frombuffer(present_key, dtype=bool)
         last_key, terms = self._last_terms.get(control, (b"", None))
@@ -425,11 +426,10 @@ class GaussianSensorModel(QuantityModel):
             terms = self._density_terms(control, is_present)
             self._last_terms[control] = (present_key, terms)
         draw_offset = terms.draw_offset
-        if draws == 1:
+        if result.shape[-1] == 1:
             draw_offset = draw_offset - self._log_weight  # the sum over draws is weighted
-        result = np.empty((len(observations), self.state_count, draws))
         log_densities(
-            np.ascontiguousarray(np.where(is_present, observations, 0.0).T),
+            np.ascontiguousarray(np.where(is_present, observations[steps], 0.0).T),
             terms.mean,
             terms.inverse_deviation,
             terms.interval_directions,
@@ -437,9 +437,9 @@ class GaussianSensorModel(QuantityModel):
             self._draw_coefficients,
             draw_offset,
             terms.log_scale,
+            steps,
             result,
         )
-        return result
 
     def _density_terms(self, control: int, is_present: NDArray[np.bool_]) -> _DensityTerms:
         """Return the terms that all observations with the same present sensors share.
@@ -562,6 +562,34 @@ class GaussianSensorModel(QuantityModel):
         """
         variance = np.tensordot(self.check_joint(joint), self.total_standard_deviation**2, axes=2)
         return np.asarray(np.sqrt(variance))
+
+
+def _steps_by_group(
+    control: Index, is_present: NDArray[np.bool_]
+) -> dict[tuple[int, bytes], Index]:
+    """Return the steps that have the same control and the same present sensors, by both.
+
+    The present sensors are given as the bytes of an array of bool, because an array cannot be a
+    key.
+
+    Parameters
+    ----------
+    control : (T,) array
+        The control in force in each step.
+    is_present : (T, G) array of bool
+        Whether a sensor counts in a step.
+    """
+    if len(control) > _MANY_STEPS and bool(np.all(is_present == is_present[0])):
+        present_key = is_present[0].tobytes()
+        return {
+            (value, present_key): np.flatnonzero(control == value)
+            for value in np.unique(control).tolist()
+        }
+    steps_by_group: dict[tuple[int, bytes], list[int]] = {}
+    for step, control_in_force in enumerate(control.tolist()):
+        group = (control_in_force, is_present[step].tobytes())
+        steps_by_group.setdefault(group, []).append(step)
+    return {group: np.array(steps) for group, steps in steps_by_group.items()}
 
 
 def check_noise(

@@ -105,6 +105,8 @@ class Watch:
     ----------
     source : AssetSource
         The source of the model that the twin believes.
+    inputs : mapping of str to str
+        The SHA-256 hash of each input.
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel
@@ -150,11 +152,11 @@ class Watch:
         remove_half_written_files(folder)
         if sibling is None:
             self.source: AssetSource = believed_source(scenario)
-            self._inputs: Mapping[str, str] = self.source.prepare(folder, progress)
+            self.inputs: Mapping[str, str] = self.source.prepare(folder, progress)
         else:
             self.source = sibling.source
-            self._inputs = sibling._inputs
-        self.config = record_inputs(folder, config, self._inputs)
+            self.inputs = sibling.inputs
+        self.config = record_inputs(folder, config, self.inputs)
         self.models: list[BelievedModel] = []
         self.models.append(self._prepare_model() if sibling is None else sibling.models[0])
         self.journal_path = folder / JOURNAL_NAME
@@ -167,7 +169,7 @@ class Watch:
         with self.progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
         remark = calibration_sentence(
-            knowledge.draws.record or {}, WATCHED_ASSET, self.source.origin.model, self._inputs
+            knowledge.draws.record or {}, WATCHED_ASSET, self.source.origin.model, self.inputs
         )
         if remark is not None:
             self.progress.note(remark)

@@ -6,7 +6,9 @@ and no more messages than can wait here. Further ones wait at the broker, or are
 
 import json
 import os
+import selectors
 import socket
+import ssl
 import sys
 import time
 from collections import deque
@@ -25,6 +27,7 @@ from twin_master.watch.records import Decision
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
+    from paho.mqtt.enums import MQTTErrorCode
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
@@ -36,8 +39,15 @@ FIRST_RETRY_SECONDS = 1.0
 LONGEST_RETRY_SECONDS = 30.0
 """The pause between two attempts is doubled from the first to the longest one [s]."""
 HEARTBEAT_SECONDS = 10.0
+EXCHANGE_SECONDS = 0.5
+"""Longest time between two exchanges with the broker while messages wait here [s].
+
+Without them, heartbeats and decisions would wait until all messages are processed.
+"""
 _UNREAD_MESSAGES = 200
 """Largest number of messages that the broker sends before they are acknowledged."""
+_UNREAD_BYTES = 50_000_000
+"""Size of the messages that wait here at most, beyond the `_UNREAD_MESSAGES` first ones [bytes]."""
 _UNACKNOWLEDGED_DECISIONS = 1000
 """Largest number of decisions sent and not acknowledged; further ones wait in the journal."""
 _SESSION_SECONDS = 7 * 86_400
@@ -131,6 +141,13 @@ class Session:
         self._next_attempt = 0.0
         self._retry_seconds = FIRST_RETRY_SECONDS
         self._next_heartbeat = 0.0
+        self._next_exchange = 0.0
+
+        # The pace since the last heartbeat
+        self._pace_begin = time.monotonic()
+        self._processing_seconds = 0.0
+        self._was_idle = True
+        self._kept_up = True
 
         # Messages and decisions
         self.unread: deque[MQTTMessage] = deque()
@@ -319,17 +336,13 @@ class Session:
         wait : float
             How long to wait at most if nothing comes [s].
         """
+        self._next_exchange = time.monotonic() + EXCHANGE_SECONDS
         client = self._client
         if client is None:
             client = self._try_to_connect(wait)
         if client is None:
             return
-        count = len(self.unread)
-        error = client.loop(wait)
-        # Read all packets that have arrived already
-        while not error and len(self.unread) > count:
-            count = len(self.unread)
-            error = client.loop(0.0)
+        error = self._read_and_write(client, wait)
         if error or self._failure or client.socket() is None:
             self._drop_connection(f"the {self._where} is away ({error.name})")
             return
@@ -345,7 +358,58 @@ class Session:
             publisher.publish()
         if self._is_connected and time.monotonic() >= self._next_heartbeat:
             self._next_heartbeat = time.monotonic() + HEARTBEAT_SECONDS
-            client.publish(self._heartbeat_topic, json.dumps(self._heartbeat()), retain=True)
+            heartbeat = self._heartbeat() | self._pace()
+            client.publish(self._heartbeat_topic, json.dumps(heartbeat), retain=True)
+
+    def _read_and_write(self, client: "Client", wait: float) -> "MQTTErrorCode":
+        """Read all packets that have come, and write those that wait; return paho's error code.
+
+        The loop of paho itself waits by `select`, which knows no file beyond the first 1,024 of a
+        process; the watch of a fleet has two open files for each asset. Some brokers send more than
+        they were asked for, so that nothing is read while `_UNREAD_BYTES` wait here.
+        """
+        error = client.loop_misc()
+        if not error and client.want_write():
+            error = client.loop_write()
+        while not error and self._has_room and _can_read(client, wait):
+            error = client.loop_read()
+            wait = 0.0
+        if not error and client.want_write():
+            error = client.loop_write()
+        return error
+
+    @property
+    def _has_room(self) -> bool:
+        """Whether further messages may come into memory."""
+        if len(self.unread) <= _UNREAD_MESSAGES:
+            return True
+        return sum(len(message.payload) for message in self.unread) < _UNREAD_BYTES
+
+    def _pace(self) -> JsonObject:
+        """Return whether messages are processed as fast as they come, since the last heartbeat.
+
+        Brokers send only so many messages before the first is acknowledged, so that the number of
+        those that wait here does not tell how many wait there. Whether all were processed at some
+        time does. The operator is told once if this does not happen between two heartbeats.
+        """
+        now = time.monotonic()
+        elapsed = max(now - self._pace_begin, 1e-3)
+        pace: JsonObject = {
+            "busy": round(min(1.0, self._processing_seconds / elapsed), 2),
+            "keeps_up": self._was_idle,
+        }
+        if not self._was_idle and self._kept_up:
+            self.note(
+                f"Messages come faster than they are processed: for {elapsed:.0f} s some have "
+                "always been waiting, and the broker drops what it cannot keep."
+            )
+        elif self._was_idle and not self._kept_up:
+            self.note("All messages that waited are processed.")
+        self._kept_up = self._was_idle
+        self._pace_begin = now
+        self._processing_seconds = 0.0
+        self._was_idle = not self.unread
+        return pace
 
     def _try_to_connect(self, wait: float) -> "Client | None":
         """Return a new client; None if it is too early for an attempt, or if it fails."""
@@ -373,13 +437,19 @@ class Session:
         while True:
             while self.unread:
                 self._last_message = self.unread.popleft()
+                begin = time.monotonic()
                 yield self._last_message
+                now = time.monotonic()
+                self._processing_seconds += now - begin
                 self.acknowledge()
+                if now >= self._next_exchange:
+                    self._exchange(0.0)
             end = time.monotonic() + wait
             self._exchange(wait)
             while not self.unread and time.monotonic() < end:
                 self._exchange(wait)
             if not self.unread:
+                self._was_idle = True
                 yield None
 
     def acknowledge(self) -> None:
@@ -458,3 +528,15 @@ class Session:
             client.disconnect()
             while copy.recv(65536):
                 pass
+
+
+def _can_read(client: "Client", wait: float) -> bool:
+    """Return whether a packet has come, or comes within a time [s]."""
+    connection = client.socket()
+    if connection is None:
+        return False
+    if isinstance(connection, ssl.SSLSocket) and connection.pending():
+        return True  # decrypted already, so that the system knows nothing of it
+    with selectors.DefaultSelector() as selector:
+        selector.register(connection, selectors.EVENT_READ)
+        return bool(selector.select(wait))

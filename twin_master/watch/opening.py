@@ -80,10 +80,17 @@ def begin_watch(
         If the folder exists and is not to be replaced.
     """
     source = believed_source(resolved_scenario)
-    source.check()
+    if sibling is None:  # else the same source was checked and prepared before
+        source.check()
     files = source.files() | _client_files_to_discard(folder)
     opened = run_folder.new_run_folder(
-        resolved_scenario, file, folder, files, replace=replace_run, watched=True
+        resolved_scenario,
+        file,
+        folder,
+        files,
+        replace=replace_run,
+        watched=True,
+        inputs=None if sibling is None else sibling.inputs,
     )
     with opened as (config, located_scenario):
         yield Watch(folder, config, located_scenario, progress, sibling)

@@ -21,6 +21,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, of_library, text_of, written
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.resolution import Overrides
+from twin_master.command_options import choose_engine
 from twin_master.errors import (
     FleetError,
     ImpossibleObservation,
@@ -40,7 +41,6 @@ from twin_master.fleet.shard import result_of_unflown
 from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
 from twin_master.fleet.store_address import STORE_NAME
 from twin_master.fleet.store_layout import FORMER_DIMENSIONS, FORMER_PATHS
-from twin_master.fleet_command import choose_engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge

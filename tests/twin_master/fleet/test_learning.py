@@ -26,13 +26,15 @@ from twin_master.fleet.evidence import (
     scaled_likelihood,
     transition_evidence,
 )
-from twin_master.fleet.learn import learn_fleet, with_noise_factor
+from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.noise import with_noise_factor
 from twin_master.fleet.outcomes import Estimated, Outcomes
 from twin_master.fleet.overview import overview_of_group
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import (
     HIGHEST,
     LOWEST,
+    Axes,
     LikelihoodGrid,
     likelihood_grid,
     population_posterior,
@@ -123,7 +125,12 @@ def test_evidence_of_a_node_is_that_of_the_filter():
 def grid_of(*counts: tuple[int, int]) -> LikelihoodGrid:
     """Return the likelihood of probabilities of which so many were hits, and so many not."""
     hits, misses = np.array(counts, dtype=float).T
-    return likelihood_grid(lambda points: np.log(points) @ hits + np.log1p(-points) @ misses, len(counts))
+
+    def log_likelihood(axes: Axes) -> np.ndarray:
+        points = expit(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+        return np.log(points) @ hits + np.log1p(-points) @ misses
+
+    return likelihood_grid(log_likelihood, len(counts))
 
 
 SIMILAR, MANY = ((3, 47), (6, 44), (2, 48), (9, 41), (4, 46)), (22_500, 427_500)

@@ -11,6 +11,7 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from tests.command_line import command, said, seen
@@ -34,7 +35,7 @@ from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.store_layout import ALL_ROWS
 from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
 from twin_master.fleet.watched_asset import WatchedAsset
-from twin_master.fleet.watching import FleetWatch
+from twin_master.fleet.watching import FILES_OF_ASSET, FURTHER_FILES, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
 from twin_master.watch.metrics_server import MetricsServer
@@ -559,3 +560,23 @@ def test_the_figures_of_all_assets_are_served_for_prometheus(fleet_file, tmp_pat
     steps = re.findall(r'^uav_twin_step\{asset="(.*)"\} (\S+)$', texts[0], re.MULTILINE)
     assert steps == [(name, f"{STEPS - 1}.0") for name in WINGS]
     assert "Metrics: http://127.0.0.1:" in done.stderr
+
+
+def test_assets_beyond_the_files_of_a_process_are_refused_and_leave_the_others_alone(
+    fleet_file, tmp_path, monkeypatch
+):
+    files = FURTHER_FILES + 2 * FILES_OF_ASSET
+    monkeypatch.setattr("twin_master.fleet.watching.allow_many_files", lambda: files)
+    fleet = watched(fleet_file, tmp_path / "out")
+    assert set(fleet.assets) == {"north/wing-0", "north/wing-1"}
+    assert "a process watches 2 assets at most" in fleet.failures["north/wing-2"]
+
+
+def test_an_asset_keeps_as_many_files_open_as_the_limit_counts(fleet_file, tmp_path):
+    numbers: list[int] = []
+
+    def count(asset: WatchedAsset, _decision: Decision) -> None:
+        numbers.append(psutil.Process().num_fds())
+
+    FleetWatch(load_fleet(fleet_file), tmp_path / "out", count, str).run()
+    assert max(numbers) - numbers[0] == 2 * FILES_OF_ASSET

@@ -1,0 +1,222 @@
+"""Evidence on grids and at draws, the search for a grid, and workers, against the filter and each other."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from scipy.special import expit
+
+from reporting.progress import Progress
+from tests.refusals import refused
+from tests.twin_master.fleet.test_kills import KillingProgress, local_workers
+from tests.twin_master.fleet.test_learning import tiny
+from tests.twin_master.network.decision_oracles import precise_forward_backward
+from twin_master.assets.resolution import Overrides
+from twin_master.errors import FleetError
+from twin_master.fleet import evidence_tasks
+from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
+from twin_master.fleet.evidence import (
+    TransitionFamily,
+    grid_evidence,
+    parameter_evidence,
+    transition_evidence,
+)
+from twin_master.fleet.evidence_kernels import LEAST_EVIDENCE
+from twin_master.fleet.grid_search import GridSearch
+from twin_master.fleet.plan import ensemble
+from twin_master.fleet.posterior import Axes, likelihood_grid
+from twin_master.network.twin import build_graphical_model
+from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet
+
+EACH = {"2g": 0.07, "3g": 0.2}
+OF_REGIONS = {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}
+CONTROLS = {
+    "one control": [0, 0, 0, 0, 0, 0],
+    "one change": [1, 1, 1, 0, 0, 0],
+    "there and back": [1, 0, 0, 1, 1, 0],
+    "to and fro": [0, 1, 0, 1, 0, 1],
+}
+
+
+@pytest.mark.parametrize("control", CONTROLS.values(), ids=CONTROLS)
+@pytest.mark.parametrize(
+    ("probability", "name", "success"),
+    [
+        (EACH, "growing_damage", 1.0),
+        (OF_REGIONS, "growing_damage", 1.0),
+        (EACH, "inspected_wing", 0.7),
+    ],
+    ids=["of each control", "of each region", "with repairs"],
+)
+def test_evidence_on_a_grid_is_that_of_its_points(probability, name, success, control):
+    scenario = tiny(probability, name=name, success=success)
+    family = TransitionFamily.learnable(scenario)
+    controls = np.array([control, [len(scenario.control) - 1 - number for number in control]])
+    likelihood = np.random.default_rng(4).random((2, 6, 9))
+    axes = tuple(np.linspace(0.02 + 0.01 * k, 0.6, 3) for k in range(len(family.names)))
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    evidence = grid_evidence(family, axes, likelihood, controls)
+    np.testing.assert_allclose(
+        evidence, transition_evidence(family, points, likelihood, controls), rtol=1e-12
+    )
+
+
+def test_evidence_on_a_grid_is_right_where_its_products_underflow():
+    """The steps say in turn that all is well and that all is damaged: e^-1500 in all, and impossible."""
+    family = TransitionFamily.learnable(tiny(EACH))
+    likelihood = np.full((2, 6, 9), math.exp(-300.0))
+    likelihood[0, ::2, 0] = likelihood[0, 1::2, 8] = 1.0
+    likelihood[1] = 0.0
+    likelihood[1, :3, 8] = likelihood[1, 3:, 0] = 1.0
+    control = np.array([[1, 1, 0, 0, 1, 0]] * 2)
+    axes = (np.array([0.1, 0.2]), np.array([0.3]))
+    points = np.array([[0.1, 0.3], [0.2, 0.3]])
+    evidence = grid_evidence(family, axes, likelihood, control)
+    expected = transition_evidence(family, points, likelihood, control)
+    assert (expected[0] < -700.0).all()
+    np.testing.assert_allclose(evidence[0], expected[0], rtol=1e-12)
+    assert (evidence[1] == -np.inf).all()
+
+
+def test_evidence_of_a_draw_is_that_of_the_filter_where_products_underflow():
+    scenario = tiny(EACH)
+    model = build_graphical_model(scenario)
+    family = TransitionFamily.learnable(scenario)
+    generator = np.random.default_rng(5)
+    values = 1e-3 * (1.0 + generator.random((3, 9, 2, 24)))
+    control = generator.integers(0, 2, (2, 6))
+    observed = values[1, generator.integers(0, 9, (2, 6)), control]
+    sensors = GaussianSensorModel(values, 1e-4)
+    evidence = parameter_evidence(family, family.assumed, sensors, observed, control)
+    for twin in range(2):
+        log_density = sensors.log_density_of_draws(observed[twin], control[twin])
+        scaled_evidence = evidence[twin] - log_density.max(axis=1).sum(axis=0)
+        assert (scaled_evidence < LEAST_EVIDENCE).any()
+    for draw in range(3):
+        alone = GaussianSensorModel(values[draw : draw + 1], 1e-4)
+        for twin in range(2):
+            rows = alone.log_likelihood_sequence(observed[twin], control[twin])
+            *_, expected = precise_forward_backward(model, control[twin], rows)
+            assert evidence[twin, draw] == pytest.approx(expected.sum(), rel=1e-12)
+
+
+class Readings:
+    """The log likelihood of two probabilities of which so many were hits; counts how often it is read."""
+
+    def __init__(self, twins: float, surplus: float = 0.0) -> None:
+        self.hits = np.array([0.05, 0.1]) * (1.0 + surplus) * 20.0 * twins
+        self.misses = np.array([0.95, 0.9]) * 20.0 * twins
+        self.count = 0
+
+    def on_grid(self, axes: Axes) -> np.ndarray:
+        points = expit(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+        return np.log(points) @ self.hits + np.log1p(-points) @ self.misses
+
+    def on_grids(self, grids: tuple[Axes, ...]) -> list[np.ndarray]:
+        self.count += 1
+        return [self.on_grid(axes) for axes in grids]
+
+
+def shifted(axes: Axes) -> np.ndarray:
+    """Return a log likelihood that expects other probabilities."""
+    return -1e4 * sum((axis - 1.0) ** 2 for axis in np.meshgrid(*axes, indexing="ij"))
+
+
+@pytest.mark.parametrize("expectation", ["of some twins", "wrong", "none"])
+def test_a_search_finds_the_grid_of_the_plain_search_whatever_it_expects(expectation):
+    readings = Readings(1e6)
+    some = Readings(0.97e6, surplus=2e-3).on_grid
+    expected = {"of some twins": some, "wrong": shifted, "none": None}[expectation]
+    found = GridSearch(readings.on_grids, expected, 2).likelihood()
+    plain = likelihood_grid(readings.on_grid, 2)
+    np.testing.assert_array_equal(found.axes, plain.axes)
+    np.testing.assert_array_equal(found.log_likelihood, plain.log_likelihood)
+
+
+def test_a_search_that_expects_well_reads_a_million_twins_twice():
+    readings = Readings(1e6)
+    some = Readings(0.97e6, surplus=2e-3).on_grid
+    GridSearch(readings.on_grids, some, 2).likelihood()
+    assert readings.count == 2
+
+
+@pytest.fixture(scope="module")
+def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a fleet of forty twins."""
+    plan = ensemble("growing_damage", range(40), Overrides(strain_library=library_file))
+    return fly_fleet(plan, tmp_path_factory.mktemp("flown") / "fleet").folder
+
+
+@pytest.fixture
+def small_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a task have seven twins."""
+    monkeypatch.setattr(evidence_tasks, "TASK_TWINS", 7)
+
+
+def lessons(flown: Path, folder: Path, **options: Any) -> bytes:
+    """Return the file of what a fleet teaches."""
+    learn_from_fleet(flown, folder / "learnt.toml", **options)
+    return (folder / "learnt.toml").read_bytes()
+
+
+def test_a_fleet_teaches_the_same_bytes_with_any_number_of_workers(flown, tmp_path, small_tasks):
+    alone = lessons(flown, tmp_path)
+    assert lessons(flown, tmp_path, engine=Engine(1)) == alone
+    assert lessons(flown, tmp_path, engine=Engine(2)) == alone
+
+
+def test_a_worker_that_dies_changes_nothing(flown, tmp_path, small_tasks):
+    progress = KillingProgress(local_workers)
+    alone = lessons(flown, tmp_path)
+    assert lessons(flown, tmp_path, engine=Engine(1), progress=progress) == alone
+    assert progress.killed
+
+
+def end_this_process(_task: int) -> int:
+    """Kill the process that computes the task."""
+    psutil.Process().kill()
+    return 0
+
+
+def test_twins_over_which_workers_die_again_and_again_end_the_command_with_a_sentence():
+    with (
+        open_task_pool(Engine(1), Progress()) as pool,
+        refused(FleetError, "3 workers died over the same twins"),
+    ):
+        list(pool.results(end_this_process, [1]))
+
+
+class DistantPool(TaskPool):
+    """Computes in this process while it does not see the folder of the fleet, as a distant machine."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(None)
+        self._folder = folder
+        self.answers: list[bool] = []
+
+    def results(self, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[Any]:
+        for task in tasks:
+            evidence_tasks._stored_observations.cache_clear()
+            hidden = self._folder.rename(self._folder.with_name("hidden"))
+            result = function(task)
+            hidden.rename(self._folder)
+            evidence_tasks._stored_observations.cache_clear()
+            self.answers.append(result is not None)
+            yield result
+
+
+def test_observations_are_sent_to_workers_that_do_not_see_the_fleet(
+    flown, tmp_path, small_tasks, monkeypatch
+):
+    pool = DistantPool(flown)
+    alone = lessons(flown, tmp_path)
+    monkeypatch.setattr("twin_master.fleet.learn.open_task_pool", lambda *_: nullcontext(pool))
+    assert lessons(flown, tmp_path) == alone
+    # The first task comes back without an answer; then all tasks go with their observations.
+    assert pool.answers[:2] == [False, True]
+    assert sum(not answer for answer in pool.answers) == 1

@@ -1,0 +1,446 @@
+"""Compiled loops for the log evidence of twins: at many points, on grids, and at many draws.
+
+All are forward passes of a hidden Markov model with S joint states. `evidence_at_points` divides
+the belief by its sum in each step. The other two leave the belief as it is and compute many *lanes*
+side by side, each as it would be alone: points of a grid, or draws of a parameter. The likelihood
+of a step is at most 1, so that all that underflows adds less than T S 1e-307 to the evidence in T
+steps. The evidence is therefore exact to rounding wherever it is above `LEAST_EVIDENCE`; the caller
+computes others by `evidence_at_points`.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.compilation import callable_when_compiled, compiled
+from reporting.arrays import Float, Index
+from twin_master.network.gaussian_kernels import fill_exponentials
+from twin_master.network.kernels import PredecessorLists, apply_blocks
+
+LEAST_EVIDENCE = -575.0
+"""Log evidence below which underflow may matter: exp(-575) is 1e-250."""
+LANES_TOGETHER = 8
+"""The number of lanes is a multiple of this, so that loops leave no remainder."""
+
+_makes_no_arrays = partial(callable_when_compiled, makes_arrays=False, inline=True)
+"""Decorator of functions that only read and fill arrays: numba does not count references."""
+
+
+@compiled
+def evidence_at_points(
+    prior: Float,
+    lists: PredecessorLists,
+    probability: Float,
+    control: Index,
+    likelihood: Float,
+    result: Float,
+) -> None:
+    """Fill `result` with the log evidence of B twins in T steps for P transition models.
+
+    In each step the belief is propagated through the transition, multiplied by the likelihood, and
+    divided by its sum; the log evidence is the sum of the logarithms of these sums.
+
+    Parameters
+    ----------
+    prior : (S,) array
+        The belief before the first step.
+    lists : PredecessorLists
+        The predecessors of the levels of each factor; their probabilities are not used.
+    probability : (P, non-zeros) array
+        The probabilities of the entries of the lists, for each of the P models.
+    control : (B, T) array
+        The control in force in each step.
+    likelihood : (B, T, S) array
+        The likelihood of the states in each step, divided by its largest value.
+    result : (B, P) array
+        To be filled: the log evidence; -inf if the observations are impossible.
+    """
+    twins, steps, state_count = likelihood.shape
+    levels, first_row, start, source, _, _ = lists
+    belief = np.empty(state_count)
+    work = np.empty(state_count)
+    for twin in range(twins):
+        for point in range(len(probability)):
+            # `apply_blocks` does not read the last field, the log probabilities, so that the
+            # probabilities can be passed in its place.
+            point_lists = levels, first_row, start, source, probability[point], probability[point]
+            belief[:] = prior
+            result[twin, point] = 0.0
+            for t in range(steps):
+                if t > 0:
+                    apply_blocks(
+                        point_lists,  # type: ignore[arg-type]  # numba takes a plain tuple, too
+                        control[twin, t - 1],
+                        belief,
+                        belief,
+                        work,
+                    )
+                predictive_probability = 0.0
+                for state in range(state_count):
+                    belief[state] *= likelihood[twin, t, state]
+                    predictive_probability += belief[state]
+                if predictive_probability <= 0.0:
+                    result[twin, point] = -np.inf
+                    break
+                result[twin, point] += np.log(predictive_probability)
+                for state in range(state_count):
+                    belief[state] /= predictive_probability
+
+
+@_makes_no_arrays
+def _apply_block(
+    lists: PredecessorLists,
+    block: int,
+    control: int,
+    entries: Float,
+    lanes: tuple[int, int],
+    source: Float,
+    target: Float,
+) -> None:
+    """Fill `target` (S, L) with the numbers `source` (S, L) after one block of a transition.
+
+    `entries` (non-zeros, ...) are the probabilities of the lists, in the lanes from the first to
+    the end of `lanes`. The block is applied along the first axis of the joint state, which becomes
+    the last one, as in `apply_blocks`.
+    """
+    levels, first_row, start, predecessor, _, _ = lists
+    level_count = levels[block]
+    inner_count = np.uint64(len(source) // level_count)  # joint levels of the other blocks
+    first_lane, end_lane = lanes
+    lane_count = end_lane - first_lane
+    for level in range(level_count):
+        row = first_row[block] + control * level_count + level
+        first_entry = start[row]
+        for i in range(inner_count):
+            after = target[i * np.uint64(level_count) + np.uint64(level)]
+            if first_entry == start[row + 1]:
+                for lane in range(lane_count):
+                    after[lane] = 0.0
+            for k in range(first_entry, start[row + 1]):
+                before = source[predecessor[k] * inner_count + i]
+                probability = entries[k][first_lane:end_lane]
+                if k == first_entry:
+                    for lane in range(lane_count):
+                        after[lane] = before[lane] * probability[lane]
+                else:
+                    for lane in range(lane_count):
+                        after[lane] += before[lane] * probability[lane]
+
+
+@_makes_no_arrays
+def _apply_block_backward(
+    lists: PredecessorLists,
+    block: int,
+    control: int,
+    entries: Float,
+    lanes: tuple[int, int],
+    source: Float,
+    target: Float,
+) -> None:
+    """Fill `target` (S, L) with `source` (S, L) carried back through one block: its transpose."""
+    levels, first_row, start, predecessor, _, _ = lists
+    level_count = levels[block]
+    inner_count = np.uint64(len(source) // level_count)
+    first_lane, end_lane = lanes
+    lane_count = end_lane - first_lane
+    for state in range(len(target)):
+        for lane in range(lane_count):
+            target[state, lane] = 0.0
+    for level in range(level_count):
+        row = first_row[block] + control * level_count + level
+        for i in range(inner_count):
+            later = source[i * np.uint64(level_count) + np.uint64(level)]
+            for k in range(start[row], start[row + 1]):
+                earlier = target[predecessor[k] * inner_count + i]
+                probability = entries[k][first_lane:end_lane]
+                for lane in range(lane_count):
+                    earlier[lane] += later[lane] * probability[lane]
+
+
+class SubGrids(NamedTuple):
+    """The points of a tensor grid of K axes, and of its projections on every set of axes.
+
+    A set of axes is a number whose bit k says whether it has axis k; there are 2^K sets. The points
+    of a projection are lanes, the last axis varies fastest, and the last point is repeated until
+    their number is a multiple of `LANES_TOGETHER`.
+
+    Attributes
+    ----------
+    axes_of_control : (U,) array
+        The set of axes on which the transition under each control depends.
+    first : (2^K + 1,) array
+        The first lane of each set among the lanes of all sets.
+    stride : (2^K, K) array
+        By how many lanes of a set its next value of an axis is away; 0 if the set lacks the axis.
+    index_on_axis : (lanes of all sets, K) array
+        The index on each axis of each lane; 0 on axes that its set lacks.
+    entries : (non-zeros, lanes of all sets) array
+        The probabilities of the lists of predecessors.
+    """
+
+    axes_of_control: Index
+    first: Index
+    stride: Index
+    index_on_axis: Index
+    entries: Float
+
+
+@_makes_no_arrays
+def _lane_in(grids: SubGrids, axes: int, lane: int) -> int:
+    """Return the lane, among those of a set of axes, that has the indices of a lane of any set."""
+    result = 0
+    for k in range(grids.stride.shape[1]):
+        result += grids.stride[axes, k] * grids.index_on_axis[lane, k]
+    return result
+
+
+@_makes_no_arrays
+def _spread_lanes(
+    grids: SubGrids, axes: int, wider_axes: int, source: Float, target: Float
+) -> None:
+    """Fill `target` with the lanes of `source` (S, ...), repeated for a set of more axes."""
+    first = grids.first[wider_axes]
+    for lane in range(grids.first[wider_axes + 1] - first):
+        lane_before = _lane_in(grids, axes, first + lane)
+        for state in range(len(source)):
+            target[state, lane] = source[state, lane_before]
+
+
+@_makes_no_arrays
+def _cheapest_meeting(grids: SubGrids, control: Index, backward_lanes: Index) -> int:
+    """Return the step at which a forward and a backward pass meet with the least work.
+
+    Each pass has a lane for each point of the axes on which its own transitions depend. A fleet
+    whose twins change from one control to another once has two passes with one axis each, where a
+    forward pass alone would have two axes after the change. `backward_lanes` (T,) is work space.
+    """
+    steps = len(control)
+    axes = 0
+    backward_lanes[steps - 1] = 0
+    for t in range(steps - 1, 0, -1):
+        axes |= grids.axes_of_control[control[t - 1]]
+        backward_lanes[t - 1] = backward_lanes[t] + grids.first[axes + 1] - grids.first[axes]
+    axes = 0
+    forward_lanes = 0
+    meeting = 0
+    least_lanes = backward_lanes[0]
+    for t in range(1, steps):
+        axes |= grids.axes_of_control[control[t - 1]]
+        forward_lanes += grids.first[axes + 1] - grids.first[axes]
+        if forward_lanes + backward_lanes[t] <= least_lanes:
+            least_lanes = forward_lanes + backward_lanes[t]
+            meeting = t
+    return meeting
+
+
+@callable_when_compiled
+def _backward_to(
+    meeting: int,
+    lists: PredecessorLists,
+    grids: SubGrids,
+    control: Index,
+    likelihood: Float,
+    current: Float,
+    other: Float,
+) -> tuple[int, Float, Float]:
+    """Return the backward sums of a twin after a step: their set of axes, their array, the other.
+
+    The arguments are those of `evidence_on_grid` for one twin; `current` and `other` (S, L) are
+    work space.
+    """
+    state_count = likelihood.shape[1]
+    axes = 0
+    lanes = grids.first[1]
+    for state in range(state_count):
+        for lane in range(lanes):
+            current[state, lane] = 1.0
+    for t in range(len(control) - 1, meeting, -1):
+        control_in_force = control[t - 1]
+        axes_before = axes
+        axes |= grids.axes_of_control[control_in_force]
+        if axes != axes_before:
+            _spread_lanes(grids, axes_before, axes, current, other)
+            current, other = other, current
+        lanes_of_axes = (grids.first[axes], grids.first[axes + 1])
+        for state in range(state_count):
+            for lane in range(lanes_of_axes[1] - lanes_of_axes[0]):
+                current[state, lane] *= likelihood[t, state]
+        for block in range(len(lists.levels) - 1, -1, -1):
+            _apply_block_backward(
+                lists, block, control_in_force, grids.entries, lanes_of_axes, current, other
+            )
+            current, other = other, current
+    return axes, current, other
+
+
+@callable_when_compiled
+def _forward_to(
+    meeting: int,
+    prior: Float,
+    lists: PredecessorLists,
+    grids: SubGrids,
+    control: Index,
+    likelihood: Float,
+    current: Float,
+    other: Float,
+) -> tuple[int, Float, Float]:
+    """Return the forward sums of a twin up to a step, as `_backward_to` those after it."""
+    state_count = likelihood.shape[1]
+    axes = 0
+    lanes = grids.first[1]
+    for state in range(state_count):
+        for lane in range(lanes):
+            current[state, lane] = prior[state] * likelihood[0, state]
+    for t in range(1, meeting + 1):
+        control_in_force = control[t - 1]
+        axes_before = axes
+        axes |= grids.axes_of_control[control_in_force]
+        if axes != axes_before:
+            _spread_lanes(grids, axes_before, axes, current, other)
+            current, other = other, current
+        lanes_of_axes = (grids.first[axes], grids.first[axes + 1])
+        for block in range(len(lists.levels)):
+            _apply_block(
+                lists, block, control_in_force, grids.entries, lanes_of_axes, current, other
+            )
+            current, other = other, current
+        for state in range(state_count):
+            for lane in range(lanes_of_axes[1] - lanes_of_axes[0]):
+                current[state, lane] *= likelihood[t, state]
+    return axes, current, other
+
+
+@compiled
+def evidence_on_grid(
+    prior: Float,
+    lists: PredecessorLists,
+    grids: SubGrids,
+    control: Index,
+    likelihood: Float,
+    result: Float,
+) -> None:
+    """Fill `result` with the log evidence of B twins in T steps at the P points of a tensor grid.
+
+    With the forward sum a(s) over the courses of the state that end in state s of a step, and the
+    backward sum b(s) over their continuations, the evidence is the sum of a(s) b(s) over s.
+
+    Parameters
+    ----------
+    prior : (S,) array
+        The belief before the first step.
+    lists : PredecessorLists
+        The predecessors of the levels of each factor; their probabilities are not used.
+    grids : SubGrids
+        The grid.
+    control : (B, T) array
+        The control in force in each step.
+    likelihood : (B, T, S) array
+        The likelihood of the states in each step, divided by its largest value.
+    result : (B, P) array
+        To be filled: the log evidence.
+    """
+    twins, steps, state_count = likelihood.shape
+    all_axes = len(grids.first) - 2
+    most_lanes = grids.first[all_axes + 1] - grids.first[all_axes]
+    forward = np.empty((state_count, most_lanes))
+    backward = np.empty((state_count, most_lanes))
+    other = np.empty((state_count, most_lanes))
+    lane_sums = np.empty(steps, np.int64)
+    for twin in range(twins):
+        meeting = _cheapest_meeting(grids, control[twin], lane_sums)
+        backward_axes, backward, other = _backward_to(
+            meeting, lists, grids, control[twin], likelihood[twin], backward, other
+        )
+        forward_axes, forward, other = _forward_to(
+            meeting, prior, lists, grids, control[twin], likelihood[twin], forward, other
+        )
+        for point in range(result.shape[1]):
+            lane = grids.first[all_axes] + point
+            forward_lane = _lane_in(grids, forward_axes, lane)
+            backward_lane = _lane_in(grids, backward_axes, lane)
+            total = 0.0
+            for state in range(state_count):
+                total += forward[state, forward_lane] * backward[state, backward_lane]
+            result[twin, point] = np.log(total) if total > 0.0 else -np.inf
+
+
+@compiled
+def evidence_at_draws(
+    prior: Float,
+    lists: PredecessorLists,
+    entries: Float,
+    control: Index,
+    log_density: Float,
+    result: Float,
+    log_scale: Float,
+) -> None:
+    """Fill `result` with the log evidence of B twins in T steps for each of E draws.
+
+    The likelihood of a step and draw is divided by its largest value over the states; the log
+    evidence is `result` plus `log_scale`.
+
+    Parameters
+    ----------
+    prior : (S,) array
+        The belief before the first step.
+    lists : PredecessorLists
+        The predecessors of the levels of each factor; their probabilities are not used.
+    entries : (non-zeros, L) array
+        The probabilities of the entries of the lists, the same in all lanes; L is E, rounded up to
+        a multiple of `LANES_TOGETHER`.
+    control : (B, T) array
+        The control in force in each step.
+    log_density : (B, T, S, E) array
+        log p(o_t | D_t, u_t, e).
+    result, log_scale : (B, E) array
+        To be filled: the log evidence of the divided likelihoods, and the sum of the logarithms of
+        their largest values.
+    """
+    twins, steps, state_count, draws = log_density.shape
+    lanes = entries.shape[1]
+    blocks = len(lists.levels)
+    current = np.zeros((state_count, lanes))
+    other = np.zeros((state_count, lanes))
+    density = np.zeros(lanes)
+    largest = np.zeros(lanes)
+    mantissa = np.zeros(lanes)
+    power_bits = np.zeros(lanes, np.int64)
+    power = power_bits.view(np.float64)
+    for twin in range(twins):
+        for draw in range(draws):
+            log_scale[twin, draw] = 0.0
+        for t in range(steps):
+            if t > 0:
+                for block in range(blocks):
+                    _apply_block(
+                        lists, block, control[twin, t - 1], entries, (0, lanes), current, other
+                    )
+                    current, other = other, current
+            else:
+                for state in range(state_count):
+                    for lane in range(lanes):
+                        current[state, lane] = prior[state]
+            # The largest density; where no state is possible, any number serves.
+            for draw in range(draws):
+                largest[draw] = log_density[twin, t, 0, draw]
+            for state in range(1, state_count):
+                for draw in range(draws):
+                    value = log_density[twin, t, state, draw]
+                    largest[draw] = value if value > largest[draw] else largest[draw]
+            for draw in range(draws):
+                if largest[draw] == -np.inf:
+                    largest[draw] = 0.0
+                log_scale[twin, draw] += largest[draw]
+            # Times the likelihood.
+            for state in range(state_count):
+                for draw in range(draws):
+                    density[draw] = log_density[twin, t, state, draw]
+                fill_exponentials(density, largest, mantissa, power_bits)
+                for lane in range(lanes):
+                    current[state, lane] *= mantissa[lane] * power[lane]
+        for draw in range(draws):
+            total = 0.0
+            for state in range(state_count):
+                total += current[state, draw]
+            result[twin, draw] = np.log(total) if total > 0.0 else -np.inf

@@ -1,0 +1,221 @@
+"""The noise of the sensors of a fleet, learnt from some of its twins."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fe.runtime.errors import OutsideModelError
+from reporting.arrays import Float, Index
+from reporting.progress import SilentProgress
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.errors import FleetError
+from twin_master.fleet.checks import source_of
+from twin_master.fleet.evidence import (
+    TransitionFamily,
+    parameter_evidence,
+    scaled_likelihood,
+    transition_evidence,
+)
+from twin_master.fleet.evidence_tasks import with_all_transitions_possible
+from twin_master.fleet.posterior import Axes, Distribution, cell_probabilities, resolve_density
+from twin_master.fleet.reading import TwinsOfScenario
+from twin_master.fleet.stored_observations import ObservedTwins, StoredObservations
+from twin_master.mission.preparation import Knowledge
+from twin_master.network.sensor_model import GaussianSensorModel
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+NOISE_TWINS = 100
+"""Largest number of twins of a group from which the noise is learnt.
+
+They determine the factor on the noise to a few parts in a thousand.
+"""
+LARGEST_NOISE = 3.0
+"""Largest factor on the assumed noise that is considered; the smallest is its inverse."""
+NOISE_POINTS = 13
+"""Number of points of the grid of the factor on the noise."""
+NODES = 61
+"""Number of values of the calibrated parameter at which the evidence is computed."""
+NODE_DEVIATIONS = 6.0
+"""Distance of the first and the last of these values from the calibrated mean.
+
+The unit is the standard deviation of the calibration.
+"""
+
+
+@dataclass(frozen=True)
+class ParameterNodes:
+    """Values of the calibrated parameter at which the evidence of twins is computed.
+
+    Attributes
+    ----------
+    values : (E,) array
+        The equally spaced values.
+    prior : (E,) array
+        Their probabilities by the calibration, a normal distribution.
+    predicted : (E, S, U, G) array
+        The noise-free readings of the sensors for each value, state and control, in SI units.
+    """
+
+    values: Float
+    prior: Float
+    predicted: Float
+
+
+def parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> ParameterNodes | None:
+    """Return values of the calibrated parameter, with the readings that a model predicts for each.
+
+    Return None if the calibration has no uncertainty, or if the source of the readings cannot
+    compute them at chosen values of the parameter.
+
+    Raises
+    ------
+    FleetError
+        If some of the values are outside the range of the model.
+    """
+    knowledge = twins.knowledge
+    draws = knowledge.draws
+    if draws.standard_deviation <= 0.0:
+        return None
+    deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
+    values = draws.mean + draws.standard_deviation * deviations
+    prior = np.exp(-0.5 * deviations**2)
+    source = source_of(knowledge.scenario, is_real=is_real)
+    source.prepare(twins.folder, SilentProgress())
+    nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
+    try:
+        predicted_readings = source.observation_table(nodes, knowledge.model)
+    except OutsideModelError as error:
+        raise FleetError(
+            f"{error} `fleet learn` computes the readings at values of {draws.name} up to "
+            f"{NODE_DEVIATIONS:g} standard deviations from the mean of the calibration, which is "
+            f"{draws.mean:.4g} ± {draws.standard_deviation:.2g} here: give `[calibration]` a "
+            "smaller standard deviation, or a model with a wider range, and fly the fleet again."
+        ) from error
+    if len(predicted_readings) != NODES:  # a stored library of observations has fixed draws
+        return None
+    return ParameterNodes(values, prior / prior.sum(), predicted_readings)
+
+
+class _Flights(NamedTuple):
+    """The flights of B twins of one scenario, whose observations are in the store.
+
+    Attributes
+    ----------
+    knowledge : Knowledge
+        The knowledge that the twins share: model, policy and calibration draws.
+    store : StoredObservations
+        The observations of their group.
+    rows : (B,) array
+        The rows of the twins in the store, in ascending order.
+    """
+
+    knowledge: Knowledge
+    store: StoredObservations
+    rows: Index
+
+    def first_twins(self, count: int) -> "_Flights":
+        """Return the flights of the first twins."""
+        return self._replace(rows=self.rows[:count])
+
+    def blocks(self) -> Iterator[ObservedTwins]:
+        """Yield the observations of the twins, some twins at a time."""
+        return self.store.blocks(self.rows)
+
+
+def flights_by_scenario(
+    group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
+) -> list[_Flights]:
+    """Return the flights of the twins of a group that have flown, for each scenario."""
+    store = StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
+    return [_Flights(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
+
+
+def with_noise_factor(
+    model: GaussianSensorModel, factor: float, value_per_draw: Float | None = None
+) -> GaussianSensorModel:
+    """Return a copy of a sensor model with its noise multiplied by a factor.
+
+    Parameters
+    ----------
+    model : GaussianSensorModel
+        The model.
+    factor : float
+        The factor on the standard deviation of the noise.
+    value_per_draw : (E, S, U, G) array, optional
+        The noise-free readings at other values of the parameter; by default those of the model.
+    """
+    return type(model)(
+        model.value_per_draw if value_per_draw is None else value_per_draw,
+        model.standard_deviation * factor,
+        average="inside" if model.averages_inside else "outside",
+        model_error=model.model_error,
+        interval=model.interval,
+        **model.extra_arguments,
+    )
+
+
+def noise_factor(
+    flights_by_scenario: Sequence[_Flights],
+    family: TransitionFamily,
+    nodes: ParameterNodes | None,
+) -> Distribution:
+    """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
+
+    The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
+    it in each step separately would attribute a part of the noise to the parameter. With nodes, the
+    evidence of all steps is computed at each value first and averaged over the values then.
+    """
+    flights_of_first_twins = [
+        flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
+    ]
+
+    def log_likelihood(axes: Axes) -> Float:
+        log_evidence = [
+            _evidence_of_noise(flights_of_first_twins, family, nodes, factor)
+            for factor in np.exp(axes[0]).tolist()
+        ]
+        return np.array(log_evidence)
+
+    largest_log_factor = np.log(LARGEST_NOISE)
+    widest_axis = np.linspace(-largest_log_factor, largest_log_factor, NOISE_POINTS)
+    (axis,), values = resolve_density(log_likelihood, (widest_axis,))
+    return Distribution(axis, cell_probabilities(values), np.exp)
+
+
+def _evidence_of_noise(
+    flights_by_scenario: Sequence[_Flights],
+    family: TransitionFamily,
+    nodes: ParameterNodes | None,
+    factor: float,
+) -> float:
+    """Return the log evidence of twins for a factor on the noise.
+
+    Twins whose observations no course of states explains are left out.
+    """
+    probability = with_all_transitions_possible(family.assumed)
+    total_log_evidence = 0.0
+    for flights in flights_by_scenario:
+        value_per_draw = None if nodes is None else nodes.predicted
+        model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
+        for observed, control in flights.blocks():
+            if nodes is None:
+                likelihood = scaled_likelihood(model, observed, control)
+                at_point = transition_evidence(
+                    family, probability[None], likelihood.values, control
+                )
+                log_evidence = at_point[:, 0] + likelihood.log_scale
+            else:
+                at_nodes = parameter_evidence(family, probability, model, observed, control)
+                log_evidence = _average_over_nodes(at_nodes, nodes.prior)
+            total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
+    return total_log_evidence
+
+
+def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
+    """Return the log evidence of B twins averaged over E nodes, whose prior is given."""
+    largest = log_evidence.max(axis=1, keepdims=True)  # keeps the exponential from underflowing
+    return np.asarray(largest[:, 0] + np.log(np.exp(log_evidence - largest) @ prior))
