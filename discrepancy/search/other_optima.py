@@ -4,7 +4,7 @@ They have another magnitude of a single effect, another stretch of the structure
 covers, or another place of one effect of a set.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -14,10 +14,12 @@ from scipy.special import ndtr, ndtri
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, objective
+from discrepancy.fits.fitting import CandidateFit, objective, try_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.search_settings import SEARCH
+
+from .fitted_candidates import FittedCandidates
 
 LEAST_TAIL = 0.02
 """Prior probability that is left beyond a moved end of a stretch."""
@@ -77,6 +79,29 @@ def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Po
             valued_points.append((objective(problem, candidate, point), point))
     valued_points.sort(key=lambda valued_point: valued_point[0])
     return [point for _, point in valued_points[: SEARCH.most_restarts]]
+
+
+def refit_from_other_stretches(
+    candidates: FittedCandidates, on_progress: Callable[[str], None]
+) -> None:
+    """Fit the best set again from other stretches of the structure that its effect may cover.
+
+    The response has a kink where an end of a stretch passes a line of the mesh. A fit may end in an
+    optimum on the wrong side of a line, where the stretch seems to be known far better than it is.
+
+    Parameters
+    ----------
+    candidates : FittedCandidates
+        All candidates and their fits, to which the new ones are added.
+    on_progress : callable
+        The function to which progress is reported, as a line of text.
+    """
+    best_fit = candidates.best()
+    for point in points_at_other_stretches(best_fit):
+        on_progress(f"fitting {best_fit.candidate.description} from other stretches")
+        fit = try_fit(candidates.problem, best_fit.candidate, point)
+        if fit is not None:
+            candidates.record_fit(fit, exact=True)
 
 
 def points_at_other_stretches(fit: CandidateFit) -> list[Point]:

@@ -26,14 +26,9 @@ from discrepancy.missing_force.hypotheses import can_estimate_forces
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
+from . import other_optima
 from .fitted_candidates import FittedCandidates
 from .free_shapes import fits_of_free_shape
-from .other_optima import (
-    canonical_relatives,
-    points_at_other_magnitudes,
-    points_at_other_stretches,
-    sets_at_other_places,
-)
 from .starts import (
     FitStart,
     OnProgress,
@@ -340,7 +335,7 @@ class Search(FittedCandidates):
             self.fit_pairs()
         self.move_effects()
         self.drop_effects()
-        self.refit_from_other_stretches()
+        other_optima.refit_from_other_stretches(self, self.on_progress)
         self.refine_time_steps()
 
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
@@ -405,11 +400,11 @@ class Search(FittedCandidates):
         if self._is_in_optimum_of_estimate(leading_fit):
             return
         (leading_term,) = leading_fit.candidate.terms
-        for hypothesis in canonical_relatives(leading_term, self.force_hypotheses):
+        for hypothesis in other_optima.canonical_relatives(leading_term, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
             start = force_search.point_with_effects(hypothesis)
-            for point in points_at_other_magnitudes(self.problem, candidate, start):
+            for point in other_optima.points_at_other_magnitudes(self.problem, candidate, start):
                 fit = try_fit(self.problem, candidate, point)
                 if fit is None:
                     continue
@@ -495,7 +490,9 @@ class Search(FittedCandidates):
         best_fit = self.best()
         while len(best_fit.candidate.terms) > 1 and self.is_unexplained():
             objective_limit = best_fit.objective + SEARCH.largest_rough_deficit
-            for candidate in sets_at_other_places(best_fit.candidate, self.problem.setting):
+            for candidate in other_optima.sets_at_other_places(
+                best_fit.candidate, self.problem.setting
+            ):
                 if candidate.key in self.exact_fits:
                     continue
                 fit = try_fit(
@@ -506,20 +503,6 @@ class Search(FittedCandidates):
             if self.best() is best_fit:
                 break
             best_fit = self.best()
-
-    def refit_from_other_stretches(self) -> None:
-        """Fit the best set again from other stretches of the structure that its effect may cover.
-
-        The response has a kink where an end of a stretch passes a line of the mesh. A fit may end
-        in an optimum on the wrong side of a line, where the stretch seems to be known far better
-        than it is.
-        """
-        best_fit = self.best()
-        for point in points_at_other_stretches(best_fit):
-            self.on_progress(f"fitting {best_fit.candidate.description} from other stretches")
-            fit = try_fit(self.problem, best_fit.candidate, point)
-            if fit is not None:
-                self.record_fit(fit, exact=True)
 
     def drop_effects(self) -> None:
         """Drop one effect at a time from the best set, as long as the score rises.
