@@ -9,15 +9,17 @@ import sys
 import time
 from importlib import metadata
 
-import jax
 import numpy as np
-from dynamax.hidden_markov_model import hmm_two_filter_smoother
 
 REPEATS = 7
 
 
 def main(problem_file: str, posterior_file: str) -> None:
     """Read a problem, smooth all its sequences on one core, and write the posterior."""
+    # imported here, so that the module can be imported where dynamax is not installed
+    import jax
+    from dynamax.hidden_markov_model import hmm_two_filter_smoother
+
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     with np.load(problem_file) as problem:
         prior, transitions = (
