@@ -547,7 +547,7 @@ def _change_over_substeps(
 
 
 def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the changes of a state over steps by a unit input to its rate.
+    """Return how much a unit input, added to the rate of a state, changes the state over a step.
 
     The input is linear over the step. The matrices follow from one exponential of the system with
     the input and its rate as further states (Van Loan 1978, IEEE Transactions on Automatic Control

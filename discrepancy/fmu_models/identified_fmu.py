@@ -401,9 +401,10 @@ class IdentifiedFmu(FmuRuns):
     def choose_step(self, trial: Trial, state: OperatingPoint) -> StepChoice:
         """Return the angular frequency of the FMU's first mode, and the step for a trial.
 
-        Both may be given in the model's file. The first mode is otherwise the one with the largest
-        flexibility at the first port; without a port, the one with the highest peak in the
-        spectrum. The step is otherwise an integer fraction of the sampling interval.
+        Both may be given in the model's file. If the file gives no frequency, the first mode is the
+        one with the largest flexibility at the first port; without a port, the one with the highest
+        peak in the spectrum. If it gives no step, the step is an integer fraction of the sampling
+        interval.
         """
         interval = trial.interval
         system, excitation, steps_per_sample = self._system_that_shows_all_modes(

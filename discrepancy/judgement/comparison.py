@@ -326,7 +326,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return whether a hypothesis may replace the best one because it is simpler.
 
         Its families must be among those of the best one, it must explain nearly the same share of
-        the gap, and it must be one that may be named.
+        the gap, and nothing must speak against naming it.
         """
         if not option.candidate.terms or _complexity(option) >= _complexity(best_hypothesis):
             return False

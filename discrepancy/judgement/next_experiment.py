@@ -228,7 +228,8 @@ def _reduce_dimensions(
 
     The subspace is spanned by the differences of the means and by the rows of the factors of the
     covariances. Along all other directions of the space of readings, every hypothesis predicts the
-    same noise, so that these directions do not separate the hypotheses.
+    same noise, so that these directions do not separate the hypotheses. The means that are returned
+    are relative to the mean over all hypotheses.
 
     Parameters
     ----------

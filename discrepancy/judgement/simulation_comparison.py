@@ -110,12 +110,15 @@ class SimulationComparison(Comparison[CandidateFit]):
         )
 
     def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[_BlockSums]:
-        """Return the sums over each block of a trial's samples.
+        """Return squared residuals before and after, and counts, summed over blocks of samples.
+
+        Residuals are divided by the deviation of their noise. Both trials use the same readings.
 
         Parameters
         ----------
         trial_before, trial_after : FittedTrial
-            The trial with its residuals without effect, and with those of a hypothesis.
+            The trial with the residuals of the model without effect, and with the residuals of a
+            hypothesis.
         """
         is_used = trial_before.used
         noise_scales = np.array([self._noise_scales[name] for name in trial_before.trial.channels])

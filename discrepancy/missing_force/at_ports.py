@@ -128,8 +128,8 @@ class MissingForces:
         """Return the prior medians of missing forces, by the number of the port.
 
         The median standard deviation is 5 % of the elastic force at the port. The median
-        correlation time is that of one radian of the vibration, or the duration of the trials if
-        the port has no frequency.
+        correlation time is the time in which the vibration advances by one radian, or the duration
+        of the trials if the port has no frequency.
 
         Parameters
         ----------

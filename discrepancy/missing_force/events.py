@@ -168,7 +168,9 @@ class EventSearch(EventTrials):
 
 
 def _improved_path(record: SwitchedRecord, path: BoolArray) -> BoolArray:
-    """Return a path with its changes at the most probable samples, no stretch better inverted.
+    """Return a path that neither moving its changes nor inverting a stretch makes more probable.
+
+    The number of inversions is limited, as each one may be undone later.
 
     Parameters
     ----------

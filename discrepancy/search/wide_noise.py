@@ -320,8 +320,8 @@ def refit_under_wide_noise(
 ) -> CandidateFit | None:
     """Return the fit of a hypothesis under a wider noise.
 
-    Its point, evidence and covariance are those under the wider noise. Its residuals are relative
-    to the recorded noise, and its residual process is that of these residuals.
+    Point, evidence and covariance come from the fit under the wider noise. The residuals are those
+    at this point relative to the recorded noise, and the residual process describes them.
 
     Parameters
     ----------

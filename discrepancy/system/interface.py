@@ -349,11 +349,11 @@ class Model(ABC):
     def respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the true response of a trial, before sensors; those of the patch are ignored.
+        """Return the true response of a trial, before any sensor. Sensors in the patch are ignored.
 
         Where an output is wanted as a velocity or acceleration, it is differentiated in time; as a
-        signal, it is returned unchanged. A model with a response cache returns equal responses from
-        there.
+        signal, it is returned unchanged. A model with a response cache answers a repeated request
+        from there.
 
         Parameters
         ----------
