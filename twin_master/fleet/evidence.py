@@ -17,7 +17,6 @@ from twin_master.fleet.evidence_kernels import (
     LANES_TOGETHER,
     LEAST_EVIDENCE,
     SubGrids,
-    evidence_at_draws,
     evidence_at_points,
     evidence_on_grid,
 )
@@ -29,8 +28,6 @@ from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
 
 _LEARNABLE_KIND = "independent_worsening"
-VALUES_TOGETHER = 300_000
-"""Log densities of draws that are in memory at the same time at most, 2.4 MB."""
 
 
 def reason_transitions_are_fixed(scenario: Scenario) -> str:
@@ -211,9 +208,9 @@ class ScaledLikelihood(NamedTuple):
 
     Attributes
     ----------
-    values : (B, T, S) array
+    values : (B, ..., T, S) array
         p(o_t | D_t, u_t) divided by its largest value over the S states, for each step t.
-    log_scale : (B,) array
+    log_scale : (B, ...) array
         The sum over the steps of the logarithms of these largest values.
     """
 
@@ -238,13 +235,13 @@ def scaled_likelihood(
     twin_count, step_count = control.shape
     all_steps = observations.reshape(-1, observations.shape[-1])
     log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
-    return _scaled(log_likelihood.reshape(twin_count, step_count, -1))
+    return scaled(log_likelihood.reshape(twin_count, step_count, -1))
 
 
-def _scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return likelihoods (twins, steps, states) over the largest of each step, from logs."""
-    largest = log_likelihood.max(axis=2, keepdims=True)
-    return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
+def scaled(log_likelihood: Float) -> ScaledLikelihood:
+    """Return likelihoods (..., T, S) over the largest of each step, from their logarithms."""
+    largest = log_likelihood.max(axis=-1, keepdims=True)
+    return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(-2, -1)))
 
 
 def transition_evidence(
@@ -320,7 +317,7 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
     Parameters
     ----------
     family : TransitionFamily
-        The transitions as a function of K probabilities, at least one.
+        The transitions as a function of K probabilities.
     axes : tuple of (N,) array
         The values of each probability, between 0 and 1.
     likelihood : (B, T, S) array
@@ -334,6 +331,8 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
         The log evidence, the last axis varies fastest; -inf if the observations of a twin are
         impossible.
     """
+    if not axes:  # the transitions are not learnt: the grid has a single point without coordinates
+        return transition_evidence(family, np.empty((1, 0)), likelihood, control)
     result = np.empty((len(control), math.prod(len(axis) for axis in axes)))
     grids = sub_grids(family, axes)
     evidence_on_grid(family.prior, family.lists, grids, control, likelihood, result)
@@ -344,86 +343,3 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
             family, points, likelihood[is_improbable], control[is_improbable]
         )
     return result
-
-
-def parameter_evidence(
-    family: TransitionFamily,
-    probability: Float,
-    model: GaussianSensorModel,
-    observations: Float,
-    control: Index,
-) -> Float:
-    """Return the log evidence of B twins for E values of a parameter that is constant in time.
-
-    For each value the likelihood of all steps is computed with this value.
-
-    Parameters
-    ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
-    probability : (K,) array
-        The probabilities to worsen.
-    model : GaussianSensorModel
-        The model of the G sensors; its E draws are the values of the parameter.
-    observations : (B, T, G) array
-        The observations in SI units; NaN where one was lost.
-    control : (B, T) array
-        The control in force in each step.
-
-    Returns
-    -------
-    (B, E) array
-        The log evidence; -inf if the observations of a twin are impossible.
-    """
-    twin_count, step_count = control.shape
-    lanes = model.draw_count + -model.draw_count % LANES_TOGETHER
-    entries = np.repeat(family.entries(probability[None]).T, lanes, axis=1)
-    result = np.empty((twin_count, model.draw_count))
-    log_scale = np.empty_like(result)
-    values_of_twin = max(1, step_count * model.state_count * model.draw_count)
-    twins_together = max(1, VALUES_TOGETHER // values_of_twin)
-    for first in range(0, twin_count, twins_together):
-        twins = slice(first, first + twins_together)
-        all_steps = observations[twins].reshape(-1, observations.shape[-1])
-        log_density = model.log_density_of_draws(all_steps, control[twins].ravel())
-        log_density = log_density.reshape(-1, step_count, model.state_count, model.draw_count)
-        evidence_at_draws(
-            family.prior,
-            family.lists,
-            entries,
-            control[twins],
-            log_density,
-            result[twins],
-            log_scale[twins],
-        )
-        is_improbable = ~(result[twins] > LEAST_EVIDENCE).all(axis=1)
-        for twin in np.flatnonzero(is_improbable).tolist():
-            exact = _evidence_of_draws(
-                family, probability, log_density[twin], control[first + twin]
-            )
-            result[first + twin], log_scale[first + twin] = exact
-    return result + log_scale
-
-
-def _evidence_of_draws(
-    family: TransitionFamily, probability: Float, log_density: Float, control: Index
-) -> tuple[Float, Float]:
-    """Return what `evidence_at_draws` fills in for one twin, with a belief that is divided.
-
-    Parameters
-    ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
-    probability : (K,) array
-        The probabilities to worsen.
-    log_density : (T, S, E) array
-        log p(o_t | D_t, u_t, e).
-    control : (T,) array
-        The control in force in each step.
-    """
-    log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
-    # The E draws take the place of twins: all have the same controls.
-    likelihood = _scaled(log_density_by_draw)
-    control_of_draws = np.tile(control, (len(log_density_by_draw), 1))
-    evidence = transition_evidence(family, probability[None], likelihood.values, control_of_draws)
-    return evidence[:, 0], likelihood.log_scale

@@ -8,12 +8,11 @@ workers.
 import pickle
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from reporting.files import hash_record
@@ -21,12 +20,11 @@ from reporting.progress import Progress
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import TaskPool
-from twin_master.fleet.evidence import (
-    TransitionFamily,
-    grid_evidence,
+from twin_master.fleet.evidence import TransitionFamily
+from twin_master.fleet.parameter_evidence import (
+    averaged_likelihood,
+    likelihood_at_nodes,
     parameter_evidence,
-    scaled_likelihood,
-    transition_evidence,
 )
 from twin_master.fleet.posterior import Axes
 from twin_master.fleet.store import open_group
@@ -97,7 +95,7 @@ class FlightsOfScenario(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """Twins of one scenario in successive rows, and what is asked of them.
+    """Twins of one scenario in successive rows.
 
     Attributes
     ----------
@@ -107,31 +105,25 @@ class _Task(NamedTuple):
         Their rows in the store.
     observed : sequence of ObservedTwins or None
         Their observations; None if the process that computes reads them itself.
-    grids : tuple of Axes or None
-        Grids of the K probabilities to worsen on which the log likelihood is asked for.
-    probability : (K,) array or None
-        Probabilities at which the log evidence of each draw of the sensor model is asked for.
     """
 
     kit: bytes
     rows: Index
     observed: Sequence[ObservedTwins] | None = None
-    grids: tuple[Axes, ...] | None = None
-    probability: Float | None = None
 
 
-class GridSums(NamedTuple):
-    """The log likelihood of twins on grids.
+class GridSum(NamedTuple):
+    """The log likelihood of twins on a grid.
 
     Attributes
     ----------
-    log_likelihood : list of (N, ..., N) array
-        The sum over the twins whose observations are possible, on each grid.
+    log_likelihood : (N, ..., N) array
+        The sum over the twins whose observations are possible.
     explained : int
         The number of these twins.
     """
 
-    log_likelihood: list[Float]
+    log_likelihood: Float
     explained: int
 
 
@@ -170,38 +162,44 @@ def _observed_twins(task: _Task) -> Sequence[ObservedTwins] | Iterator[ObservedT
     return None if stored is None else stored.blocks(task.rows)
 
 
-def _grid_sums(task: _Task) -> GridSums | None:
-    """Return the log likelihood of the twins of a task; None if their observations are missing."""
+def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
+    """Return the log likelihood of the twins of a task; None if their observations are missing.
+
+    The arguments are those of `GroupEvidence.grid_sum`.
+    """
     blocks = _observed_twins(task)
     if blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
-    point = with_all_transitions_possible(kit.family.assumed)[None]
-    totals = [np.zeros([len(axis) for axis in axes]) for axes in task.grids or ()]
+    centre = np.array([axis[len(axis) // 2] for axis in axes])
+    probability = with_all_transitions_possible(centre)
+    total = np.zeros([len(axis) for axis in axes])
     explained = 0
     for observed, control in blocks:
-        likelihood = scaled_likelihood(kit.sensor_model, observed, control).values
-        at_point = transition_evidence(kit.family, point, likelihood, control)  # (twins, 1)
-        is_explained: NDArray[np.bool_] = np.isfinite(at_point[:, 0])
-        explained += int(is_explained.sum())
-        for total, axes in zip(totals, task.grids or (), strict=True):
-            log_evidence = grid_evidence(
-                kit.family, axes, likelihood[is_explained], control[is_explained]
+        if prior is None:
+            likelihood = averaged_likelihood(
+                kit.family, probability, kit.sensor_model, observed, control
             )
-            total += log_evidence.sum(axis=0).reshape(total.shape)
-    return GridSums(totals, explained)
+        else:
+            likelihood = likelihood_at_nodes(
+                kit.family, probability, prior, kit.sensor_model, observed, control
+            )
+        log_evidence = likelihood.evidence_on_grid(kit.family, axes)
+        total += log_evidence.sum(axis=0).reshape(total.shape)
+        explained += len(log_evidence)
+    return GridSum(total, explained)
 
 
-def _evidence_of_draws(task: _Task) -> Float | None:
+def _evidence_of_draws(task: _Task, probability: Float) -> Float | None:
     """Return the log evidence (B, E) of the twins of a task; None without their observations."""
     blocks = _observed_twins(task)
-    if blocks is None or task.probability is None:
+    if blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
     rows = []
     for observed, control in blocks:
         rows.append(
-            parameter_evidence(kit.family, task.probability, kit.sensor_model, observed, control)
+            parameter_evidence(kit.family, probability, kit.sensor_model, observed, control)
         )
     return np.concatenate(rows)
 
@@ -234,26 +232,37 @@ class GroupEvidence:
         self._progress = progress
         self._sends_observations = False
 
-    def grid_sums(self, grids: tuple[Axes, ...], blocks_apart: int = 1) -> GridSums:
-        """Return the log likelihood of the probabilities to worsen on grids, in one reading.
+    @property
+    def twin_count(self) -> int:
+        """The number of twins."""
+        return sum(len(rows) for _, rows in self._flights)
+
+    def of_some_twins(self, blocks_apart: int) -> "GroupEvidence":
+        """Return the evidence of the twins in one block of `BLOCK_TWINS` in so many."""
+        flights = []
+        for kit, rows in self._flights:
+            block = np.arange(len(rows)) // BLOCK_TWINS
+            is_chosen = block % blocks_apart == 0
+            flights.append(FlightsOfScenario(kit, rows[is_chosen]))
+        return GroupEvidence(self._pool, self._group, flights, self._progress)
+
+    def grid_sum(self, axes: Axes, prior: Float | None) -> GridSum:
+        """Return the log likelihood of the probabilities to worsen on a grid.
 
         Parameters
         ----------
-        grids : tuple of Axes
-            The grids, axes of probabilities.
-        blocks_apart : int
-            With a number above 1 the sum is over one block of twins in so many.
+        axes : tuple of (N,) array
+            The values of each probability.
+        prior : (E,) array or None
+            The probability of each draw of the sensor model, which holds in all steps; if it is
+            None, the likelihood is averaged over the draws in each step anew.
         """
-        total = GridSums([np.zeros([len(axis) for axis in axes]) for axes in grids], 0)
-        questions = self._tasks(blocks_apart, grids=grids)
-        twin_count = sum(len(_some_blocks(rows, blocks_apart)) for _, rows in self._flights)
-        for sums in self._answers(_grid_sums, questions, twin_count):
-            for total_on_grid, sum_on_grid in zip(
-                total.log_likelihood, sums.log_likelihood, strict=True
-            ):
-                total_on_grid += sum_on_grid
-            total = total._replace(explained=total.explained + sums.explained)
-        return total
+        log_likelihood = np.zeros([len(axis) for axis in axes])
+        explained = 0
+        for part in self._answers(partial(_grid_sum, axes=axes, prior=prior)):
+            log_likelihood += part.log_likelihood
+            explained += part.explained
+        return GridSum(log_likelihood, explained)
 
     def evidence_of_draws(self, probability: Float) -> Iterator[Float]:
         """Yield the log evidence (B, E) of all twins for each draw, some twins at a time.
@@ -263,32 +272,18 @@ class GroupEvidence:
         probability : (K,) array
             The probabilities to worsen.
         """
-        tasks = self._tasks(1, probability=probability)
-        twin_count = sum(len(rows) for _, rows in self._flights)
-        yield from self._answers(_evidence_of_draws, tasks, twin_count)
+        yield from self._answers(partial(_evidence_of_draws, probability=probability))
 
-    def _tasks(
-        self,
-        blocks_apart: int,
-        *,
-        grids: tuple[Axes, ...] | None = None,
-        probability: Float | None = None,
-    ) -> Iterator[_Task]:
-        """Yield the tasks of all twins, or of those in one block of the store in so many."""
+    def _tasks(self) -> Iterator[_Task]:
+        """Yield the tasks of all twins."""
         for kit, rows in self._flights:
-            chosen_rows = _some_blocks(rows, blocks_apart)
-            number = chosen_rows // TASK_TWINS
-            for rows_of_task in np.split(chosen_rows, np.flatnonzero(np.diff(number)) + 1):
+            number = rows // TASK_TWINS
+            for rows_of_task in np.split(rows, np.flatnonzero(np.diff(number)) + 1):
                 if len(rows_of_task):
-                    yield _Task(kit, rows_of_task, grids=grids, probability=probability)
+                    yield _Task(kit, rows_of_task)
 
-    def _answers(
-        self,
-        function: Callable[[_Task], _Answer | None],
-        tasks: Iterator[_Task],
-        twin_count: int,
-    ) -> Iterator[_Answer]:
-        """Yield the results of tasks, in their order; they have so many twins in all.
+    def _answers(self, function: Callable[[_Task], _Answer | None]) -> Iterator[_Answer]:
+        """Yield the results of all tasks, in their order.
 
         Workers read the observations themselves if they see the folder of the fleet. From the first
         one on that does not, this process sends the observations with the tasks.
@@ -296,12 +291,12 @@ class GroupEvidence:
         unanswered: deque[_Task] = deque()
 
         def tasks_to_send() -> Iterator[_Task]:
-            for task in tasks:
+            for task in self._tasks():
                 unanswered.append(task)
                 yield _with_observations(task) if self._sends_observations else task
 
         title = f"Learning from {self._group}"
-        with self._progress.stage(title, total=twin_count, unit="twins") as stage:
+        with self._progress.stage(title, total=self.twin_count, unit="twins") as stage:
             for answer in self._pool.results(function, tasks_to_send()):
                 task = unanswered.popleft()
                 if answer is None:
@@ -310,12 +305,6 @@ class GroupEvidence:
                 if answer is not None:
                     yield answer
                 stage.advance(len(task.rows))
-
-
-def _some_blocks(rows: Index, blocks_apart: int) -> Index:
-    """Return the rows (B,) that are in one block of the store in so many."""
-    chosen: Index = rows[(rows // BLOCK_TWINS) % blocks_apart == 0]
-    return chosen
 
 
 def _with_observations(task: _Task) -> _Task:

@@ -16,6 +16,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_record
 from reporting.json_file import JsonObject
 from reporting.progress import Progress, SilentProgress
+from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
@@ -28,7 +29,6 @@ from twin_master.fleet.evidence_tasks import (
     FlightsOfScenario,
     GroupEvidence,
 )
-from twin_master.fleet.grid_search import GridSearch
 from twin_master.fleet.lessons import LESSONS_NAME, write_learnt
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.noise import (
@@ -42,6 +42,8 @@ from twin_master.fleet.posterior import (
     Axes,
     Distribution,
     LikelihoodGrid,
+    PopulationPosterior,
+    likelihood_grid,
     logistic,
     population_posterior,
     shared_posterior,
@@ -49,16 +51,21 @@ from twin_master.fleet.posterior import (
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.row_file import RowFile
 from twin_master.fleet.store import check_installed, flown_rows, open_group
-from twin_master.fleet.store_layout import BLOCK_TWINS, row_blocks, stored_values
+from twin_master.fleet.store_layout import row_blocks, stored_values
 from twin_master.run_folder import to_json
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_LEAST_BLOCKS_APART = 16
-_EXPECTING_TWINS = 16_384
-"""The first grids are expected by one block of twins in 16, or by about 16,384 twins."""
+_FIRST_TWINS = 512
+_MOST_BLOCKS_APART = 16
+"""All is learnt from 512 twins first, or from one in 16 if these are more."""
+_FIRST_ROUNDS = 2
+"""How often probabilities and population are learnt from the first twins, by turns.
+
+The second time, the probabilities are off by less than a hundredth of their standard deviation.
+"""
 _TWINS_WORTH_WORKERS = 10_000
 """The smallest number of twins of a fleet that is worth worker processes."""
 _MEMBERS_TOGETHER = 1024
@@ -310,10 +317,9 @@ class _FlownGroup:
     reading: str
 
     def learn(self, pool: TaskPool, progress: Progress) -> _GroupLessons:
-        """Learn from the twins.
+        """Learn from the twins: the noise, the probabilities to worsen, and the population.
 
-        The noise is learnt first, because the likelihoods for the other two need it; then the
-        probabilities to worsen, and then the distribution of the calibrated parameter.
+        The noise is learnt first, because the likelihoods for the other two need it.
         """
         scenario = self.twins_by_scenario[0].knowledge.scenario
         family = _transition_family(scenario)
@@ -327,76 +333,126 @@ class _FlownGroup:
             noise = noise_factor(
                 flights_by_scenario(self.group, self.twins_by_scenario), family, nodes
             )
-        flights = [self._flights(twins, family, noise.mean) for twins in self.twins_by_scenario]
-        grid, twin_count = _probability_grid(
-            family, GroupEvidence(pool, name, flights, progress), self._flown_count
+        growth_nodes = None if nodes is None else nodes.every_second
+        growth, population = self._growth_and_population(
+            self._evidence(family, noise.mean, growth_nodes, pool, progress),
+            self._evidence(family, noise.mean, nodes, pool, progress),
+            family,
+            nodes,
         )
-        if not twin_count:
+        if not growth.twin_count:
             raise FleetError(
                 f"no state of the twins explains what was observed in group {name}: nothing can be "
                 "learnt from it; check its model and its noise."
             )
         counts = _counts(self.group, scenario.control_names)
         lessons: JsonObject = {
-            "twins": twin_count,
-            "left_out": self._flown_count - twin_count,
+            "twins": growth.twin_count,
+            "left_out": self._flown_count - growth.twin_count,
             "alarmed": counts.alarmed,
             "noise_factor": noise.summary,
         }
         if family.reason_fixed:
             lessons["transitions_kept_because"] = family.reason_fixed
-        if nodes is not None:
-            (twins,) = self.twins_by_scenario
-            at_nodes = [self._flights(twins, family, noise.mean, nodes.predicted)]
-            evidence = GroupEvidence(pool, name, at_nodes, progress)
-            lessons["population"] = self._population(evidence, family, grid, nodes)
-        return _GroupLessons(family, grid, counts.followed_controls, lessons)
+        if population is not None:
+            lessons["population"] = {
+                "parameter": self._draws.name,
+                "mean": population.mean.summary,
+                "spread": population.deviation.summary,
+            }
+        return _GroupLessons(family, growth.grid, counts.followed_controls, lessons)
 
     @property
     def _flown_count(self) -> int:
         """The number of twins that have flown."""
         return sum(len(twins.rows) for twins in self.twins_by_scenario)
 
-    def _flights(
+    @property
+    def _draws(self) -> ParameterDraws:
+        """The draws of the calibrated parameter."""
+        return self.twins_by_scenario[0].knowledge.draws
+
+    def _evidence(
         self,
-        twins: TwinsOfScenario,
         family: TransitionFamily,
         noise_factor: float,
-        value_per_draw: Float | None = None,
-    ) -> FlightsOfScenario:
-        """Return the flights of the twins of a scenario, with what their evidence needs.
+        nodes: ParameterNodes | None,
+        pool: TaskPool,
+        progress: Progress,
+    ) -> GroupEvidence:
+        """Return the evidence of the twins, computed by the processes of a pool.
 
         Parameters
         ----------
-        twins : TwinsOfScenario
-            The twins.
         family : TransitionFamily
             The transitions.
         noise_factor : float
             The factor on the assumed noise.
-        value_per_draw : (E, S, U, G) array, optional
-            The noise-free readings at other values of the parameter; by default those of the model.
+        nodes : ParameterNodes or None
+            The values of the calibrated parameter; with None the draws of each twin's calibration.
+        pool : TaskPool
+            The processes.
+        progress : Progress
+            Shows how far a reading of all twins has come.
         """
-        kit = EvidenceKit(
-            folder=str(self.folder.absolute()),
-            fleet_hash=self.fleet_hash,
-            group=self.record["name"],
-            reading=self.reading,
-            family=family,
-            sensor_model=with_noise_factor(
-                twins.knowledge.sensor_model, noise_factor, value_per_draw
-            ),
-        )
-        return FlightsOfScenario(pickle.dumps(kit, pickle.HIGHEST_PROTOCOL), twins.rows)
+        value_per_draw = None if nodes is None else nodes.predicted
+        flights = []
+        for twins in self.twins_by_scenario:
+            kit = EvidenceKit(
+                folder=str(self.folder.absolute()),
+                fleet_hash=self.fleet_hash,
+                group=self.record["name"],
+                reading=self.reading,
+                family=family,
+                sensor_model=with_noise_factor(
+                    twins.knowledge.sensor_model, noise_factor, value_per_draw
+                ),
+            )
+            packed_kit = pickle.dumps(kit, pickle.HIGHEST_PROTOCOL)
+            flights.append(FlightsOfScenario(packed_kit, twins.rows))
+        return GroupEvidence(pool, self.record["name"], flights, progress)
+
+    def _growth_and_population(
+        self,
+        growth_evidence: GroupEvidence,
+        population_evidence: GroupEvidence,
+        family: TransitionFamily,
+        nodes: ParameterNodes | None,
+    ) -> tuple["_Growth", PopulationPosterior | None]:
+        """Learn the probabilities to worsen, and the population of the parameter if it has nodes.
+
+        Each is learnt given the other. It is begun with some twins, by turns, and their results are
+        the first grid and the prior of the parameter for all twins.
+        """
+        blocks_apart = growth_evidence.twin_count // _FIRST_TWINS
+        blocks_apart = min(max(blocks_apart, 1), _MOST_BLOCKS_APART)
+        rounds = [blocks_apart] * (1 if nodes is None else _FIRST_ROUNDS)
+        if blocks_apart > 1:
+            rounds.append(1)
+        first_axes = None
+        population = None
+        prior = None if nodes is None else nodes.every_second.prior
+        for blocks_apart in rounds:
+            some_twins = growth_evidence.of_some_twins(blocks_apart)
+            growth = _growth(family, some_twins, prior, first_axes)
+            if growth.grid is not None:
+                first_axes = growth.grid.axes
+            if nodes is not None and growth.twin_count:
+                population = self._population(
+                    population_evidence.of_some_twins(blocks_apart),
+                    growth.mean_probability(family),
+                    nodes,
+                )
+                prior = population.prior_of_member(nodes.every_second.values)
+        return growth, population
 
     def _population(
         self,
         evidence: GroupEvidence,
-        family: TransitionFamily,
-        grid: LikelihoodGrid | None,
+        probability: Float,
         nodes: ParameterNodes,
-    ) -> JsonObject:
-        """Return the record of the population of the calibrated parameter in the group.
+    ) -> PopulationPosterior:
+        """Return the population of the calibrated parameter.
 
         The log evidence of the twins is read several times. It is kept in a temporary file, because
         that of many twins would not fit in memory.
@@ -405,29 +461,17 @@ class _FlownGroup:
         ----------
         evidence : GroupEvidence
             The evidence of the twins at the values of the parameter.
-        family : TransitionFamily
-            The transitions.
-        grid : LikelihoodGrid or None
-            The likelihood of the probabilities to worsen, whose posterior means are used; the
-            assumed ones if it is None.
+        probability : (K,) array
+            The probabilities to worsen.
         nodes : ParameterNodes
             The values of the parameter.
         """
-        probability = family.assumed
-        if grid is not None:
-            probability = np.array([marginal.mean for marginal in grid.marginals])
-        draws = self.twins_by_scenario[0].knowledge.draws
         with RowFile(
             self.folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER
         ) as log_evidence:
             for rows in evidence.evidence_of_draws(probability):
                 log_evidence.append(rows)
-            population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
-        return {
-            "parameter": draws.name,
-            "mean": population.mean.summary,
-            "spread": population.deviation.summary,
-        }
+            return population_posterior(nodes.values, log_evidence, self._draws.standard_deviation)
 
 
 def _transition_family(scenario: Scenario) -> TransitionFamily:
@@ -467,7 +511,7 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
     return _GroupCounts(alarmed, followed_controls)
 
 
-class _GridOfTwins(NamedTuple):
+class _Growth(NamedTuple):
     """The likelihood of the probabilities to worsen given the observations of twins.
 
     Attributes
@@ -482,49 +526,48 @@ class _GridOfTwins(NamedTuple):
     grid: LikelihoodGrid | None
     twin_count: int
 
+    def mean_probability(self, family: TransitionFamily) -> Float:
+        """Return the posterior means of the probabilities (K,), or the assumed ones."""
+        if self.grid is None:
+            return family.assumed
+        return np.array([marginal.mean for marginal in self.grid.marginals])
 
-def _probability_grid(
-    family: TransitionFamily, evidence: GroupEvidence, flown_count: int
-) -> _GridOfTwins:
+
+def _growth(
+    family: TransitionFamily,
+    evidence: GroupEvidence,
+    prior: Float | None,
+    first_axes: Axes | None,
+) -> _Growth:
     """Return, on a grid, the likelihood of the probabilities with which a state worsens.
 
-    The twins are read for several grids at once, and for each reading the likelihoods of the states
-    are computed anew, because those of many twins do not fit in memory.
+    The twins are read for each grid of the search, and the likelihoods of the states are computed
+    anew each time, because those of many twins do not fit in memory.
 
     Parameters
     ----------
     family : TransitionFamily
         The transitions as a function of the probabilities.
     evidence : GroupEvidence
-        The evidence of all twins of a group.
-    flown_count : int
-        The number of these twins.
+        The evidence of the twins.
+    prior : (E,) array or None
+        The prior of the calibrated parameter at its nodes; None if it has none.
+    first_axes : tuple of (N,) array or None
+        The log odds with which the search begins.
     """
     if not family.names:
-        return _GridOfTwins(None, evidence.grid_sums(()).explained)
+        return _Growth(None, evidence.grid_sum((), prior).explained)
     twin_count = 0
 
-    def log_likelihoods(grids: tuple[Axes, ...]) -> list[Float]:
-        """Return the log likelihood of all twins on grids of log odds."""
+    def log_likelihood(axes: Axes) -> Float:
+        """Return the log likelihood of the twins on a grid of log odds."""
         nonlocal twin_count
-        sums = evidence.grid_sums(tuple(_probabilities(axes) for axes in grids))
-        twin_count = sums.explained
-        return sums.log_likelihood
+        total = evidence.grid_sum(_probabilities(axes), prior)
+        twin_count = total.explained
+        return total.log_likelihood
 
-    def expected_log_likelihood(axes: Axes) -> Float:
-        """Return the log likelihood of some blocks of twins, in proportion to their number."""
-        sums = evidence.grid_sums((_probabilities(axes),), blocks_apart)
-        return sums.log_likelihood[0] * (flown_count / max(1, sums.explained))
-
-    # One block in sixteen, or some 16,000 twins, which say well enough where the first grids lie.
-    blocks_apart = max(_LEAST_BLOCKS_APART, flown_count // _EXPECTING_TWINS)
-    search = GridSearch(
-        log_likelihoods,
-        expected_log_likelihood if flown_count >= blocks_apart * BLOCK_TWINS else None,
-        count=len(family.names),
-    )
-    grid = search.likelihood()
-    return _GridOfTwins(grid, twin_count)
+    grid = likelihood_grid(log_likelihood, len(family.names), first_axes)
+    return _Growth(grid, twin_count)
 
 
 def _probabilities(axes: Axes) -> Axes:

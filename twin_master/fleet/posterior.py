@@ -144,7 +144,9 @@ class Distribution:
         return low, high
 
 
-def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
+def resolve_density(
+    log_density: LogDensity, widest_axes: Axes, first_axes: Axes | None = None
+) -> tuple[Axes, Float]:
     """Find a grid that resolves a density, by narrowing the axes of a wide grid step by step.
 
     A grid resolves a density if the spacing of each axis is small compared with the standard
@@ -154,19 +156,25 @@ def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
     ----------
     log_density : callable
         Returns the logarithm of the density at all points of a grid.
-    axes : tuple of (N,) array
+    widest_axes : tuple of (N,) array
         The widest axes.
+    first_axes : tuple of (N,) array, optional
+        Narrower axes that presumably hold the density, with which the search begins.
 
     Returns
     -------
     axes : tuple of (N,) array
-        Axes with as many points, within the given ones.
+        Axes with as many points, within the widest ones.
     values : (N, ..., N) array
         The logarithm of the density at their points.
     """
-    bounds = [(axis[0], axis[-1]) for axis in axes]
-    while True:
+    bounds = [(axis[0], axis[-1]) for axis in widest_axes]
+    axes = widest_axes if first_axes is None else first_axes
+    values = log_density(axes)
+    while _is_cut_off(axes, values, bounds):
+        axes = _twice_as_wide(axes, bounds)
         values = log_density(axes)
+    while True:
         weight = cell_probabilities(values)
         # For each axis: the range of its relevant points, and whether the grid is fine enough.
         ranges = []
@@ -186,6 +194,28 @@ def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
             np.linspace(low, high, len(axis))
             for (low, high), axis in zip(ranges, axes, strict=True)
         )
+        values = log_density(axes)
+
+
+def _is_cut_off(axes: Axes, values: Float, bounds: Sequence[tuple[float, float]]) -> bool:
+    """Return whether the density is relevant at an end of an axis that is not a bound."""
+    is_relevant = values > values.max() - RELEVANT_DROP
+    for number, (axis, (lowest, highest)) in enumerate(zip(axes, bounds, strict=True)):
+        at_start, at_end = np.moveaxis(is_relevant, number, 0)[[0, -1]]
+        if (axis[0] > lowest and at_start.any()) or (axis[-1] < highest and at_end.any()):
+            return True
+    return False
+
+
+def _twice_as_wide(axes: Axes, bounds: Sequence[tuple[float, float]]) -> Axes:
+    """Return axes of twice the length about the same centres, within their bounds."""
+    wider_axes = []
+    for axis, (lowest, highest) in zip(axes, bounds, strict=True):
+        half_length = 0.5 * (axis[-1] - axis[0])
+        low = max(lowest, axis[0] - half_length)
+        high = min(highest, axis[-1] + half_length)
+        wider_axes.append(np.linspace(low, high, len(axis)))
+    return tuple(wider_axes)
 
 
 def _relevant_range(
@@ -286,7 +316,9 @@ def marginal_distributions(
     return tuple(marginals)
 
 
-def likelihood_grid(log_likelihood: LogDensity, count: int) -> LikelihoodGrid:
+def likelihood_grid(
+    log_likelihood: LogDensity, count: int, first_axes: Axes | None = None
+) -> LikelihoodGrid:
     """Return the likelihood of K probabilities on a grid that resolves their posterior.
 
     The prior is uniform in the probabilities. The axes of the grid are log odds.
@@ -297,6 +329,8 @@ def likelihood_grid(log_likelihood: LogDensity, count: int) -> LikelihoodGrid:
         Returns the log likelihood at all points of a grid of log odds.
     count : int
         The number K of probabilities, from 1 to 4.
+    first_axes : tuple of (N,) array, optional
+        The log odds with which the search for the grid begins; by default those of the whole range.
     """
 
     def log_posterior(axes: Axes) -> Float:
@@ -306,7 +340,7 @@ def likelihood_grid(log_likelihood: LogDensity, count: int) -> LikelihoodGrid:
     lowest_log_odds = logit(np.array(LOWEST))
     highest_log_odds = logit(np.array(HIGHEST))
     widest_axis = np.linspace(lowest_log_odds, highest_log_odds, GRID_POINTS[count])
-    axes, log_density = resolve_density(log_posterior, (widest_axis,) * count)
+    axes, log_density = resolve_density(log_posterior, (widest_axis,) * count, first_axes)
     return LikelihoodGrid(axes, log_density - _log_uniform_prior(axes))
 
 
@@ -506,6 +540,20 @@ class PopulationPosterior:
 
     mean: Distribution
     deviation: Distribution
+
+    def prior_of_member(self, nodes: Float) -> Float:
+        """Return the probabilities (E,) of E equally spaced values of a member's parameter.
+
+        They are those of a normal distribution with the variance of the posterior predictive one:
+        the expected variance of the population, and the variance of its mean.
+        """
+        variance = (
+            self.deviation.mean**2
+            + self.deviation.standard_deviation**2
+            + self.mean.standard_deviation**2
+        )
+        weight = np.exp(-0.5 * (nodes - self.mean.mean) ** 2 / variance)
+        return np.asarray(weight / weight.sum())
 
 
 def population_posterior(

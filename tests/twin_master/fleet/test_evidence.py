@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from scipy.special import expit
 
 from reporting.progress import Progress
 from tests.refusals import refused
@@ -23,13 +22,11 @@ from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
 from twin_master.fleet.evidence import (
     TransitionFamily,
     grid_evidence,
-    parameter_evidence,
     transition_evidence,
 )
 from twin_master.fleet.evidence_kernels import LEAST_EVIDENCE
-from twin_master.fleet.grid_search import GridSearch
+from twin_master.fleet.parameter_evidence import parameter_evidence
 from twin_master.fleet.plan import ensemble
-from twin_master.fleet.posterior import Axes, likelihood_grid
 from twin_master.network.twin import build_graphical_model
 from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet
 
@@ -103,46 +100,6 @@ def test_evidence_of_a_draw_is_that_of_the_filter_where_products_underflow():
             rows = alone.log_likelihood_sequence(observed[twin], control[twin])
             *_, expected = precise_forward_backward(model, control[twin], rows)
             assert evidence[twin, draw] == pytest.approx(expected.sum(), rel=1e-12)
-
-
-class Readings:
-    """The log likelihood of two probabilities of which so many were hits; counts how often it is read."""
-
-    def __init__(self, twins: float, surplus: float = 0.0) -> None:
-        self.hits = np.array([0.05, 0.1]) * (1.0 + surplus) * 20.0 * twins
-        self.misses = np.array([0.95, 0.9]) * 20.0 * twins
-        self.count = 0
-
-    def on_grid(self, axes: Axes) -> np.ndarray:
-        points = expit(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
-        return np.log(points) @ self.hits + np.log1p(-points) @ self.misses
-
-    def on_grids(self, grids: tuple[Axes, ...]) -> list[np.ndarray]:
-        self.count += 1
-        return [self.on_grid(axes) for axes in grids]
-
-
-def shifted(axes: Axes) -> np.ndarray:
-    """Return a log likelihood that expects other probabilities."""
-    return -1e4 * sum((axis - 1.0) ** 2 for axis in np.meshgrid(*axes, indexing="ij"))
-
-
-@pytest.mark.parametrize("expectation", ["of some twins", "wrong", "none"])
-def test_a_search_finds_the_grid_of_the_plain_search_whatever_it_expects(expectation):
-    readings = Readings(1e6)
-    some = Readings(0.97e6, surplus=2e-3).on_grid
-    expected = {"of some twins": some, "wrong": shifted, "none": None}[expectation]
-    found = GridSearch(readings.on_grids, expected, 2).likelihood()
-    plain = likelihood_grid(readings.on_grid, 2)
-    np.testing.assert_array_equal(found.axes, plain.axes)
-    np.testing.assert_array_equal(found.log_likelihood, plain.log_likelihood)
-
-
-def test_a_search_that_expects_well_reads_a_million_twins_twice():
-    readings = Readings(1e6)
-    some = Readings(0.97e6, surplus=2e-3).on_grid
-    GridSearch(readings.on_grids, some, 2).likelihood()
-    assert readings.count == 2
 
 
 @pytest.fixture(scope="module")

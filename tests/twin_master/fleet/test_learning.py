@@ -21,7 +21,6 @@ from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.configuration import fleet_config, group_folder
 from twin_master.fleet.evidence import (
     TransitionFamily,
-    parameter_evidence,
     reason_transitions_are_fixed,
     scaled_likelihood,
     transition_evidence,
@@ -30,6 +29,7 @@ from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.noise import with_noise_factor
 from twin_master.fleet.outcomes import Estimated, Outcomes
 from twin_master.fleet.overview import overview_of_group
+from twin_master.fleet.parameter_evidence import parameter_evidence
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import (
     HIGHEST,
@@ -120,6 +120,43 @@ def test_evidence_of_a_node_is_that_of_the_filter():
         rows = alone.log_likelihood_sequence(observed[twin], control[twin])
         *_, expected = precise_forward_backward(model, control[twin], rows)
         assert nodes[twin, node] == pytest.approx(expected.sum(), rel=1e-12)
+
+
+class Counts:
+    """The log likelihood of probabilities of which so many were hits; counts its grids."""
+
+    def __init__(self, hits: float, misses: float) -> None:
+        self.hits, self.misses = hits, misses
+        self.grids = 0
+
+    def on_grid(self, axes: Axes) -> np.ndarray:
+        self.grids += 1
+        points = expit(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+        return self.hits * np.log(points).sum(axis=-1) + self.misses * np.log1p(-points).sum(axis=-1)
+
+
+@pytest.mark.parametrize(
+    "first",
+    [(0.099, 0.101), (0.08, 0.12), (0.1, 0.9), (0.3, 0.4)],
+    ids=["narrow", "about right", "one-sided", "beside it"],
+)
+def test_a_search_finds_a_posterior_wherever_it_begins(first):
+    counts = Counts(1e5, 9e5)
+    first_axis = np.linspace(*logit(first), 13)
+    marginals = likelihood_grid(counts.on_grid, 2, (first_axis, first_axis)).marginals
+    exact = beta(1e5 + 1.0, 9e5 + 1.0)
+    for marginal in marginals:
+        assert marginal.mean == pytest.approx(exact.mean(), abs=1e-3 * exact.std())
+        assert marginal.standard_deviation == pytest.approx(exact.std(), rel=1e-3)
+
+
+def test_a_search_that_begins_with_the_posterior_of_some_twins_needs_few_grids():
+    """The posterior of one twin in sixteen is four times as wide."""
+    some, all_twins, whole_range = Counts(6.3e3, 56.2e3), Counts(1e5, 9e5), Counts(1e5, 9e5)
+    first_axes = likelihood_grid(some.on_grid, 2).axes
+    likelihood_grid(all_twins.on_grid, 2, first_axes)
+    likelihood_grid(whole_range.on_grid, 2)
+    assert all_twins.grids <= 3 < whole_range.grids
 
 
 def grid_of(*counts: tuple[int, int]) -> LikelihoodGrid:
