@@ -48,6 +48,11 @@ Few degrees of freedom give it a heavy tail, so that large deviations remain pos
 """
 POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
+LEAST_STEPS_OF_PRIOR = 2.0 / 3.0
+"""Least standard deviation of the prior of a member, in distances between two of its values.
+
+A sum over normally weighted values with this deviation has the right mean to 1e-3 of a distance.
+"""
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
 _MEMBERS_TOGETHER = 1024
@@ -545,13 +550,17 @@ class PopulationPosterior:
         """Return the probabilities (E,) of E equally spaced values of a member's parameter.
 
         They are those of a normal distribution with the variance of the posterior predictive one:
-        the expected variance of the population, and the variance of its mean.
+        the expected variance of the population, and the variance of its mean. A distribution much
+        narrower than the distance of the values would only have the one that is next to its mean;
+        it is widened, so that the values have the right mean.
         """
-        variance = (
+        predictive_variance = (
             self.deviation.mean**2
             + self.deviation.standard_deviation**2
             + self.mean.standard_deviation**2
         )
+        step = nodes[1] - nodes[0]
+        variance = max(predictive_variance, (LEAST_STEPS_OF_PRIOR * step) ** 2)
         weight = np.exp(-0.5 * (nodes - self.mean.mean) ** 2 / variance)
         return np.asarray(weight / weight.sum())
 

@@ -35,7 +35,9 @@ from twin_master.fleet.posterior import (
     HIGHEST,
     LOWEST,
     Axes,
+    Distribution,
     LikelihoodGrid,
+    PopulationPosterior,
     likelihood_grid,
     population_posterior,
     shared_posterior,
@@ -305,6 +307,23 @@ def test_a_fleet_that_is_read_by_blocks_teaches_what_the_whole_teaches(grown, le
     monkeypatch.setattr("twin_master.fleet.stored_observations.BLOCK_TWINS", 7)
     record = learn_fleet(grown[1])["groups"]["growing_damage"]
     np.testing.assert_allclose(numbers_of(record), numbers_of(learnt_by_fleet[0]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.001, 0.05, 0.15], ids=["narrow", "two steps", "wide"])
+def test_the_prior_of_a_member_has_the_mean_of_the_population(spread):
+    """Also if the population lies between two of the values, which are 0.02 apart."""
+    nodes = np.linspace(0.0, 2.0, 101)
+    grid = np.linspace(-4.0, 4.0, 41)
+    around = norm.pdf(grid) / norm.pdf(grid).sum()
+    population = PopulationPosterior(
+        mean=Distribution(1.007 + 0.0002 * grid, around),
+        deviation=Distribution(spread * (1.0 + 0.05 * grid), around),
+    )
+    prior = population.prior_of_member(nodes)
+    deviation = np.sqrt(prior @ (nodes - prior @ nodes) ** 2)
+    assert prior.sum() == pytest.approx(1.0, rel=1e-12)
+    assert prior @ nodes == pytest.approx(1.007, abs=2e-5)
+    assert deviation == pytest.approx(max(spread, 0.02 * 2.0 / 3.0), rel=0.01)
 
 
 def test_a_population_is_the_same_for_members_taken_a_few_at_a_time(tmp_path):
