@@ -279,6 +279,8 @@ def _connected_client(engine: Engine) -> "Iterator[Client]":
         "distributed.comm.timeouts.connect": CONNECTING,
         "distributed.worker.memory.terminate": False,
         "distributed.admin.large-graph-warning-threshold": "1 GiB",
+        # Dask keeps the last 1,000 messages to each worker, with their tasks: hundreds of megabytes.
+        "distributed.admin.low-level-log-length": 10,
         "logging.distributed": "critical",
     }
     with dask.config.set(quiet_settings):
