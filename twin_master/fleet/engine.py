@@ -279,7 +279,7 @@ def _connected_client(engine: Engine) -> "Iterator[Client]":
         "distributed.comm.timeouts.connect": CONNECTING,
         "distributed.worker.memory.terminate": False,
         "distributed.admin.large-graph-warning-threshold": "1 GiB",
-        # Dask keeps the last 1,000 messages to each worker, with their tasks: hundreds of megabytes.
+        # Dask would keep the last 1,000 messages to each worker: hundreds of megabytes of tasks.
         "distributed.admin.low-level-log-length": 10,
         "logging.distributed": "critical",
     }

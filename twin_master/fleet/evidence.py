@@ -138,7 +138,7 @@ class TransitionFamily:
         low, high = 0.25, 0.75
         lists = _predecessors_at(scenario, low)
         entries = lists.probability
-        slope = 2.0 * (_predecessors_at(scenario, high).probability - entries)
+        slope = (_predecessors_at(scenario, high).probability - entries) / (high - low)
         return cls(
             names=tuple(cause.name for cause in probabilities),
             assumed=np.array(list(probabilities.values())),
@@ -187,9 +187,10 @@ def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return for each entry of the lists, (non-zeros,), the index of its probability of worsening.
+    """Return the number of the cause on whose probability each entry of the lists depends.
 
-    Rows of the lists are ordered by factor, then by control, then by level.
+    The result is a (non-zeros,) array. Rows of the lists are ordered by factor, then by control,
+    then by level.
     """
     levels_of_factors, _, start, _, _, _ = lists
     index_of_rows = []

@@ -163,14 +163,16 @@ def _observed_twins(task: _Task) -> Sequence[ObservedTwins] | Iterator[ObservedT
 
 
 def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
-    """Return the log likelihood of the twins of a task; None if their observations are missing.
+    """Return the log likelihood of the twins of a task on a grid.
 
-    The arguments are those of `GroupEvidence.grid_sum`.
+    It is None if this process cannot read their observations. `axes` and `prior` are those of
+    `GroupEvidence.grid_sum`.
     """
     blocks = _observed_twins(task)
     if blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
+    # Which values of the parameter are probable is found out at the centre of the grid.
     centre = np.array([axis[len(axis) // 2] for axis in axes])
     probability = with_all_transitions_possible(centre)
     total = np.zeros([len(axis) for axis in axes])
@@ -191,7 +193,7 @@ def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
 
 
 def _evidence_of_draws(task: _Task, probability: Float) -> Float | None:
-    """Return the log evidence (B, E) of the twins of a task; None without their observations."""
+    """Return the log evidence (B, E) of the twins of a task, or None as `_grid_sum`."""
     blocks = _observed_twins(task)
     if blocks is None:
         return None
@@ -216,7 +218,7 @@ class GroupEvidence:
     flights : sequence of FlightsOfScenario
         The flights of the twins, by scenario.
     progress : Progress
-        Shows how far a reading of all twins has come.
+        Shows how far a pass over all twins has come.
     """
 
     def __init__(
@@ -285,8 +287,8 @@ class GroupEvidence:
     def _answers(self, function: Callable[[_Task], _Answer | None]) -> Iterator[_Answer]:
         """Yield the results of all tasks, in their order.
 
-        Workers read the observations themselves if they see the folder of the fleet. From the first
-        one on that does not, this process sends the observations with the tasks.
+        A worker that cannot read the fleet's folder answers None. Its task is then computed again
+        with the observations, which this process reads, and so are all later tasks.
         """
         unanswered: deque[_Task] = deque()
 
@@ -297,6 +299,7 @@ class GroupEvidence:
 
         title = f"Learning from {self._group}"
         with self._progress.stage(title, total=self.twin_count, unit="twins") as stage:
+            # The pool keeps the order of the tasks, and takes some before it has the first answer.
             for answer in self._pool.results(function, tasks_to_send()):
                 task = unanswered.popleft()
                 if answer is None:

@@ -83,16 +83,17 @@ def learn_from_fleet(
 ) -> JsonObject:
     """Learn from all twins of a fleet, and write what was learnt to a file.
 
-    Learnt are the probabilities that damage grows, the noise of the sensors, and the distribution
-    of the calibrated parameter over the assets. The record is also written to the fleet's folder.
+    This gives the probabilities with which damage grows, the noise of the sensors, and the
+    distribution of the calibrated parameter over the assets. The record is also written to the
+    fleet's folder.
 
     Parameters
     ----------
     folder : Path or str
-        The folder of the fleet, which may still fly.
+        The folder of the fleet. Its twins may still be flying.
     out : Path or str
-        The file to write, for the override ``learnt`` of a mission or the key of that name of a
-        group.
+        The file to write. A mission reads it by the override ``learnt``, and a group of a fleet by
+        the key of this name.
     engine : Engine, optional
         The processes that compute; by default this one. Their number does not change the results.
     progress : Progress, optional
@@ -110,7 +111,7 @@ def learn_from_fleet(
     ------
     RunFolderError, FleetError
         If the folder holds no fleet, if no twin has flown to its end, or if no course of states
-        explains the observations of any twin of a group. If the cluster cannot be used.
+        explains the observations of any twin of a group, or if the cluster cannot be used.
     """
     record = learn_fleet(folder, engine=engine, progress=progress)
     write_learnt(Path(out), Path(folder), record)
@@ -141,7 +142,7 @@ def learn_fleet(
     Parameters
     ----------
     folder : Path or str
-        The folder of the fleet, which may still fly.
+        The folder of the fleet. Its twins may still be flying.
     engine : Engine, optional
         The processes that compute; by default this one.
     progress : Progress, optional
@@ -151,7 +152,7 @@ def learn_fleet(
     ------
     RunFolderError, FleetError
         If the folder holds no fleet, if no twin has flown to its end, or if no course of states
-        explains the observations of any twin of a group. If the cluster cannot be used.
+        explains the observations of any twin of a group, or if the cluster cannot be used.
     """
     folder = Path(folder)
     config = fleet_config(folder)
@@ -254,8 +255,8 @@ def _lessons_of_groups(
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
     """Return the records of all groups, and of the distribution of probabilities common to them.
 
-    They share one in this case: all groups have the same probabilities to worsen, these are at most
-    `_MOST_SHARED`, and several groups have learnt them.
+    The groups share a distribution if several of them have learnt probabilities, if these have the
+    same names in all groups, and if there are `_MOST_SHARED` of them at most.
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
     distinct_names = {lesson.family.names for lesson in lessons.values()}
@@ -323,32 +324,30 @@ class _FlownGroup:
         """
         scenario = self.twins_by_scenario[0].knowledge.scenario
         family = _transition_family(scenario)
-        # With several scenarios each twin has its own calibration, and no common distribution of
-        # the parameter is learnt.
         nodes = None
-        if len(self.twins_by_scenario) == 1:
+        if len(self.twins_by_scenario) == 1:  # otherwise each twin has a calibration of its own
             nodes = parameter_nodes(self.twins_by_scenario[0], is_real="recordings" in self.record)
         name = self.record["name"]
         with progress.stage(f"Learning the noise of {name}"):
             noise = noise_factor(
                 flights_by_scenario(self.group, self.twins_by_scenario), family, nodes
             )
-        growth_nodes = None if nodes is None else nodes.every_second
+        population_evidence = self._evidence(family, noise.mean, nodes, pool, progress)
+        growth_evidence = population_evidence
+        if nodes is not None:  # growth changes so little with the parameter that half of them do
+            growth_evidence = self._evidence(family, noise.mean, nodes.every_second, pool, progress)
         growth, population = self._growth_and_population(
-            self._evidence(family, noise.mean, growth_nodes, pool, progress),
-            self._evidence(family, noise.mean, nodes, pool, progress),
-            family,
-            nodes,
+            growth_evidence, population_evidence, family, nodes
         )
-        if not growth.twin_count:
+        if not growth.explained_count:
             raise FleetError(
                 f"no state of the twins explains what was observed in group {name}: nothing can be "
                 "learnt from it; check its model and its noise."
             )
         counts = _counts(self.group, scenario.control_names)
         lessons: JsonObject = {
-            "twins": growth.twin_count,
-            "left_out": self._flown_count - growth.twin_count,
+            "twins": growth.explained_count,
+            "left_out": growth_evidence.twin_count - growth.explained_count,
             "alarmed": counts.alarmed,
             "noise_factor": noise.summary,
         }
@@ -363,11 +362,6 @@ class _FlownGroup:
         return _GroupLessons(family, growth.grid, counts.followed_controls, lessons)
 
     @property
-    def _flown_count(self) -> int:
-        """The number of twins that have flown."""
-        return sum(len(twins.rows) for twins in self.twins_by_scenario)
-
-    @property
     def _draws(self) -> ParameterDraws:
         """The draws of the calibrated parameter."""
         return self.twins_by_scenario[0].knowledge.draws
@@ -380,7 +374,7 @@ class _FlownGroup:
         pool: TaskPool,
         progress: Progress,
     ) -> GroupEvidence:
-        """Return the evidence of the twins, computed by the processes of a pool.
+        """Return an object that computes the evidence of the twins by the processes of a pool.
 
         Parameters
         ----------
@@ -393,9 +387,9 @@ class _FlownGroup:
         pool : TaskPool
             The processes.
         progress : Progress
-            Shows how far a reading of all twins has come.
+            Shows how far a pass over all twins has come.
         """
-        value_per_draw = None if nodes is None else nodes.predicted
+        readings_at_nodes = None if nodes is None else nodes.predicted
         flights = []
         for twins in self.twins_by_scenario:
             kit = EvidenceKit(
@@ -405,7 +399,7 @@ class _FlownGroup:
                 reading=self.reading,
                 family=family,
                 sensor_model=with_noise_factor(
-                    twins.knowledge.sensor_model, noise_factor, value_per_draw
+                    twins.knowledge.sensor_model, noise_factor, readings_at_nodes
                 ),
             )
             packed_kit = pickle.dumps(kit, pickle.HIGHEST_PROTOCOL)
@@ -421,23 +415,18 @@ class _FlownGroup:
     ) -> tuple["_Growth", PopulationPosterior | None]:
         """Learn the probabilities to worsen, and the population of the parameter if it has nodes.
 
-        Each is learnt given the other. It is begun with some twins, by turns, and their results are
-        the first grid and the prior of the parameter for all twins.
+        Each of the two is learnt given the other, in rounds: first from some of the twins, at last
+        from all. A round begins with the grid and with the population of the last one.
         """
-        blocks_apart = growth_evidence.twin_count // _FIRST_TWINS
-        blocks_apart = min(max(blocks_apart, 1), _MOST_BLOCKS_APART)
-        rounds = [blocks_apart] * (1 if nodes is None else _FIRST_ROUNDS)
-        if blocks_apart > 1:
-            rounds.append(1)
         first_axes = None
         population = None
         prior = None if nodes is None else nodes.every_second.prior
-        for blocks_apart in rounds:
+        for blocks_apart in _rounds(growth_evidence.twin_count, has_population=nodes is not None):
             some_twins = growth_evidence.of_some_twins(blocks_apart)
             growth = _growth(family, some_twins, prior, first_axes)
             if growth.grid is not None:
                 first_axes = growth.grid.axes
-            if nodes is not None and growth.twin_count:
+            if nodes is not None and growth.explained_count:
                 population = self._population(
                     population_evidence.of_some_twins(blocks_apart),
                     growth.mean_probability(family),
@@ -511,6 +500,18 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
     return _GroupCounts(alarmed, followed_controls)
 
 
+def _rounds(twin_count: int, *, has_population: bool) -> list[int]:
+    """Return the rounds of learning: each reads one block of twins in so many.
+
+    Growth and population need several rounds to agree, because each is learnt given the other.
+    """
+    blocks_apart = min(max(twin_count // _FIRST_TWINS, 1), _MOST_BLOCKS_APART)
+    rounds = [blocks_apart] * (_FIRST_ROUNDS if has_population else 1)
+    if blocks_apart > 1:
+        rounds.append(1)
+    return rounds
+
+
 class _Growth(NamedTuple):
     """The likelihood of the probabilities to worsen given the observations of twins.
 
@@ -518,13 +519,13 @@ class _Growth(NamedTuple):
     ----------
     grid : LikelihoodGrid or None
         The likelihood; None if the transitions are not learnt.
-    twin_count : int
+    explained_count : int
         The number of twins whose observations are possible under the model; the others are left
         out.
     """
 
     grid: LikelihoodGrid | None
-    twin_count: int
+    explained_count: int
 
     def mean_probability(self, family: TransitionFamily) -> Float:
         """Return the posterior means of the probabilities (K,), or the assumed ones."""
@@ -541,8 +542,8 @@ def _growth(
 ) -> _Growth:
     """Return, on a grid, the likelihood of the probabilities with which a state worsens.
 
-    The twins are read for each grid of the search, and the likelihoods of the states are computed
-    anew each time, because those of many twins do not fit in memory.
+    All twins are read again for each grid of the search, because the likelihoods of the states of
+    many twins do not fit in memory.
 
     Parameters
     ----------
@@ -557,17 +558,17 @@ def _growth(
     """
     if not family.names:
         return _Growth(None, evidence.grid_sum((), prior).explained)
-    twin_count = 0
+    explained_count = 0
 
     def log_likelihood(axes: Axes) -> Float:
         """Return the log likelihood of the twins on a grid of log odds."""
-        nonlocal twin_count
+        nonlocal explained_count
         total = evidence.grid_sum(_probabilities(axes), prior)
-        twin_count = total.explained
+        explained_count = total.explained
         return total.log_likelihood
 
     grid = likelihood_grid(log_likelihood, len(family.names), first_axes)
-    return _Growth(grid, twin_count)
+    return _Growth(grid, explained_count)
 
 
 def _probabilities(axes: Axes) -> Axes:

@@ -63,9 +63,9 @@ def parameter_evidence(
 
 
 class TwinLikelihood(NamedTuple):
-    """The likelihood of the states of B twins in T steps, at some nodes of each twin's own.
+    """The likelihood of the states of B twins in T steps, at some nodes for each twin.
 
-    The nodes of all twins are in successive rows, M in all.
+    There is a row for each node of each twin, M rows in all. Those of a twin follow each other.
 
     Attributes
     ----------
@@ -101,6 +101,7 @@ class TwinLikelihood(NamedTuple):
         """
         evidence_at_nodes = grid_evidence(family, axes, self.values, self.control)
         weighted = evidence_at_nodes + self.log_weight[:, None]
+        # The sum over the rows of each twin, which begin with its first one.
         return np.asarray(np.logaddexp.reduceat(weighted, self.first_row, axis=0))
 
 
@@ -168,10 +169,10 @@ def averaged_likelihood(
     observations: Float,
     control: Index,
 ) -> TwinLikelihood:
-    """Return the likelihood of twins, averaged over the draws of the parameter in each step anew.
+    """Return the likelihood of twins from a model that averages over draws in each step by itself.
 
-    It serves where the readings at chosen values of the parameter are not known. Twins whose
-    observations are impossible are left out.
+    This takes the place of `likelihood_at_nodes` where the readings at chosen values of the
+    parameter are unknown. Twins whose observations are impossible are left out.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ def averaged_likelihood(
         values=likelihood[is_explained],
         control=control[is_explained],
         log_weight=log_scale[is_explained],
-        first_row=np.arange(is_explained.sum()),
+        first_row=np.arange(is_explained.sum()),  # each twin has a single row
     )
 
 

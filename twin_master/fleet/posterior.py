@@ -30,6 +30,8 @@ LEAST_SHRINKAGE = 0.95
 """A further grid is computed only if an axis becomes shorter than this fraction of its length."""
 NEGLIGIBLE_WEIGHT = 1e-9
 """Fraction of the largest weight below which the tails of a distribution are cut."""
+SPLINE_POINTS = 4
+"""Least number of points of a cubic spline."""
 FINE_POINTS = 2001
 """Points on which a distribution is interpolated."""
 SHARED_POINTS = 121
@@ -48,10 +50,10 @@ Few degrees of freedom give it a heavy tail, so that large deviations remain pos
 """
 POINTS_BETWEEN_NODES = 4
 """Number of intervals into which each interval between two nodes of the evidence is divided."""
-LEAST_STEPS_OF_PRIOR = 2.0 / 3.0
-"""Least standard deviation of the prior of a member, in distances between two of its values.
+LEAST_PRIOR_WIDTH = 2.0 / 3.0
+"""Least standard deviation of the prior of a member, over the distance between two of its values.
 
-A sum over normally weighted values with this deviation has the right mean to 1e-3 of a distance.
+With this width the mean over the values is that of the normal distribution to 1e-3 of the distance.
 """
 LEAST_LOG_EVIDENCE = -700.0
 """Log evidence, relative to its maximum, below which the exponential function would underflow."""
@@ -96,16 +98,17 @@ class Distribution:
     def _interpolated(self) -> tuple[Float, Float]:
         """Values of x and their probabilities, as two arrays, from a spline of the log density.
 
-        The sums over the grid itself would be wrong if its spacing is as wide as the distribution,
-        or if a bound cuts the distribution off.
+        Sums over the grid itself would be wrong where its points are as far apart as the
+        distribution is wide, or where a bound cuts the distribution off.
         """
         from scipy.interpolate import CubicSpline
 
-        # Leave out the tails, whose logarithms would make the spline swing, but keep the four
-        # points that a cubic spline needs.
-        relevant = np.flatnonzero(self.weight > NEGLIGIBLE_WEIGHT * self.weight.max())
-        begin = max(0, min(relevant[0], len(self.x) - 4))
-        end = max(4, relevant[-1] + 1)
+        # Leave out the tails, whose logarithms would make the spline oscillate, but keep enough
+        # points for a cubic spline.
+        first, last = np.flatnonzero(self.weight > NEGLIGIBLE_WEIGHT * self.weight.max())[[0, -1]]
+        count = max(SPLINE_POINTS, last - first + 1)
+        begin = min(first, len(self.x) - count)
+        end = begin + count
         x = self.x[begin:end]
         fine_x = np.linspace(x[0], x[-1], FINE_POINTS)
         # The weights at both ends are those of half an interval: double them for the density.
@@ -371,9 +374,9 @@ def shared_posterior(grids: Sequence[LikelihoodGrid]) -> SharedPosterior:
 
     A probability of a group has the distribution Beta(m kappa, (1 - m) kappa) with the mean m and
     the concentration kappa, which are the hyperparameters. Their prior is uniform in the log odds
-    of m, between the bounds of a probability, and in the logarithm of kappa. The sum over the
-    probabilities of each group has its own axes, because the posterior of a group with many twins
-    can be a thousand times narrower than that of a group with few.
+    of m, between the bounds of a probability, and in the logarithm of kappa. Each group has axes of
+    its own for its probabilities, because the posterior of a group with many twins can be a
+    thousand times narrower than that of a group with few.
 
     Parameters
     ----------
@@ -439,10 +442,10 @@ class _GroupOnAxes:
         hyper_weight : (H, H) or (H, 1) array
             The posterior of the hyperparameters given all groups.
         """
-        # p(probabilities | data) = sum over hyperparameters of their posterior times prior times
-        # likelihood over this group's evidence; the likelihood does not depend on them.
-        hyper_ratio = hyper_weight / np.maximum(self.evidence, _TINY)
-        mixed_prior = self.prior_of_first.T @ hyper_ratio @ self.prior_of_second
+        # With the hyperparameters h, and the group's probabilities p and data d:
+        # p(p | all data) = p(d | p) * sum over h of p(p | h) p(h | all data) / p(d | h).
+        posterior_over_evidence = hyper_weight / np.maximum(self.evidence, _TINY)
+        mixed_prior = self.prior_of_first.T @ posterior_over_evidence @ self.prior_of_second
         joint = self.likelihood * mixed_prior
         joint /= joint.sum()
         count = len(self.axes)
@@ -549,18 +552,18 @@ class PopulationPosterior:
     def prior_of_member(self, nodes: Float) -> Float:
         """Return the probabilities (E,) of E equally spaced values of a member's parameter.
 
-        They are those of a normal distribution with the variance of the posterior predictive one:
-        the expected variance of the population, and the variance of its mean. A distribution much
-        narrower than the distance of the values would only have the one that is next to its mean;
-        it is widened, so that the values have the right mean.
+        The prior is a normal distribution with the variance of the posterior predictive: the
+        expected variance of the population, plus the variance of its mean. If it is narrower than
+        the distance between two values, nearly all of it would fall on one value, which is not the
+        mean. Therefore it has a least width.
         """
         predictive_variance = (
             self.deviation.mean**2
             + self.deviation.standard_deviation**2
             + self.mean.standard_deviation**2
         )
-        step = nodes[1] - nodes[0]
-        variance = max(predictive_variance, (LEAST_STEPS_OF_PRIOR * step) ** 2)
+        least_deviation = LEAST_PRIOR_WIDTH * (nodes[1] - nodes[0])
+        variance = max(predictive_variance, least_deviation**2)
         weight = np.exp(-0.5 * (nodes - self.mean.mean) ** 2 / variance)
         return np.asarray(weight / weight.sum())
 
@@ -595,26 +598,25 @@ def population_posterior(
     def log_density(axes: Axes) -> Float:
         """Return the log posterior (means, deviations) of the population, up to a constant."""
         means, deviations = axes
-        # The probability of each value in the populations of all means and deviations, in columns.
+        # The probability of each value, in rows, in each population, in columns: all means with the
+        # first deviation, all means with the second one, and so on.
         probabilities = np.hstack(
             [
                 np.diff(ndtr((edges[:, None] - means) / deviation), axis=0)
                 for deviation in deviations
             ]
         )
-        log_evidence_by_column = np.zeros(len(deviations) * len(means))
-        for members in log_evidence:
-            likelihood = _member_likelihood(nodes, members, values)
+        log_likelihood = np.zeros(len(deviations) * len(means))
+        for log_evidence_of_members in log_evidence:
+            likelihood = _member_likelihood(nodes, log_evidence_of_members, values)
             for first in range(0, len(likelihood), _MEMBERS_TOGETHER):
                 evidence = likelihood[first : first + _MEMBERS_TOGETHER] @ probabilities
-                np.maximum(evidence, _TINY, out=evidence)
-                log_evidence_by_column += np.log(evidence, out=evidence).sum(axis=0)
-        log_evidence_of_all = log_evidence_by_column.reshape(len(deviations), len(means)).T
+                log_likelihood += np.log(np.maximum(evidence, _TINY)).sum(axis=0)
         # The density of Student's t is (1 + (x / scale)^2 / freedom)^(-(freedom + 1) / 2).
-        minus_log_prior = (
-            0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)
+        log_prior = (
+            -0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)
         )
-        return log_evidence_of_all - minus_log_prior
+        return log_likelihood.reshape(len(deviations), len(means)).T + log_prior
 
     mean_axis = np.linspace(nodes[0], nodes[-1], POPULATION_POINTS)
     deviation_axis = np.linspace(0.25 * step, 0.5 * (nodes[-1] - nodes[0]), POPULATION_POINTS)
