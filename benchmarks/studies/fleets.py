@@ -3,21 +3,27 @@
     python -m benchmarks.studies.fleets coverage --fleets 200
     python -m benchmarks.studies.fleets groups --fleets 40
     python -m benchmarks.studies.fleets half --twins 1000
+    python -m benchmarks.studies.fleets spread --fleets 20
 
 `coverage`: how often 95 % intervals hold the truth. `groups`: what groups gain from each other.
-`half`: what flying with the learnt probabilities is worth. Every mission flies the reduced model
-in this process; each part prints its table.
+`half`: what flying with the learnt probabilities is worth. `spread`: how often all intervals of
+`fleet learn` hold the truth if each asset has a stiffness of its own. Every mission flies the
+reduced model in this process; each part prints its table.
 """
 
 import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
+from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.evidence import TransitionFamily, grid_evidence, scaled_likelihood
+from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.members import Member
 from twin_master.fleet.posterior import (
     Axes,
@@ -31,6 +37,7 @@ from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.inference import predict
 from twin_master.scenario.reading import load_scenario, parse_scenario
+from uav_twin import fly_fleet
 
 Float = NDArray[np.float64]
 
@@ -167,6 +174,44 @@ def half(twins: int) -> None:
         )
 
 
+def spread(fleets: int, twins: int) -> None:
+    """Print how often intervals of `fleet learn` hold the truth if assets differ in stiffness."""
+    mean, deviation = 1.0, 0.01
+    truths = {**ASSUMED, "mean": mean, "spread": deviation}
+    deviations: dict[str, list[float]] = {name: [] for name in truths}
+    inside: dict[str, list[bool]] = {name: [] for name in truths}
+    scenario = scenario_files()["growing_damage"].read_text(encoding="utf-8")
+    for seed in range(fleets):
+        with TemporaryDirectory() as folder:
+            # Without notices a twin flies thirty times as fast.
+            Path(folder, "quiet.toml").write_text(f"notice = false\n{scenario}", encoding="utf-8")
+            Path(folder, "fleet.toml").write_text(
+                f"""format = 1
+[fleet]
+name = "spread"
+seed = {seed}
+[[group]]
+name = "wings"
+scenario = "quiet.toml"
+count = {twins}
+parameters = {{ young_modulus_factor = {{ mean = {mean}, standard_deviation = {deviation} }} }}
+""",
+                encoding="utf-8",
+            )
+            flown = fly_fleet(Path(folder, "fleet.toml"), Path(folder, "flown"))
+            lessons = learn_fleet(flown.folder)["groups"]["wings"]
+        found = {**lessons["probability"], **lessons["population"]}
+        for name, truth in truths.items():
+            posterior = found[name]
+            inside[name].append(posterior["lower_95"] <= truth <= posterior["upper_95"])
+            deviations[name].append((posterior["mean"] - truth) / posterior["standard_deviation"])
+    for name, hits in inside.items():
+        print(
+            f"| {name}, {fleets} fleets of {twins} | {sum(hits)} of {fleets} "
+            f"| {np.mean(deviations[name]):.2f} ± {fleets**-0.5:.2f} |"
+        )
+
+
 def score(known: Knowledge, flown: Flights) -> Float:
     """Return the mean log probability of the true state ten steps ahead, of each twin: (B,)."""
     model = known.model
@@ -184,12 +229,15 @@ def score(known: Knowledge, flown: Flights) -> Float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("part", choices=("coverage", "groups", "half"))
+    parser.add_argument("part", choices=("coverage", "groups", "half", "spread"))
     parser.add_argument("--fleets", type=int, default=200)
     parser.add_argument("--twins", type=int)
     arguments = parser.parse_args()
     if arguments.part == "half":
         half(arguments.twins or 1000)
+        return
+    if arguments.part == "spread":
+        spread(arguments.fleets, arguments.twins or 2000)
         return
     parts: dict[str, Any] = {"coverage": coverage, "groups": groups}
     parts[arguments.part](
