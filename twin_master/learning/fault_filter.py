@@ -8,16 +8,9 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.learning import hypothesis_weights
+from twin_master.learning.belief_transitions import Onsets, Recoveries, advance_beliefs
 from twin_master.learning.fault_evidence import correct_beliefs
-from twin_master.learning.fault_kernels import (
-    FaultPriors,
-    LogEvidence,
-    Observations,
-    Predictions,
-    advance_beliefs,
-    mix_in_model,
-    weighted_belief,
-)
+from twin_master.learning.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
 from twin_master.learning.hypothesis_weights import HypothesisWeights
 from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, FROM_THE_START, WatchState
 from twin_master.network.estimator import Carried
@@ -196,25 +189,33 @@ class FaultFilter:
         control_index : (B,) array
             The controls in force in this step.
         """
-        advance_beliefs(
-            self._model.transition.forward_lists,
-            previous_control,
-            len(self._draw_weight),
-            state.beliefs,
-        )
         # The prior probability to begin in exactly this step. It is positive: the probability to
         # begin after a step decreases strictly with the step.
         begins_later = self.probability_to_begin_after(state.step_count)
         begins_now = self.probability_to_begin_after(state.step_count - 1.0) - begins_later
         log_begins_now = np.log(begins_now)
-        self._begin_gauge_faults(state, log_begins_now)
-        self._begin_free_gains(state, log_begins_now)
-        self._switch_hypotheses(state, log_begins_now, previous_control, control_index)
+        onsets = Onsets(
+            self._begin_gauge_faults(state, log_begins_now),
+            self._begin_free_gains(state, log_begins_now),
+        )
+        ended_or_hidden = self._switch_hypotheses(
+            state, log_begins_now, previous_control, control_index
+        )
+        recoveries = self._move_to_recovered(state, ended_or_hidden)
+        advance_beliefs(
+            self._model.transition.forward_lists,
+            previous_control,
+            len(self._draw_weight),
+            onsets,
+            recoveries,
+            state.beliefs,
+        )
 
-    def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> None:
+    def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> Float:
         """Let faults of single gauges begin in this step, and let the sums about their gains fade.
 
-        A fault that begins now has the belief and the sums of squares of the model so far.
+        A fault that begins now has the sums of squares of the model so far. The probability (B,
+        G K) that each fault began earlier is returned, with which beliefs are mixed.
 
         Parameters
         ----------
@@ -232,7 +233,6 @@ class FaultFilter:
         state.gauge_onset += (1.0 - earlier_weight) * (
             state.step_count[:, None] - state.gauge_onset
         )
-        mix_in_model(beliefs.model, earlier_weight, beliefs.gauge)
         # A fault that begins now has learnt no gain yet: its sums are zero.
         fading = self._fading_per_step()
         np.multiply(beliefs.gauge_sum_cc, fading * earlier_weight, out=beliefs.gauge_sum_cc)
@@ -241,13 +241,15 @@ class FaultFilter:
         beliefs.gauge_squares[:] = (
             earlier_weight * beliefs.gauge_squares + (1.0 - earlier_weight) * model_squares
         )
+        return np.asarray(earlier_weight)
 
-    def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> None:
+    def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> Float:
         """Let the fault of free gains begin in this step, and let its sums about the gains fade.
 
         Free gains are the fault that several gauges have unknown gains.
 
-        A fault that begins now has the belief and the sums of squares of the model so far.
+        A fault that begins now has the sums of squares of the model so far. The probability (B,)
+        that it began earlier is returned, with which beliefs are mixed.
 
         Parameters
         ----------
@@ -262,7 +264,6 @@ class FaultFilter:
         state.log_free_gains_evidence = log_total
         new_weight = 1.0 - earlier_weight
         state.free_gains_onset += new_weight[:, 0] * (state.step_count - state.free_gains_onset)
-        mix_in_model(beliefs.model, earlier_weight, beliefs.free_gains[:, :, None])
         statistics = state.free_gain_statistics
         statistics.free_probability[:] += new_weight * (
             FREE_GAIN_PROBABILITY - statistics.free_probability
@@ -272,6 +273,7 @@ class FaultFilter:
         fading = self._fading_per_step()
         for sums in (statistics.sum_cc, statistics.sum_cx):
             sums *= fading * earlier_weight
+        return np.ascontiguousarray(earlier_weight[:, 0])
 
     def _fading_per_step(self) -> float:
         """Return the factor by which the sums about gains fade in a step, as gains may change."""
@@ -290,7 +292,7 @@ class FaultFilter:
         log_begins_now: Float,
         previous_control: Index,
         control: Index,
-    ) -> None:
+    ) -> Float:
         """Update the weights of the hypotheses for faults that begin, end or become hidden.
 
         Parameters
@@ -301,6 +303,11 @@ class FaultFilter:
             The log prior probability that a fault begins in this step.
         previous_control, control : (B,) array
             The controls of the step before and of this one.
+
+        Returns
+        -------
+        (B, 1 + G K) array
+            The probability of each fault that it ended or was hidden in this step.
         """
         # Hazard: probability to begin now, given that no fault of either kind has begun before.
         fault_probability = 2.0 * self._settings.prior
@@ -310,12 +317,13 @@ class FaultFilter:
 
         ended_or_hidden = state.weights.change_controls(previous_control, control)
         ended_or_hidden += state.weights.advance(log_hazard, self._log_begin)
-        self._move_to_recovered(state, ended_or_hidden)
+        return ended_or_hidden
 
-    def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix the beliefs and sums of ended and hidden faults into the hypothesis "recovered".
+    def _move_to_recovered(self, state: WatchState, right_again: Float) -> Recoveries:
+        """Mix the sums of ended and hidden faults into the hypothesis "recovered".
 
-        "Recovered" is the hypothesis that the gauges are right again after a fault.
+        "Recovered" is the hypothesis that the gauges are right again after a fault. The weights
+        are returned with which beliefs are mixed.
 
         Parameters
         ----------
@@ -333,19 +341,12 @@ class FaultFilter:
         np.divide(
             probability_of_all, right_after_fault, out=fraction_new, where=right_after_fault > 0.0
         )
-        fraction_new = np.minimum(fraction_new, 1.0)
+        fraction_new = np.where(is_any_right, np.minimum(fraction_new, 1.0), 0.0)
         fault_weight = right_again / divisor[:, None]
         free_gains_weight = fault_weight[:, hypothesis_weights.FREE_GAINS_OF_FAULTS]
         gauge_weight = np.ascontiguousarray(fault_weight[:, hypothesis_weights.GAUGES_OF_FAULTS])
 
         beliefs = state.beliefs
-        new_belief = weighted_belief(gauge_weight, beliefs.gauge)
-        new_belief += free_gains_weight[:, None] * beliefs.free_gains
-        total = new_belief.sum(axis=1)
-        fraction_new = np.where(is_any_right & (total > 0.0), fraction_new, 0.0)
-        new_belief /= np.where(total > 0.0, total, 1.0)[:, None]
-        beliefs.recovered[:] += fraction_new[:, None] * (new_belief - beliefs.recovered)
-
         # Sums of squares: those of the model for a sound gauge and those of the fault for a faulty
         # one, averaged over the faults by their weights.
         model_squares = beliefs.model_squares
@@ -363,6 +364,7 @@ class FaultFilter:
         beliefs.recovered_squares[:] += fraction_new[:, None] * (
             new_squares - beliefs.recovered_squares
         )
+        return Recoveries(fraction_new, gauge_weight, np.ascontiguousarray(free_gains_weight))
 
     def assimilate(self, state: WatchState, observations: Observations) -> None:
         """Correct the beliefs and weights of all hypotheses of B twins by an observation of each.

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index, Single
-from twin_master.network.kernels import PredecessorLists
 
 NEGLIGIBLE_UNDER_MODEL = 1e-30
 """Pairs of draw and state of smaller probability are left out of the evidence of the model."""
@@ -123,6 +122,8 @@ class Beliefs(NamedTuple):
         The belief under the model, and after a fault has ended.
     gauge : (B, N, R) array
         The belief under each fault of a gauge, gauge by gauge; most entries are zero.
+    gauge_is_nonzero : (B, N) array of bool
+        Whether any fault of a gauge believes in the pair; else its row of `gauge` is zero.
     free_gains : (B, N) array
         The belief if several gauges have unknown gains.
     model_squares, recovered_squares : (B, G) array
@@ -135,6 +136,7 @@ class Beliefs(NamedTuple):
     model: Float
     recovered: Float
     gauge: Single
+    gauge_is_nonzero: NDArray[np.bool_]
     free_gains: Single
     model_squares: Float
     recovered_squares: Float
@@ -180,136 +182,6 @@ class StandardizedObservation(NamedTuple):
     prediction: Float
     log_density: Float
     degrees_after: Float
-
-
-# ----------------------------------------------------------------------------------------------
-# The transition
-# ----------------------------------------------------------------------------------------------
-
-
-@compiled
-def advance_belief(
-    lists: PredecessorLists,
-    control: int,
-    inner_count: int,
-    belief: Float | Single,
-    work: Float | Single,
-) -> None:
-    """Advance a belief by one transition of the states, in place.
-
-    The blocks are applied one after the other, each along its own axis of the joint state.
-
-    Parameters
-    ----------
-    lists : PredecessorLists
-        The predecessors of each level.
-    control : int
-        The control before the transition.
-    inner_count : int
-        The number of entries of each state.
-    belief, work : (S inner_count,) array
-        The belief, in the order of the states, and work space.
-    """
-    levels, first_row, start, predecessor, probability, _ = lists
-    outer = 1
-    inner = len(belief)
-    is_nonzero = np.empty(len(belief) // inner_count, np.bool_)
-    for block in range(len(levels)):
-        level_count = levels[block]
-        inner //= level_count  # states of later blocks, times the entries of a state
-        for row in range(outer * level_count):
-            total = 0.0
-            for i in range(row * inner, (row + 1) * inner):
-                total += belief[i]
-            is_nonzero[row] = total > 0.0
-        for row in range(outer * level_count):
-            o, level = divmod(row, level_count)
-            target = work[row * inner : (row + 1) * inner]
-            for i in range(inner):
-                target[i] = 0.0
-            list_row = first_row[block] + control * level_count + level
-            for k in range(start[list_row], start[list_row + 1]):
-                before = o * level_count + np.int64(predecessor[k])
-                if is_nonzero[before]:
-                    source = belief[before * inner : (before + 1) * inner]
-                    weight = work.dtype.type(probability[k])
-                    for i in range(inner):
-                        target[i] += weight * source[i]
-        for i in range(len(belief)):
-            belief[i] = work[i]
-        outer *= level_count
-
-
-@compiled
-def advance_beliefs(lists: PredecessorLists, control: Index, draws: int, beliefs: Beliefs) -> None:
-    """Advance all beliefs of B twins by one transition, in place.
-
-    Parameters
-    ----------
-    lists : PredecessorLists
-        The predecessors of each level.
-    control : (B,) array
-        The control of the step before.
-    draws : int
-        The number E of draws.
-    beliefs : Beliefs
-        The beliefs; updated in place.
-    """
-    twins, pairs, faults = beliefs.gauge.shape
-    work = np.empty(pairs)
-    single_work = np.empty(pairs * faults, np.float32)
-    for twin in range(twins):
-        now = control[twin]
-        gauge = beliefs.gauge[twin].reshape(pairs * faults)
-        advance_belief(lists, now, draws, beliefs.model[twin], work)
-        advance_belief(lists, now, draws, beliefs.recovered[twin], work)
-        advance_belief(lists, now, draws, beliefs.free_gains[twin], single_work[:pairs])
-        advance_belief(lists, now, draws * faults, gauge, single_work)
-
-
-@compiled
-def mix_in_model(model_belief: Float, earlier_weight: Float, fault_belief: Single) -> None:
-    """Let faults begin: mix the belief of the model into the beliefs of faults, in place.
-
-    A fault that begins now has the belief of the model. It is mixed with the belief of the fault
-    that began earlier, so that one belief stands for all first steps.
-
-    Parameters
-    ----------
-    model_belief : (B, N) array
-        The belief of the model of each twin.
-    earlier_weight : (B, R) array
-        The probability that each fault began before this step, if it has begun at all.
-    fault_belief : (B, N, R) array
-        The beliefs of the faults; updated in place.
-    """
-    twins, pairs, faults = fault_belief.shape
-    earlier = np.empty(faults, np.float32)  # single precision, as the beliefs
-    new = np.empty(faults, np.float32)
-    for twin in range(twins):
-        for r in range(faults):
-            earlier[r] = np.float32(earlier_weight[twin, r])
-            new[r] = np.float32(1.0) - earlier[r]
-        for i in range(pairs):
-            model = np.float32(model_belief[twin, i])
-            belief = fault_belief[twin, i]
-            for r in range(faults):
-                belief[r] = earlier[r] * belief[r] + new[r] * model
-
-
-@compiled
-def weighted_belief(weight: Float, fault_belief: Single) -> Float:
-    """Return the sum of weights (B, R) times beliefs (B, N, R) over the faults: (B, N)."""
-    twins, pairs, faults = fault_belief.shape
-    result = np.empty((twins, pairs))
-    for twin in range(twins):
-        for i in range(pairs):
-            belief = fault_belief[twin, i]
-            total = 0.0
-            for r in range(faults):
-                total += weight[twin, r] * belief[r]
-            result[twin, i] = total
-    return result
 
 
 # ----------------------------------------------------------------------------------------------

@@ -284,5 +284,6 @@ def update_gauge_faults(
     for j in range(len(model.pair)):
         row = weight[j]
         posterior = belief[model.pair[j]]
+        beliefs.gauge_is_nonzero[twin, model.pair[j]] = True
         for r in range(count):
             posterior[r] = row[r] * inverse[r]

@@ -15,7 +15,6 @@ from reporting.arrays import Float, Index
 from twin_master.learning import hypothesis_weights
 from twin_master.learning.fault_filter import FaultFilter
 from twin_master.learning.fault_kernels import Observations
-from twin_master.learning.hypothesis_weights import HypothesisBeliefs
 from twin_master.learning.notices import NoticeWriter
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
@@ -176,14 +175,9 @@ class GaugeWatch:
         self.faults.assimilate(state, checked.observations)
         notices = self._report_absurd_readings(state, checked, step)
         self._raise_alarms(state, notices, step)
-        beliefs = self.beliefs(state, model_belief)
-        self._report_followed_hypothesis(state, beliefs, notices, step)
-        state.mixed = hypothesis_weights.mix_beliefs(state.weights, beliefs)
+        self._report_followed_hypothesis(state, notices, step)
+        state.mixed = hypothesis_weights.mix_beliefs(state.weights, model_belief, state.beliefs)
         return notices
-
-    def beliefs(self, state: WatchState, model_belief: Float) -> HypothesisBeliefs:
-        """Return the beliefs about the state under all hypotheses that believe in one."""
-        return HypothesisBeliefs(model_belief, state.beliefs.recovered, state.beliefs.gauge)
 
     def _report_absurd_readings(
         self, state: WatchState, checked: CheckedReadings, step: int
@@ -219,11 +213,7 @@ class GaugeWatch:
             )
 
     def _report_followed_hypothesis(
-        self,
-        state: WatchState,
-        beliefs: HypothesisBeliefs,
-        notices: Sequence[list[Notice]],
-        step: int,
+        self, state: WatchState, notices: Sequence[list[Notice]], step: int
     ) -> None:
         """Append a notice for each twin that follows another hypothesis than before."""
         hypothesis, probability = hypothesis_weights.most_probable_hypothesis(
@@ -280,7 +270,6 @@ class GaugeWatch:
         model_belief : (1, S) array
             Its filtered belief under the model.
         """
-        beliefs = self.beliefs(state, model_belief)
         return hypothesis_weights.list_hypotheses(
-            state.weights, beliefs, self._notices.hypothesis_names
+            state.weights, model_belief, state.beliefs, self._notices.hypothesis_names
         )

@@ -22,8 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reporting.arrays import Float, Index, Single
-from twin_master.learning.fault_kernels import weighted_belief
+from reporting.arrays import Float, Index
+from twin_master.learning.belief_transitions import average_competing_beliefs
+from twin_master.learning.fault_kernels import Beliefs
 from twin_master.network.estimator import Hypothesis
 
 MODEL = 0
@@ -239,25 +240,6 @@ class HypothesisWeights:
 
 
 @dataclass(frozen=True)
-class HypothesisBeliefs:
-    """The beliefs about the state under all hypotheses but free gains, which no state explains.
-
-    Attributes
-    ----------
-    model : (B, S) array
-        The belief of each twin about the state under the model.
-    recovered : (B, S E) array
-        The belief over states and draws under "recovered", and under a gauge fault that is hidden.
-    gauge : (B, S E, G K) array
-        The same under each fault of a gauge that shows, gauge by gauge.
-    """
-
-    model: Float
-    recovered: Float
-    gauge: Single
-
-
-@dataclass(frozen=True)
 class MixedBelief:
     """The beliefs of B twins about the state, averaged over all hypotheses but free gains.
 
@@ -276,7 +258,9 @@ class MixedBelief:
     model_weight: Float
 
 
-def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> MixedBelief:
+def mix_beliefs(
+    weights: HypothesisWeights, model_belief: Float, beliefs: Beliefs
+) -> MixedBelief:
     """Return the beliefs about the state, averaged over all hypotheses but free gains.
 
     Under free gains no state explains the sensors, so that they add nothing to the belief.
@@ -285,8 +269,10 @@ def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> Mixed
     ----------
     weights : HypothesisWeights
         The log weights of B twins.
-    beliefs : HypothesisBeliefs
-        Their beliefs under each hypothesis.
+    model_belief : (B, S) array
+        Their beliefs about the state under the model.
+    beliefs : Beliefs
+        Their beliefs under each other hypothesis.
     """
     # Normalise the weights without free gains, under which no state is believed.
     log_hidden = weights.hidden[:, GAUGES_OF_FAULTS]
@@ -300,21 +286,22 @@ def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> Mixed
     model_weight = current_weight[:, MODEL]
     right_after_fault = current_weight[:, RECOVERED] + hidden_weight.sum(axis=1)
     gauge_weight = np.ascontiguousarray(current_weight[:, GAUGE_FAULTS])
-    by_pair = weighted_belief(gauge_weight, beliefs.gauge)
-    by_pair += right_after_fault[:, None] * beliefs.recovered
-    twins, states = beliefs.model.shape
-    competing = by_pair.reshape(twins, states, -1).sum(axis=2)
+    competing = np.empty_like(model_belief)
+    average_competing_beliefs(right_after_fault, gauge_weight, beliefs, competing)
     competing_sum = competing.sum(axis=1)[:, None]
     is_any_competing = competing_sum > 0.0
     competing = np.where(
-        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), beliefs.model
+        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), model_belief
     )
-    belief = model_weight[:, None] * beliefs.model + (1.0 - model_weight)[:, None] * competing
+    belief = model_weight[:, None] * model_belief + (1.0 - model_weight)[:, None] * competing
     return MixedBelief(belief, competing, model_weight)
 
 
 def list_hypotheses(
-    weights: HypothesisWeights, beliefs: HypothesisBeliefs, gauge_names: tuple[str, ...]
+    weights: HypothesisWeights,
+    model_belief: Float,
+    beliefs: Beliefs,
+    gauge_names: tuple[str, ...],
 ) -> tuple[Hypothesis, ...]:
     """Return the competing hypotheses of one twin, with their probabilities and beliefs.
 
@@ -325,8 +312,10 @@ def list_hypotheses(
     ----------
     weights : HypothesisWeights
         The log weights, with a leading axis of length one.
-    beliefs : HypothesisBeliefs
-        The belief of each hypothesis about the state, of one twin.
+    model_belief : (1, S) array
+        The belief about the state under the model.
+    beliefs : Beliefs
+        The beliefs under each other hypothesis, of one twin.
     gauge_names : tuple of str
         The names of the G faults of the gauges, such as "gauge 5 off".
     """
@@ -336,12 +325,12 @@ def list_hypotheses(
     showing_probability = probability[GAUGE_FAULTS].reshape(gauge_count, -1)  # (G, K)
     hidden_probability = np.exp(log_hidden[GAUGES_OF_FAULTS]).reshape(gauge_count, -1)  # (G, K)
     gauge_probability = (showing_probability + hidden_probability).sum(axis=1)  # (G,)
-    state_count = beliefs.model.shape[1]
+    state_count = model_belief.shape[1]
     recovered_belief = beliefs.recovered.reshape(state_count, -1).sum(axis=1)  # (S,)
 
     # The gauges are right: the mixture of the model's belief and of that after a fault has ended.
     sound_probability = probability[SOUND_HYPOTHESES].sum()
-    sound_belief = beliefs.model[0]
+    sound_belief = model_belief[0]
     if probability[RECOVERED] > 0.0:
         joint = probability[MODEL] * sound_belief + probability[RECOVERED] * recovered_belief
         sound_belief = joint / sound_probability

@@ -15,6 +15,8 @@ from twin_master.learning.fault_kernels import (
     StandardizedObservation,
 )
 
+_NEGLIGIBLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
+
 
 class ModelLikelihood(NamedTuple):
     """How the model explains an observation: what the densities of faults are compared with.
@@ -49,21 +51,25 @@ class ModelLikelihood(NamedTuple):
 
 @compiled
 def considered_pairs(beliefs: Beliefs, twin: int) -> Index:
-    """Return the indices (n,) of the pairs that some fault of a twin considers."""
+    """Return the indices (n,) of the pairs that some fault of a twin considers.
+
+    The rows of all other pairs among the beliefs of the faults become zero.
+    """
     _, pairs, faults = beliefs.gauge.shape
     considered = np.empty(pairs, np.int64)
     count = 0
     for i in range(pairs):
-        belief = beliefs.gauge[twin, i]
-        largest = beliefs.free_gains[twin, i]
-        for r in range(faults):
-            largest = max(largest, belief[r])
-        if largest >= NEGLIGIBLE_UNDER_FAULT:
+        considering = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
+        if beliefs.gauge_is_nonzero[twin, i]:
+            for r in range(faults):
+                considering += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
+        if considering > 0:
             considered[count] = i
             count += 1
-        else:
+        elif beliefs.gauge_is_nonzero[twin, i]:
             for r in range(faults):
-                belief[r] = 0.0
+                beliefs.gauge[twin, i, r] = 0.0
+            beliefs.gauge_is_nonzero[twin, i] = False
     return considered[:count]
 
 
