@@ -70,7 +70,8 @@ def compiled(
         The function, in the subset of Python that numba knows.
     calls : iterable of callable
         Plain functions of other files that it calls: numba by itself sees changes of its own file
-        only. The files of compiled functions that its module names are found without them.
+        only. The files of compiled functions that its module names, and of those that their
+        modules name, are found without them.
     reorders_sums : bool
         Whether the compiler may add in another order than the one that is written, which vector
         instructions need. Results then repeat to the last bit on one processor; between
@@ -78,11 +79,9 @@ def compiled(
     """
     if numba is None:
         return _plain_with_note(function)
-    compiled_callees = [
-        value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")
-    ]
     options = dict(OPTIONS, fastmath=set(REORDERED_SUMS)) if reorders_sums else OPTIONS
-    source_files = [inspect.getfile(source) for source in (function, *calls, *compiled_callees)]
+    sources = (function, *calls, *_compiled_callees(function))
+    source_files = [inspect.getfile(source) for source in sources]
     with _cache_named_by_sources(source_files):
         try:
             compiled_function = numba.njit(cache=True, **options)(function)
@@ -90,6 +89,19 @@ def compiled(
         except RuntimeError:  # raised by numba if it finds no folder that it can write to
             compiled_function = numba.njit(**options)(function)
     return cast("Callable[Parameters, Result]", compiled_function)
+
+
+def _compiled_callees(function: NumericalFunction) -> list[NumericalFunction]:
+    """Return the compiled functions that a function's module names, and those that theirs name."""
+    callees: dict[NumericalFunction, None] = {}
+    callers = [function]
+    while callers:
+        for value in callers.pop().__globals__.values():
+            callee = getattr(value, "py_func", None)
+            if callee is not None and callee not in callees:
+                callees[callee] = None
+                callers.append(callee)
+    return list(callees)
 
 
 def compiled_with_reordered_sums(

@@ -2,9 +2,9 @@
 
 `python -m benchmarks.studies.watched_flights --write FILE` flies `growing_damage` and
 `level_turns` with notices, side by side, and writes what the twins concluded. The same command of
-another version with `--compare FILE` flies the same flights and prints the largest differences. In a
-quarter of the flights nothing is wrong, in a quarter a gauge shows 20 % too much or too little, in
-a quarter half of the gauges show 33 % too little, and in a quarter wires break.
+another version with `--compare FILE` flies the same flights and prints the largest differences. A
+quarter of the flights has no fault. In the other quarters a gauge shows 20 % too much or too
+little, half of the gauges show 33 % too little, or wires break.
 """
 
 import argparse
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
-from twin_master.assets.asset_source import AssetReading, StatelessAsset
+from reporting.arrays import AnyArray
+from twin_master.assets.asset_source import Asset, AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
@@ -30,7 +31,7 @@ FAULTY_ASSETS = 8
 """Wings with a fault of their own of each kind."""
 
 
-def with_gains(asset: StatelessAsset, gains: Float) -> StatelessAsset:
+def with_gains(asset: Asset, gains: Float) -> StatelessAsset:
     """Return an asset whose gauges show factors `gains` (G,) times their values."""
     return StatelessAsset(
         lambda control, health: AssetReading(asset.step(control, health).values * gains)
@@ -74,7 +75,7 @@ def fly(name: str, flights: int) -> Flights:
     return fly_side_by_side(knowledge, truths, assets)
 
 
-def conclusions(flights: Flights) -> dict[str, NDArray[np.generic]]:
+def conclusions(flights: Flights) -> dict[str, AnyArray]:
     """Return what the twins concluded, by name."""
     notices = [
         " ".join(f"{step} {notice.kind} {notice.sensors};" for step, notice in notices)
@@ -99,7 +100,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path, help="file for the conclusions of this version")
     parser.add_argument("--compare", type=Path, help="file with the conclusions of another version")
     arguments = parser.parse_args()
-    present: dict[str, NDArray[np.generic]] = {}
+    present: dict[str, AnyArray] = {}
     for name in SCENARIOS:
         for key, array in conclusions(fly(name, arguments.flights // len(SCENARIOS))).items():
             present[f"{name} {key}"] = array
@@ -112,7 +113,7 @@ def main() -> int:
     return 0 if all(are_same) else 1
 
 
-def print_difference(name: str, present: NDArray[np.generic], former: NDArray[np.generic]) -> bool:
+def print_difference(name: str, present: AnyArray, former: AnyArray) -> bool:
     """Print how far an array is from that of another version; return false if it should not be."""
     if present.shape != former.shape:
         print(f"{name}: {present.size} numbers, and {former.size} in the other version")
@@ -122,7 +123,7 @@ def print_difference(name: str, present: NDArray[np.generic], former: NDArray[np
         return True
     same = np.count_nonzero(present == former)
     print(f"{name}: {same} of {present.size} are the same")
-    return same == present.size
+    return bool(same == present.size)
 
 
 if __name__ == "__main__":

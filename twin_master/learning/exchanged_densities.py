@@ -80,14 +80,14 @@ class ExchangeWork(NamedTuple):
 
     Attributes
     ----------
-    excess, power, inverse_variance : (L,) array
-        The excess of a ratio of kernels over one, its power, and one over the variance.
+    excess, power_excess, inverse_variance : (L,) array
+        The excess of a ratio of kernels over one, that of its power, and one over the variance.
     is_denser : (L,) array of bool
         Whether the density is larger than that of the model, relative to the reference pair.
     """
 
     excess: Single
-    power: Single
+    power_excess: Single
     inverse_variance: Single
     is_denser: NDArray[np.bool_]
 
@@ -201,8 +201,8 @@ def exchange_factors(
 
 
 @compiled_with_reordered_sums
-def _raise_to_powers(excess: Single, digits: Single, power: Single) -> None:
-    """Fill in powers (L,) of 1 + excess, given the digits of the exponents.
+def _raise_to_powers(excess: Single, digits: Single, power_excess: Single) -> None:
+    """Fill in the excess over one of powers (L,) of 1 + excess, given the digits of the exponents.
 
     They are taken by squaring and multiplying the excess over one: (1 + z)^2 = 1 + z (2 + z). So
     single precision suffices for an excess of at least zero, however large the exponent.
@@ -210,12 +210,12 @@ def _raise_to_powers(excess: Single, digits: Single, power: Single) -> None:
     one = np.float32(1.0)
     two = np.float32(2.0)
     for number in range(len(excess)):
-        power[number] = one
+        power_excess[number] = np.float32(0.0)
     for first in range(0, len(digits), _DIGITS_TOGETHER):
         # Six digits are written out, so that the numbers stay in registers.
         for number in range(len(excess)):
             z = excess[number]
-            y = power[number] - one
+            y = power_excess[number]
             y *= two + y
             y += digits[first, number] * z * (one + y)
             y *= two + y
@@ -228,7 +228,7 @@ def _raise_to_powers(excess: Single, digits: Single, power: Single) -> None:
             y += digits[first + 4, number] * z * (one + y)
             y *= two + y
             y += digits[first + 5, number] * z * (one + y)
-            power[number] = one + y
+            power_excess[number] = y
 
 
 @compiled_with_reordered_sums
@@ -258,7 +258,7 @@ def exchange_densities(
     work : ExchangeWork
         Work space.
     """
-    excess, power, inverse_variance, is_denser = work
+    excess, power_excess, inverse_variance, is_denser = work
     one = np.float32(1.0)
     zero = np.float32(0.0)
     for number in range(len(ratio)):
@@ -280,11 +280,13 @@ def exchange_densities(
         z = abs(difference) * variance * inverse
         is_denser[number] = difference < zero
         excess[number] = z if is_denser[number] else min(z, factors.largest_excess[number])
-    _raise_to_powers(excess, factors.digits, power)
+    _raise_to_powers(excess, factors.digits, power_excess)
     if factors.has_fractions:
         for number in range(len(ratio)):
             base = np.float64(one + excess[number])
-            power[number] *= np.float32(base ** factors.fractions[number])
+            power = np.float32(base ** factors.fractions[number])
+            power_excess[number] = power * (one + power_excess[number]) - one
     for number in range(len(ratio)):
-        relative = power[number] if is_denser[number] else one / power[number]
+        power = one + power_excess[number]
+        relative = power if is_denser[number] else one / power
         ratio[number] = np.sqrt(inverse_variance[number] * relative)

@@ -106,7 +106,9 @@ def correct_beliefs(
             density,
         )
         log_evidence.model[twin] = evidence.log_evidence
-        model = model_likelihood(observation, of_faults, model_squares, density, evidence.log_factor)
+        model = model_likelihood(
+            observation, of_faults, model_squares, density, evidence.log_factor
+        )
         update_gauge_faults(observation, model, priors, beliefs, twin, log_evidence.gauge[twin])
         log_evidence.free_gains[twin] = update_free_gains(
             observation, model, priors, beliefs.free_gains[twin], statistics, twin

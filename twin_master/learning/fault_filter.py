@@ -11,7 +11,7 @@ from twin_master.learning import hypothesis_weights
 from twin_master.learning.belief_transitions import Onsets, Recoveries, advance_beliefs
 from twin_master.learning.fault_evidence import correct_beliefs
 from twin_master.learning.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
-from twin_master.learning.hypothesis_weights import HypothesisWeights
+from twin_master.learning.hypothesis_weights import HypothesisWeights, log_of_sum
 from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, FROM_THE_START, WatchState
 from twin_master.network.estimator import Carried
 from twin_master.network.graphical_model import GraphicalModel
@@ -227,7 +227,7 @@ class FaultFilter:
         beliefs = state.beliefs
         gains = len(_GAINS)
         log_begin = log_begins_now[:, None] - np.log(gains)  # each gain with equal probability
-        log_total = np.logaddexp(state.log_gauge_evidence, log_begin)
+        log_total = log_of_sum(state.log_gauge_evidence, log_begin)
         earlier_weight = np.exp(state.log_gauge_evidence - log_total)
         state.log_gauge_evidence = log_total
         state.gauge_onset += (1.0 - earlier_weight) * (
@@ -259,7 +259,7 @@ class FaultFilter:
             The log prior probability that the fault begins in this step.
         """
         beliefs = state.beliefs
-        log_total = np.logaddexp(state.log_free_gains_evidence, log_begins_now)
+        log_total = log_of_sum(state.log_free_gains_evidence, log_begins_now)
         earlier_weight = np.exp(state.log_free_gains_evidence - log_total)[:, None]
         state.log_free_gains_evidence = log_total
         new_weight = 1.0 - earlier_weight

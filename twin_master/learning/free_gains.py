@@ -183,9 +183,7 @@ def weigh_free_gains_in_logs(
     gauges = len(free_probability)
     count = len(believed)
     log_density = np.empty(count)
-    log_density_of_sound_gauges(
-        observation, model.pair[believed], model.scale_squares, log_density
-    )
+    log_density_of_sound_gauges(observation, model.pair[believed], model.scale_squares, log_density)
     largest = -np.inf
     for m in range(count):
         i = model.pair[believed[m]]
@@ -250,9 +248,7 @@ def update_free_gains(
     free_probability = np.empty(len(observation.present))
     for g in range(len(free_probability)):  # rounding may exceed one
         free_probability[g] = min(max(statistics.free_probability[twin, g], 0.0), 1.0)
-    weights = weigh_free_gains(
-        observation, model, densities, free_probability, believed, belief
-    )
+    weights = weigh_free_gains(observation, model, densities, free_probability, believed, belief)
     log_scale = model.log_density
     total = 0.0
     for m in range(count):

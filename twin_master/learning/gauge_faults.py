@@ -227,6 +227,7 @@ def update_gauge_faults(
     belief = beliefs.gauge[twin]
     weight, sums = weigh_gauge_faults(observation, model, faults, belief)
     inverse = np.empty(count, np.float32)
+    zero = np.float32(0.0)
     for r in range(count):
         log_scale = model.log_density + log_reference_density(observation, model, faults, r)
         largest = sums.weight[r] + sums.squares[r] + sums.predictions[r] + abs(sums.products[r])
@@ -248,6 +249,8 @@ def update_gauge_faults(
         beliefs.gauge_sum_cx[twin, r] += sum_of_c_x * inverse[r]
     for j in range(len(model.pair)):
         i = model.pair[j]
-        beliefs.gauge_is_nonzero[twin, i] = True
+        believing = np.int64(0)
         for r in range(count):
             belief[i, r] = weight[j, r] * inverse[r]
+            believing += belief[i, r] > zero
+        beliefs.gauge_is_nonzero[twin, i] = believing > 0

@@ -15,6 +15,7 @@ from reporting.arrays import Float, Index
 from twin_master.learning import hypothesis_weights
 from twin_master.learning.fault_filter import FaultFilter
 from twin_master.learning.fault_kernels import Observations
+from twin_master.learning.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.learning.notices import NoticeWriter
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
@@ -240,11 +241,11 @@ class GaugeWatch:
         log_begins_later = np.log(self.faults.probability_to_begin_after(state.step_count - 1.0))
         twins, gauges = state.left_out.shape
         by_gauge = state.log_gauge_evidence.reshape(twins, gauges, -1)
-        log_fault_has_begun = np.logaddexp.reduce(by_gauge, axis=2)
-        each_gauge = np.logaddexp(log_fault_has_begun, log_begins_later[:, None])
+        log_fault_has_begun = log_of_sums(by_gauge)
+        each_gauge = log_of_sum(log_fault_has_begun, log_begins_later[:, None])
         return AlarmEvidence(
-            free_gains=np.logaddexp(state.log_free_gains_evidence, log_begins_later),
-            any_gauge=np.logaddexp.reduce(each_gauge + self.faults.log_gauge_prior, axis=1),
+            free_gains=log_of_sum(state.log_free_gains_evidence, log_begins_later),
+            any_gauge=log_of_sums(each_gauge + self.faults.log_gauge_prior),
             each_gauge=each_gauge,
         )
 
