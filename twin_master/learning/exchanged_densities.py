@@ -4,12 +4,12 @@ Notation and method are those of `fault_kernels`. Single precision suffices: the
 densities of a gauge is a power of a number near one, which is kept as its excess over one.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fe.compilation import compiled, compiled_with_reordered_sums
+from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index, Single
 from twin_master.learning.fault_kernels import StandardizedObservation
 from twin_master.learning.model_likelihood import ModelLikelihood
@@ -19,6 +19,10 @@ _DIGITS_TOGETHER = 6
 
 _LARGEST_LOG_POWER = 82.0
 """Powers of kernels are cut to exp(82), the square of exp(41): larger ones may overflow."""
+
+_inlined = partial(callable_when_compiled, makes_arrays=False, inline=True)
+"""Decorator of functions that become part of their callers: the compiler vectorises a loop only
+where it sees that the arrays were made one by one."""
 
 
 class GaugeDensities(NamedTuple):
@@ -82,14 +86,14 @@ class ExchangeWork(NamedTuple):
     ----------
     excess, power_excess, inverse_variance : (L,) array
         The excess of a ratio of kernels over one, that of its power, and one over the variance.
-    is_denser : (L,) array of bool
-        Whether the density is larger than that of the model, relative to the reference pair.
+    sign : (L,) array
+        Negative where the density is larger than that of the model, relative to the reference pair.
     """
 
     excess: Single
     power_excess: Single
     inverse_variance: Single
-    is_denser: NDArray[np.bool_]
+    sign: Single
 
 
 @compiled
@@ -200,38 +204,42 @@ def exchange_factors(
     )
 
 
-@compiled_with_reordered_sums
-def _raise_to_powers(excess: Single, digits: Single, power_excess: Single) -> None:
-    """Fill in the excess over one of powers (L,) of 1 + excess, given the digits of the exponents.
+@_inlined
+def _append_digits(power: float, excess: float, digits: Single, first: int, number: int) -> float:
+    """Return a power with six more binary digits of the exponent; all as excesses over one.
 
-    They are taken by squaring and multiplying the excess over one: (1 + z)^2 = 1 + z (2 + z). So
-    single precision suffices for an excess of at least zero, however large the exponent.
+    The power is squared for each digit, and multiplied by the base if the digit is one:
+    (1 + z)^2 = 1 + z (2 + z). So single precision suffices for an excess of at least zero, however
+    large the exponent. The digits are written out, so that the numbers stay in registers.
+
+    Parameters
+    ----------
+    power, excess : float
+        The excess of a power and of its base over one.
+    digits : (6 m, L) array
+        The binary digits of the exponents of L numbers.
+    first : int
+        The first of the digits that are appended.
+    number : int
+        Which of the L numbers.
     """
     one = np.float32(1.0)
     two = np.float32(2.0)
-    for number in range(len(excess)):
-        power_excess[number] = np.float32(0.0)
-    for first in range(0, len(digits), _DIGITS_TOGETHER):
-        # Six digits are written out, so that the numbers stay in registers.
-        for number in range(len(excess)):
-            z = excess[number]
-            y = power_excess[number]
-            y *= two + y
-            y += digits[first, number] * z * (one + y)
-            y *= two + y
-            y += digits[first + 1, number] * z * (one + y)
-            y *= two + y
-            y += digits[first + 2, number] * z * (one + y)
-            y *= two + y
-            y += digits[first + 3, number] * z * (one + y)
-            y *= two + y
-            y += digits[first + 4, number] * z * (one + y)
-            y *= two + y
-            y += digits[first + 5, number] * z * (one + y)
-            power_excess[number] = y
+    power *= two + power
+    power += digits[first, number] * excess * (one + power)
+    power *= two + power
+    power += digits[first + 1, number] * excess * (one + power)
+    power *= two + power
+    power += digits[first + 2, number] * excess * (one + power)
+    power *= two + power
+    power += digits[first + 3, number] * excess * (one + power)
+    power *= two + power
+    power += digits[first + 4, number] * excess * (one + power)
+    power *= two + power
+    return power + digits[first + 5, number] * excess * (one + power)
 
 
-@compiled_with_reordered_sums
+@_inlined
 def exchange_densities(
     factors: ExchangeFactors,
     residual: Single,
@@ -258,7 +266,7 @@ def exchange_densities(
     work : ExchangeWork
         Work space.
     """
-    excess, power_excess, inverse_variance, is_denser = work
+    excess, power_excess, inverse_variance, sign = work
     one = np.float32(1.0)
     zero = np.float32(0.0)
     for number in range(len(ratio)):
@@ -278,9 +286,15 @@ def exchange_densities(
         inverse_variance[number] = smaller * inverse
         square[number] = innovation_squared * inverse_variance[number]
         z = abs(difference) * variance * inverse
-        is_denser[number] = difference < zero
-        excess[number] = z if is_denser[number] else min(z, factors.largest_excess[number])
-    _raise_to_powers(excess, factors.digits, power_excess)
+        z = z if difference < zero else min(z, factors.largest_excess[number])
+        excess[number] = z
+        power_excess[number] = _append_digits(zero, z, factors.digits, 0, number)
+        sign[number] = difference
+    for first in range(_DIGITS_TOGETHER, len(factors.digits), _DIGITS_TOGETHER):
+        for number in range(len(ratio)):
+            power_excess[number] = _append_digits(
+                power_excess[number], excess[number], factors.digits, first, number
+            )
     if factors.has_fractions:
         for number in range(len(ratio)):
             base = np.float64(one + excess[number])
@@ -288,5 +302,5 @@ def exchange_densities(
             power_excess[number] = power * (one + power_excess[number]) - one
     for number in range(len(ratio)):
         power = one + power_excess[number]
-        relative = power if is_denser[number] else one / power
+        relative = power if sign[number] < zero else one / power
         ratio[number] = np.sqrt(inverse_variance[number] * relative)

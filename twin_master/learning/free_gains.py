@@ -142,7 +142,7 @@ def weigh_free_gains(
         np.empty(2 * gauges, np.float32),
         np.empty(2 * gauges, np.float32),
         np.empty(2 * gauges, np.float32),
-        np.empty(2 * gauges, np.bool_),
+        np.empty(2 * gauges, np.float32),
     )
     for m in range(count):
         i = model.pair[believed[m]]

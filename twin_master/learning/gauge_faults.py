@@ -92,7 +92,7 @@ def weigh_gauge_faults(
         np.empty(count, np.float32),
         np.empty(count, np.float32),
         np.empty(count, np.float32),
-        np.empty(count, np.bool_),
+        np.empty(count, np.float32),
     )
     row = np.empty(count, np.float32)
     sum_weight = np.zeros(count, np.float32)
