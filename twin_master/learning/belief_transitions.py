@@ -79,10 +79,10 @@ def advance_belief(
         level_count = levels[block]
         inner //= level_count  # states of later blocks, times the draws
         for row in range(outer * level_count):
-            total = 0.0
+            believing = np.int64(0)
             for i in range(row * inner, (row + 1) * inner):
-                total += belief[i]
-            is_nonzero[row] = total > 0.0
+                believing += belief[i] > 0.0
+            is_nonzero[row] = believing > 0
         for row in range(outer * level_count):
             o, level = divmod(row, level_count)
             target = work[row * inner : (row + 1) * inner]
@@ -202,12 +202,13 @@ def begin_gauge_faults(
     pairs, faults = rows.shape
     earlier = np.empty(faults, np.float32)  # single precision, as the beliefs
     new = np.empty(faults, np.float32)
-    weight = np.empty(faults)
-    new_weight = 0.0
+    weight = np.empty(faults, np.float32)
+    zero = np.float32(0.0)
+    new_weight = zero
     for r in range(faults):
         earlier[r] = np.float32(earlier_weight[r])
         new[r] = np.float32(1.0) - earlier[r]
-        weight[r] = recovered_weight[r]
+        weight[r] = np.float32(recovered_weight[r])
         new_weight += weight[r] * new[r]
     for i in range(pairs):
         model = np.float32(model_belief[i])
@@ -221,7 +222,7 @@ def begin_gauge_faults(
             for r in range(faults):
                 rows[i, r] = new[r] * model
             is_nonzero[i] = True
-        average = 0.0
+        average = zero
         for r in range(faults):
             average += weight[r] * rows[i, r]
         recovering[i] = average
@@ -297,11 +298,14 @@ def add_gauge_beliefs(weight: Float, beliefs: Beliefs, twin: int, average: Float
     """Add to `average` (S,) the beliefs about the state of a twin under faults of weights (R,)."""
     pairs, faults = beliefs.gauge.shape[1:]
     draws = pairs // len(average)
+    single_weight = np.empty(faults, np.float32)
+    for r in range(faults):
+        single_weight[r] = np.float32(weight[r])
     for i in range(pairs):
         if beliefs.gauge_is_nonzero[twin, i]:
-            total = 0.0
+            total = np.float32(0.0)
             for r in range(faults):
-                total += weight[r] * beliefs.gauge[twin, i, r]
+                total += single_weight[r] * beliefs.gauge[twin, i, r]
             average[i // draws] += total
 
 

@@ -186,7 +186,10 @@ def exchange_factors(
         factor[number] = ratio / densities.scale_squares[number]
         offset[number] = ratio - 1.0
         exponents[number] = observation.degrees_after[g]
-        largest_excess[number] = np.expm1(_LARGEST_LOG_POWER / exponents[number])
+        if number > 0 and exponents[number] == exponents[number - 1]:
+            largest_excess[number] = largest_excess[number - 1]
+        else:
+            largest_excess[number] = np.expm1(_LARGEST_LOG_POWER / exponents[number])
     fractions = exponents - np.floor(exponents)
     has_fractions = False
     for fraction in fractions:

@@ -29,6 +29,19 @@ from twin_master.learning.model_likelihood import (
 
 
 @compiled
+def _unfilled_observation(pairs: int, gauges: int) -> StandardizedObservation:
+    """Return the arrays of an observation of one twin, to be filled."""
+    return StandardizedObservation(
+        np.empty(gauges, np.bool_),
+        np.empty((pairs, gauges)),
+        np.empty((pairs, gauges)),
+        np.empty(pairs),
+        np.empty(gauges),
+        np.empty(gauges, np.int64),
+    )
+
+
+@compiled
 def correct_beliefs(
     predictions: Predictions,
     observations: Observations,
@@ -59,14 +72,7 @@ def correct_beliefs(
     """
     twins, gauges = observations.readings.shape
     pairs = beliefs.model.shape[1]
-    observation = StandardizedObservation(
-        np.empty(gauges, np.bool_),
-        np.empty((pairs, gauges)),
-        np.empty((pairs, gauges)),
-        np.empty(pairs),
-        np.empty(gauges),
-        np.empty(gauges, np.int64),
-    )
+    observation = _unfilled_observation(pairs, gauges)
     precision = np.empty(gauges)
     model_squares = np.empty(gauges)
     density = np.empty(pairs)

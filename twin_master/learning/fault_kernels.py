@@ -343,6 +343,8 @@ def standardize(
     draws = predictions.value.shape[1] // states
     is_present = np.empty(gauges)
     reading = np.empty(gauges)
+    prediction = np.empty(gauges)
+    residual = np.empty(gauges)
     for g in range(gauges):
         is_present[g] = 1.0 if observation.present[g] else 0.0
         reading[g] = observations.readings[twin, g] if observation.present[g] else 0.0
@@ -356,11 +358,15 @@ def standardize(
             for g in range(gauges):
                 log_scale += is_present[g] * predictions.log_inverse_deviation[control, state, g]
         observation.log_density[i] = log_scale
+        # The compiler vectorises loops that write to arrays of this function only.
         for g in range(gauges):
             value = predictions.value[control, i, g]
-            residual = reading[g] * predictions.inverse_deviation[control, i, g] - value
-            observation.prediction[i, g] = is_present[g] * value
-            observation.residual[i, g] = is_present[g] * residual
+            distance = reading[g] * predictions.inverse_deviation[control, i, g] - value
+            prediction[g] = is_present[g] * value
+            residual[g] = is_present[g] * distance
+        for g in range(gauges):
+            observation.prediction[i, g] = prediction[g]
+            observation.residual[i, g] = residual[g]
     if predictions.interval.shape[1] > 0:
         _fit_within_intervals(predictions.interval[control], precision, draws, pairs, observation)
 
@@ -462,7 +468,10 @@ def _density_by_products(
     for j in range(count):
         log_factor = max(log_factor, observation.log_density[pairs[j]])
     for j in range(count):
-        density[j] = np.exp(observation.log_density[pairs[j]] - log_factor)
+        log_density = observation.log_density[pairs[j]]
+        density[j] = 1.0  # mostly, because the noise seldom depends on the state
+        if log_density < log_factor:
+            density[j] = np.exp(log_density - log_factor)
     product = 0
     for g in range(gauges):
         if observation.product[g] != product:
