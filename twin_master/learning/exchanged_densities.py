@@ -208,7 +208,9 @@ def exchange_factors(
 
 
 @_inlined
-def _append_digits(power: float, excess: float, digits: Single, first: int, number: int) -> float:
+def _append_digits(
+    power: np.float32, excess: np.float32, digits: Single, first: int, number: int
+) -> np.float32:
     """Return a power with six more binary digits of the exponent; all as excesses over one.
 
     The power is squared for each digit, and multiplied by the base if the digit is one:
@@ -217,7 +219,7 @@ def _append_digits(power: float, excess: float, digits: Single, first: int, numb
 
     Parameters
     ----------
-    power, excess : float
+    power, excess : np.float32
         The excess of a power and of its base over one.
     digits : (6 m, L) array
         The binary digits of the exponents of L numbers.
@@ -239,7 +241,8 @@ def _append_digits(power: float, excess: float, digits: Single, first: int, numb
     power *= two + power
     power += digits[first + 4, number] * excess * (one + power)
     power *= two + power
-    return power + digits[first + 5, number] * excess * (one + power)
+    power += digits[first + 5, number] * excess * (one + power)
+    return power
 
 
 @_inlined
