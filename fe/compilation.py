@@ -40,6 +40,8 @@ _Function = TypeVar("_Function", bound=NumericalFunction)
 # error.
 OPTIONS: dict[str, bool | str] = {"nogil": True, "error_model": "numpy"}
 """Options of numba."""
+REORDERED_SUMS = frozenset({"reassoc", "contract", "nsz"})
+"""What the compiler may do with sums: add in another order, and round a product and a sum once."""
 
 WITHOUT_NUMBA = (
     "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, "
@@ -48,7 +50,10 @@ WITHOUT_NUMBA = (
 
 
 def compiled(
-    function: Callable[Parameters, Result], calls: Iterable[NumericalFunction] = ()
+    function: Callable[Parameters, Result],
+    calls: Iterable[NumericalFunction] = (),
+    *,
+    reorders_sums: bool = False,
 ) -> Callable[Parameters, Result]:
     """Return a function that numba compiles at the first call, and that runs without Python's lock.
 
@@ -65,21 +70,45 @@ def compiled(
         The function, in the subset of Python that numba knows.
     calls : iterable of callable
         Plain functions of other files that it calls: numba by itself sees changes of its own file
-        only. The files of compiled functions that its module names are found without them.
+        only. The files of compiled functions that its module names, and of those that their
+        modules name, are found without them.
+    reorders_sums : bool
+        Whether the compiler may add in another order than the one that is written, which vector
+        instructions need. Results then repeat to the last bit on one processor; between
+        processors, and from plain Python, they differ by rounding errors.
     """
     if numba is None:
         return _plain_with_note(function)
-    compiled_callees = [
-        value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")
-    ]
-    source_files = [inspect.getfile(source) for source in (function, *calls, *compiled_callees)]
+    options = dict(OPTIONS, fastmath=set(REORDERED_SUMS)) if reorders_sums else OPTIONS
+    sources = (function, *calls, *_compiled_callees(function))
+    source_files = [inspect.getfile(source) for source in sources]
     with _cache_named_by_sources(source_files):
         try:
-            compiled_function = numba.njit(cache=True, **OPTIONS)(function)
+            compiled_function = numba.njit(cache=True, **options)(function)
             compiled_function._cache = _KeptMachineCode(function)
         except RuntimeError:  # raised by numba if it finds no folder that it can write to
-            compiled_function = numba.njit(**OPTIONS)(function)
+            compiled_function = numba.njit(**options)(function)
     return cast("Callable[Parameters, Result]", compiled_function)
+
+
+def _compiled_callees(function: NumericalFunction) -> list[NumericalFunction]:
+    """Return the compiled functions that a function's module names, and those that theirs name."""
+    callees: dict[NumericalFunction, None] = {}
+    callers = [function]
+    while callers:
+        for value in callers.pop().__globals__.values():
+            callee = getattr(value, "py_func", None)
+            if callee is not None and callee not in callees:
+                callees[callee] = None
+                callers.append(callee)
+    return list(callees)
+
+
+def compiled_with_reordered_sums(
+    function: Callable[Parameters, Result],
+) -> Callable[Parameters, Result]:
+    """Return what `compiled` returns, where the compiler may reorder sums: as a decorator."""
+    return compiled(function, reorders_sums=True)
 
 
 def _plain_with_note(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:

@@ -15,12 +15,30 @@ from twin_master.learning.fault_kernels import (
     Observations,
     Predictions,
     StandardizedObservation,
+    number_products,
     standardize,
     update_sound_gauges,
 )
 from twin_master.learning.free_gains import update_free_gains
 from twin_master.learning.gauge_faults import update_gauge_faults
-from twin_master.learning.model_likelihood import considered_pairs, model_likelihood
+from twin_master.learning.model_likelihood import (
+    model_likelihood,
+    pairs_of_faults,
+    pairs_of_hypotheses,
+)
+
+
+@compiled
+def _unfilled_observation(pairs: int, gauges: int) -> StandardizedObservation:
+    """Return the arrays of an observation of one twin, to be filled."""
+    return StandardizedObservation(
+        np.empty(gauges, np.bool_),
+        np.empty((pairs, gauges)),
+        np.empty((pairs, gauges)),
+        np.empty(pairs),
+        np.empty(gauges),
+        np.empty(gauges, np.int64),
+    )
 
 
 @compiled
@@ -54,16 +72,10 @@ def correct_beliefs(
     """
     twins, gauges = observations.readings.shape
     pairs = beliefs.model.shape[1]
-    observation = StandardizedObservation(
-        np.empty(gauges, np.bool_),
-        np.empty((gauges, pairs)),
-        np.empty((gauges, pairs)),
-        np.empty(pairs),
-        np.empty(gauges),
-    )
+    observation = _unfilled_observation(pairs, gauges)
     precision = np.empty(gauges)
     model_squares = np.empty(gauges)
-    log_density = np.empty(pairs)
+    density = np.empty(pairs)
     for twin in range(twins):
         # Each hypothesis has learnt noise scales of its own. They enter the constant of Student's
         # density: 1 / sqrt(degrees of freedom + squares) for each gauge.
@@ -77,24 +89,32 @@ def correct_beliefs(
             if observation.present[g]:
                 recovered_squares = priors.degrees_of_freedom + beliefs.recovered_squares[twin, g]
                 log_scale_ratio += np.log(model_squares[g] / recovered_squares)
-        standardize(predictions, observations, twin, precision, observation)
+        number_products(observation.degrees_after, observation.product)
+        of_faults = pairs_of_faults(beliefs, twin)
+        considered = pairs_of_hypotheses(beliefs, twin, of_faults)
+        standardize(predictions, observations, twin, precision, considered, observation)
 
-        log_evidence.recovered[twin] = 0.5 * log_scale_ratio + update_sound_gauges(
+        recovered_evidence = update_sound_gauges(
             observation,
+            considered,
             priors.degrees_of_freedom,
             beliefs.recovered[twin],
             beliefs.recovered_squares[twin],
-            log_density,
+            density,
         )
-        log_evidence.model[twin] = update_sound_gauges(
+        log_evidence.recovered[twin] = recovered_evidence.log_evidence + 0.5 * log_scale_ratio
+        evidence = update_sound_gauges(
             observation,
+            considered,
             priors.degrees_of_freedom,
             beliefs.model[twin],
             beliefs.model_squares[twin],
-            log_density,
+            density,
         )
-        pair = considered_pairs(beliefs, twin)
-        model = model_likelihood(observation, pair, model_squares, log_density)
+        log_evidence.model[twin] = evidence.log_evidence
+        model = model_likelihood(
+            observation, of_faults, model_squares, density, evidence.log_factor
+        )
         update_gauge_faults(observation, model, priors, beliefs, twin, log_evidence.gauge[twin])
         log_evidence.free_gains[twin] = update_free_gains(
             observation, model, priors, beliefs.free_gains[twin], statistics, twin

@@ -8,17 +8,10 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.learning import hypothesis_weights
+from twin_master.learning.belief_transitions import Onsets, Recoveries, advance_beliefs
 from twin_master.learning.fault_evidence import correct_beliefs
-from twin_master.learning.fault_kernels import (
-    FaultPriors,
-    LogEvidence,
-    Observations,
-    Predictions,
-    advance_beliefs,
-    mix_in_model,
-    weighted_belief,
-)
-from twin_master.learning.hypothesis_weights import HypothesisWeights
+from twin_master.learning.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
+from twin_master.learning.hypothesis_weights import HypothesisWeights, log_of_sum
 from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, FROM_THE_START, WatchState
 from twin_master.network.estimator import Carried
 from twin_master.network.graphical_model import GraphicalModel
@@ -115,18 +108,18 @@ class FaultFilter:
     def _predictions_of_pairs(self, values: Float) -> Predictions:
         """Return the predictions of all pairs, given those of the chosen draws (E', S, U, G)."""
         draws, states, controls, sensors = values.shape
-        shape = (controls, sensors, states, draws)
-        pairs = states * draws
-        deviation = self._sensor_model.independent_standard_deviation.transpose(1, 2, 0)
-        inverse_deviation = np.broadcast_to(1.0 / deviation[..., None], shape)
-        interval = self._sensor_model.interval.transpose(1, 3, 2, 0)  # (U, F, G, S)
-        scaled_interval = interval[..., None] * inverse_deviation[:, None]
+        shape = (controls, states, draws, sensors)
+        of_pairs = (controls, states * draws, sensors)
+        deviation = self._sensor_model.independent_standard_deviation.swapaxes(0, 1)  # (U, S, G)
+        inverse_deviation = np.broadcast_to(1.0 / deviation[:, :, None], shape)
+        interval = self._sensor_model.interval.transpose(1, 3, 0, 2)  # (U, F, S, G)
+        scaled_interval = interval[:, :, :, None] * inverse_deviation[:, None]
         factors = interval.shape[1]
         return Predictions(
-            value=values.transpose(2, 3, 1, 0).reshape(controls, sensors, pairs),
-            inverse_deviation=inverse_deviation.reshape(controls, sensors, pairs),
-            log_inverse_deviation=np.ascontiguousarray(-np.log(deviation).swapaxes(1, 2)),
-            interval=scaled_interval.reshape(controls, factors, sensors, pairs),
+            value=(values.transpose(2, 1, 0, 3) * inverse_deviation).reshape(of_pairs),
+            inverse_deviation=inverse_deviation.reshape(of_pairs),
+            log_inverse_deviation=np.ascontiguousarray(-np.log(deviation)),
+            interval=scaled_interval.reshape(controls, factors, *of_pairs[1:]),
         )
 
     def _log_gauge_prior(self) -> Float:
@@ -196,25 +189,33 @@ class FaultFilter:
         control_index : (B,) array
             The controls in force in this step.
         """
-        advance_beliefs(
-            self._model.transition.forward_lists,
-            previous_control,
-            len(self._draw_weight),
-            state.beliefs,
-        )
         # The prior probability to begin in exactly this step. It is positive: the probability to
         # begin after a step decreases strictly with the step.
         begins_later = self.probability_to_begin_after(state.step_count)
         begins_now = self.probability_to_begin_after(state.step_count - 1.0) - begins_later
         log_begins_now = np.log(begins_now)
-        self._begin_gauge_faults(state, log_begins_now)
-        self._begin_free_gains(state, log_begins_now)
-        self._switch_hypotheses(state, log_begins_now, previous_control, control_index)
+        onsets = Onsets(
+            self._begin_gauge_faults(state, log_begins_now),
+            self._begin_free_gains(state, log_begins_now),
+        )
+        ended_or_hidden = self._switch_hypotheses(
+            state, log_begins_now, previous_control, control_index
+        )
+        recoveries = self._move_to_recovered(state, ended_or_hidden)
+        advance_beliefs(
+            self._model.transition.forward_lists,
+            previous_control,
+            len(self._draw_weight),
+            onsets,
+            recoveries,
+            state.beliefs,
+        )
 
-    def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> None:
+    def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> Float:
         """Let faults of single gauges begin in this step, and let the sums about their gains fade.
 
-        A fault that begins now has the belief and the sums of squares of the model so far.
+        A fault that begins now has the sums of squares of the model so far. The probability (B,
+        G K) that each fault began earlier is returned, with which beliefs are mixed.
 
         Parameters
         ----------
@@ -226,13 +227,12 @@ class FaultFilter:
         beliefs = state.beliefs
         gains = len(_GAINS)
         log_begin = log_begins_now[:, None] - np.log(gains)  # each gain with equal probability
-        log_total = np.logaddexp(state.log_gauge_evidence, log_begin)
+        log_total = log_of_sum(state.log_gauge_evidence, log_begin)
         earlier_weight = np.exp(state.log_gauge_evidence - log_total)
         state.log_gauge_evidence = log_total
         state.gauge_onset += (1.0 - earlier_weight) * (
             state.step_count[:, None] - state.gauge_onset
         )
-        mix_in_model(beliefs.model, earlier_weight, beliefs.gauge)
         # A fault that begins now has learnt no gain yet: its sums are zero.
         fading = self._fading_per_step()
         np.multiply(beliefs.gauge_sum_cc, fading * earlier_weight, out=beliefs.gauge_sum_cc)
@@ -241,13 +241,15 @@ class FaultFilter:
         beliefs.gauge_squares[:] = (
             earlier_weight * beliefs.gauge_squares + (1.0 - earlier_weight) * model_squares
         )
+        return np.asarray(earlier_weight)
 
-    def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> None:
+    def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> Float:
         """Let the fault of free gains begin in this step, and let its sums about the gains fade.
 
         Free gains are the fault that several gauges have unknown gains.
 
-        A fault that begins now has the belief and the sums of squares of the model so far.
+        A fault that begins now has the sums of squares of the model so far. The probability (B,)
+        that it began earlier is returned, with which beliefs are mixed.
 
         Parameters
         ----------
@@ -257,12 +259,11 @@ class FaultFilter:
             The log prior probability that the fault begins in this step.
         """
         beliefs = state.beliefs
-        log_total = np.logaddexp(state.log_free_gains_evidence, log_begins_now)
+        log_total = log_of_sum(state.log_free_gains_evidence, log_begins_now)
         earlier_weight = np.exp(state.log_free_gains_evidence - log_total)[:, None]
         state.log_free_gains_evidence = log_total
         new_weight = 1.0 - earlier_weight
         state.free_gains_onset += new_weight[:, 0] * (state.step_count - state.free_gains_onset)
-        mix_in_model(beliefs.model, earlier_weight, beliefs.free_gains[:, :, None])
         statistics = state.free_gain_statistics
         statistics.free_probability[:] += new_weight * (
             FREE_GAIN_PROBABILITY - statistics.free_probability
@@ -272,6 +273,7 @@ class FaultFilter:
         fading = self._fading_per_step()
         for sums in (statistics.sum_cc, statistics.sum_cx):
             sums *= fading * earlier_weight
+        return np.ascontiguousarray(earlier_weight[:, 0])
 
     def _fading_per_step(self) -> float:
         """Return the factor by which the sums about gains fade in a step, as gains may change."""
@@ -290,7 +292,7 @@ class FaultFilter:
         log_begins_now: Float,
         previous_control: Index,
         control: Index,
-    ) -> None:
+    ) -> Float:
         """Update the weights of the hypotheses for faults that begin, end or become hidden.
 
         Parameters
@@ -301,6 +303,11 @@ class FaultFilter:
             The log prior probability that a fault begins in this step.
         previous_control, control : (B,) array
             The controls of the step before and of this one.
+
+        Returns
+        -------
+        (B, 1 + G K) array
+            The probability of each fault that it ended or was hidden in this step.
         """
         # Hazard: probability to begin now, given that no fault of either kind has begun before.
         fault_probability = 2.0 * self._settings.prior
@@ -310,12 +317,13 @@ class FaultFilter:
 
         ended_or_hidden = state.weights.change_controls(previous_control, control)
         ended_or_hidden += state.weights.advance(log_hazard, self._log_begin)
-        self._move_to_recovered(state, ended_or_hidden)
+        return ended_or_hidden
 
-    def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix the beliefs and sums of ended and hidden faults into the hypothesis "recovered".
+    def _move_to_recovered(self, state: WatchState, right_again: Float) -> Recoveries:
+        """Mix the sums of ended and hidden faults into the hypothesis "recovered".
 
-        "Recovered" is the hypothesis that the gauges are right again after a fault.
+        "Recovered" is the hypothesis that the gauges are right again after a fault. The weights
+        are returned with which beliefs are mixed.
 
         Parameters
         ----------
@@ -333,19 +341,12 @@ class FaultFilter:
         np.divide(
             probability_of_all, right_after_fault, out=fraction_new, where=right_after_fault > 0.0
         )
-        fraction_new = np.minimum(fraction_new, 1.0)
+        fraction_new = np.where(is_any_right, np.minimum(fraction_new, 1.0), 0.0)
         fault_weight = right_again / divisor[:, None]
         free_gains_weight = fault_weight[:, hypothesis_weights.FREE_GAINS_OF_FAULTS]
         gauge_weight = np.ascontiguousarray(fault_weight[:, hypothesis_weights.GAUGES_OF_FAULTS])
 
         beliefs = state.beliefs
-        new_belief = weighted_belief(gauge_weight, beliefs.gauge)
-        new_belief += free_gains_weight[:, None] * beliefs.free_gains
-        total = new_belief.sum(axis=1)
-        fraction_new = np.where(is_any_right & (total > 0.0), fraction_new, 0.0)
-        new_belief /= np.where(total > 0.0, total, 1.0)[:, None]
-        beliefs.recovered[:] += fraction_new[:, None] * (new_belief - beliefs.recovered)
-
         # Sums of squares: those of the model for a sound gauge and those of the fault for a faulty
         # one, averaged over the faults by their weights.
         model_squares = beliefs.model_squares
@@ -363,6 +364,7 @@ class FaultFilter:
         beliefs.recovered_squares[:] += fraction_new[:, None] * (
             new_squares - beliefs.recovered_squares
         )
+        return Recoveries(fraction_new, gauge_weight, np.ascontiguousarray(free_gains_weight))
 
     def assimilate(self, state: WatchState, observations: Observations) -> None:
         """Correct the beliefs and weights of all hypotheses of B twins by an observation of each.

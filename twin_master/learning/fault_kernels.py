@@ -1,7 +1,7 @@
-"""Compiled loops of the filters of gauge faults, for many twins: advance and correct the beliefs.
+"""Compiled loops of the filters of gauge faults: an observation, and how sound gauges explain it.
 
 A pair is a state and a draw of the parameter; there are N of them, in the order of the states. The
-innermost loops run over the pairs or over the faults of gauges, whose beliefs lie side by side.
+innermost loops run over the gauges or over their faults, whose numbers lie side by side.
 
 Each hypothesis has Student's density for the value of a gauge, the noise scale being learnt. In
 units of the assumed noise of the gauge:
@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.compilation import compiled
+from fe.compilation import compiled, compiled_with_reordered_sums
 from reporting.arrays import Float, Index, Single
-from twin_master.network.kernels import PredecessorLists
 
 NEGLIGIBLE_UNDER_MODEL = 1e-30
 """Pairs of draw and state of smaller probability are left out of the evidence of the model."""
@@ -29,8 +28,10 @@ NEGLIGIBLE_UNDER_FAULT = 1e-7
 """The same for a fault: leaving pairs out lowers its evidence, so that an alarm comes later."""
 LARGEST_DISTANCE = 1e140
 """Distances are cut to this in the fit within an interval; its square is still a number."""
-_GAUGES_OF_A_PRODUCT = 8
-"""Kernels of so many gauges are multiplied before a logarithm is taken."""
+LEAST_TOTAL = 1e-200
+"""A sum of relative densities that is smaller may have lost terms by underflow."""
+_GAUGES_OF_A_PRODUCT = 64
+"""Kernels of so many gauges are multiplied before a power is taken."""
 
 
 class Predictions(NamedTuple):
@@ -38,13 +39,13 @@ class Predictions(NamedTuple):
 
     Attributes
     ----------
-    value : (U, G, N) array
-        The predicted values at the levels, SI.
-    inverse_deviation : (U, G, N) array
+    value : (U, N, G) array
+        The predicted values at the levels, in units of the noise.
+    inverse_deviation : (U, N, G) array
         One over the standard deviation of the assumed noise.
     log_inverse_deviation : (U, S, G) array
         Its logarithm, by state.
-    interval : (U, F, G, N) array
+    interval : (U, F, N, G) array
         The change of each gauge within the interval of a state, in units of the noise.
     """
 
@@ -123,6 +124,8 @@ class Beliefs(NamedTuple):
         The belief under the model, and after a fault has ended.
     gauge : (B, N, R) array
         The belief under each fault of a gauge, gauge by gauge; most entries are zero.
+    gauge_is_nonzero : (B, N) array of bool
+        Whether any fault of a gauge believes in the pair; else its row of `gauge` is zero.
     free_gains : (B, N) array
         The belief if several gauges have unknown gains.
     model_squares, recovered_squares : (B, G) array
@@ -135,6 +138,7 @@ class Beliefs(NamedTuple):
     model: Float
     recovered: Float
     gauge: Single
+    gauge_is_nonzero: NDArray[np.bool_]
     free_gains: Single
     model_squares: Float
     recovered_squares: Float
@@ -160,19 +164,37 @@ class LogEvidence(NamedTuple):
     gauge: Float
 
 
+class SoundEvidence(NamedTuple):
+    """The evidence of a hypothesis under which all gauges are sound, up to a constant of the step.
+
+    Attributes
+    ----------
+    log_evidence : float
+        The log evidence.
+    log_factor : float
+        The log of the factor that its densities at the pairs leave out.
+    """
+
+    log_evidence: float
+    log_factor: float
+
+
 class StandardizedObservation(NamedTuple):
-    """An observation of one twin in units of the noise, at all pairs.
+    """An observation of one twin in units of the noise, at the pairs that are considered.
 
     Attributes
     ----------
     present : (G,) array of bool
         Whether a gauge reports. A gauge that does not has residuals and predictions of zero.
-    residual, prediction : (G, N) array
+    residual, prediction : (N, G) array
         The observation minus the prediction, and the prediction.
     log_density : (N,) array
         The log density without that of the standardised residuals.
     degrees_after : (G,) array
         Degrees of freedom plus one: twice the power of the density of a present gauge.
+    product : (G,) array
+        The number of the product to which each gauge belongs: gauges of one product have the same
+        degrees of freedom.
     """
 
     present: NDArray[np.bool_]
@@ -180,136 +202,7 @@ class StandardizedObservation(NamedTuple):
     prediction: Float
     log_density: Float
     degrees_after: Float
-
-
-# ----------------------------------------------------------------------------------------------
-# The transition
-# ----------------------------------------------------------------------------------------------
-
-
-@compiled
-def advance_belief(
-    lists: PredecessorLists,
-    control: int,
-    inner_count: int,
-    belief: Float | Single,
-    work: Float | Single,
-) -> None:
-    """Advance a belief by one transition of the states, in place.
-
-    The blocks are applied one after the other, each along its own axis of the joint state.
-
-    Parameters
-    ----------
-    lists : PredecessorLists
-        The predecessors of each level.
-    control : int
-        The control before the transition.
-    inner_count : int
-        The number of entries of each state.
-    belief, work : (S inner_count,) array
-        The belief, in the order of the states, and work space.
-    """
-    levels, first_row, start, predecessor, probability, _ = lists
-    outer = 1
-    inner = len(belief)
-    is_nonzero = np.empty(len(belief) // inner_count, np.bool_)
-    for block in range(len(levels)):
-        level_count = levels[block]
-        inner //= level_count  # states of later blocks, times the entries of a state
-        for row in range(outer * level_count):
-            total = 0.0
-            for i in range(row * inner, (row + 1) * inner):
-                total += belief[i]
-            is_nonzero[row] = total > 0.0
-        for row in range(outer * level_count):
-            o, level = divmod(row, level_count)
-            target = work[row * inner : (row + 1) * inner]
-            for i in range(inner):
-                target[i] = 0.0
-            list_row = first_row[block] + control * level_count + level
-            for k in range(start[list_row], start[list_row + 1]):
-                before = o * level_count + np.int64(predecessor[k])
-                if is_nonzero[before]:
-                    source = belief[before * inner : (before + 1) * inner]
-                    weight = work.dtype.type(probability[k])
-                    for i in range(inner):
-                        target[i] += weight * source[i]
-        for i in range(len(belief)):
-            belief[i] = work[i]
-        outer *= level_count
-
-
-@compiled
-def advance_beliefs(lists: PredecessorLists, control: Index, draws: int, beliefs: Beliefs) -> None:
-    """Advance all beliefs of B twins by one transition, in place.
-
-    Parameters
-    ----------
-    lists : PredecessorLists
-        The predecessors of each level.
-    control : (B,) array
-        The control of the step before.
-    draws : int
-        The number E of draws.
-    beliefs : Beliefs
-        The beliefs; updated in place.
-    """
-    twins, pairs, faults = beliefs.gauge.shape
-    work = np.empty(pairs)
-    single_work = np.empty(pairs * faults, np.float32)
-    for twin in range(twins):
-        now = control[twin]
-        gauge = beliefs.gauge[twin].reshape(pairs * faults)
-        advance_belief(lists, now, draws, beliefs.model[twin], work)
-        advance_belief(lists, now, draws, beliefs.recovered[twin], work)
-        advance_belief(lists, now, draws, beliefs.free_gains[twin], single_work[:pairs])
-        advance_belief(lists, now, draws * faults, gauge, single_work)
-
-
-@compiled
-def mix_in_model(model_belief: Float, earlier_weight: Float, fault_belief: Single) -> None:
-    """Let faults begin: mix the belief of the model into the beliefs of faults, in place.
-
-    A fault that begins now has the belief of the model. It is mixed with the belief of the fault
-    that began earlier, so that one belief stands for all first steps.
-
-    Parameters
-    ----------
-    model_belief : (B, N) array
-        The belief of the model of each twin.
-    earlier_weight : (B, R) array
-        The probability that each fault began before this step, if it has begun at all.
-    fault_belief : (B, N, R) array
-        The beliefs of the faults; updated in place.
-    """
-    twins, pairs, faults = fault_belief.shape
-    earlier = np.empty(faults, np.float32)  # single precision, as the beliefs
-    new = np.empty(faults, np.float32)
-    for twin in range(twins):
-        for r in range(faults):
-            earlier[r] = np.float32(earlier_weight[twin, r])
-            new[r] = np.float32(1.0) - earlier[r]
-        for i in range(pairs):
-            model = np.float32(model_belief[twin, i])
-            belief = fault_belief[twin, i]
-            for r in range(faults):
-                belief[r] = earlier[r] * belief[r] + new[r] * model
-
-
-@compiled
-def weighted_belief(weight: Float, fault_belief: Single) -> Float:
-    """Return the sum of weights (B, R) times beliefs (B, N, R) over the faults: (B, N)."""
-    twins, pairs, faults = fault_belief.shape
-    result = np.empty((twins, pairs))
-    for twin in range(twins):
-        for i in range(pairs):
-            belief = fault_belief[twin, i]
-            total = 0.0
-            for r in range(faults):
-                total += weight[twin, r] * belief[r]
-            result[twin, i] = total
-    return result
+    product: Index
 
 
 # ----------------------------------------------------------------------------------------------
@@ -349,26 +242,26 @@ def _normal_root(design: Float, weight: Float, root: Float) -> float:
 
 
 @compiled
-def _solve(root: Float, first: int, end: int, point: Float) -> None:
-    """Solve root root' x = b in place for the columns `first` to `end` of `point` (F, N)."""
+def _solve(root: Float, point: Float) -> None:
+    """Solve root root' x = b in place for `point` (F,)."""
     factors = len(root)
     for f in range(factors):
         for k in range(f):
-            for i in range(first, end):
-                point[f, i] -= root[f, k] * point[k, i]
-        for i in range(first, end):
-            point[f, i] /= root[f, f]
+            point[f] -= root[f, k] * point[k]
+        point[f] /= root[f, f]
     for f in range(factors - 1, -1, -1):
         for k in range(f + 1, factors):
-            for i in range(first, end):
-                point[f, i] -= root[k, f] * point[k, i]
-        for i in range(first, end):
-            point[f, i] /= root[f, f]
+            point[f] -= root[k, f] * point[k]
+        point[f] /= root[f, f]
 
 
-@compiled
+@compiled_with_reordered_sums
 def _fit_within_intervals(
-    interval: Float, precision: Float, draws: int, observation: StandardizedObservation
+    interval: Float,
+    precision: Float,
+    draws: int,
+    pairs: Index,
+    observation: StandardizedObservation,
 ) -> None:
     """Move the predictions to the most probable point within the interval of each state.
 
@@ -378,52 +271,57 @@ def _fit_within_intervals(
 
     Parameters
     ----------
-    interval : (F, G, N) array
+    interval : (F, N, G) array
         The change of each gauge within the interval of a state, in units of the noise.
     precision : (G,) array
         The precision of each gauge over the assumed one.
     draws : int
         The number E of draws.
+    pairs : (n,) array
+        The pairs that are considered, in rising order.
     observation : StandardizedObservation
         Residuals, predictions and log densities at the levels; updated in place.
     """
-    factors, gauges, pairs = interval.shape
-    point = np.zeros((factors, pairs))
+    factors, _, gauges = interval.shape
+    point = np.empty(factors)
     weight = np.empty(gauges)
     for g in range(gauges):
         weight[g] = precision[g] if observation.present[g] else 0.0
-    for f in range(factors):
-        for g in range(gauges):
-            for i in range(pairs):
-                residual = observation.residual[g, i]
-                residual = min(max(residual, -LARGEST_DISTANCE), LARGEST_DISTANCE)
-                point[f, i] += weight[g] * interval[f, g, i] * residual
     root = np.zeros((factors, factors))
-    for first in range(0, pairs, draws):
-        half_log_determinant = _normal_root(interval[:, :, first], weight, root)
-        _solve(root, first, first + draws, point)
-        for i in range(first, first + draws):
-            observation.log_density[i] -= half_log_determinant
-    for f in range(factors):
-        for i in range(pairs):
-            observation.log_density[i] -= 0.5 * point[f, i] * point[f, i]
-        for g in range(gauges):
-            if observation.present[g]:
-                for i in range(pairs):
-                    change = interval[f, g, i] * point[f, i]
-                    observation.residual[g, i] -= change
-                    observation.prediction[g, i] += change
+    half_log_determinant = 0.0
+    state_of_root = -1
+    for i in pairs:
+        residual = observation.residual[i]
+        prediction = observation.prediction[i]
+        if i // draws != state_of_root:  # the intervals are the same at all draws of a state
+            state_of_root = i // draws
+            half_log_determinant = _normal_root(interval[:, i], weight, root)
+        for f in range(factors):
+            point[f] = 0.0
+            for g in range(gauges):
+                distance = min(max(residual[g], -LARGEST_DISTANCE), LARGEST_DISTANCE)
+                point[f] += weight[g] * interval[f, i, g] * distance
+        _solve(root, point)
+        observation.log_density[i] -= half_log_determinant
+        for f in range(factors):
+            observation.log_density[i] -= 0.5 * point[f] * point[f]
+            for g in range(gauges):
+                if observation.present[g]:
+                    change = interval[f, i, g] * point[f]
+                    residual[g] -= change
+                    prediction[g] += change
 
 
-@compiled
+@compiled_with_reordered_sums
 def standardize(
     predictions: Predictions,
     observations: Observations,
     twin: int,
     precision: Float,
+    pairs: Index,
     observation: StandardizedObservation,
 ) -> None:
-    """Fill residuals, predictions and log densities of the observation of a twin at all pairs.
+    """Fill residuals, predictions and log densities of the observation of a twin at some pairs.
 
     Parameters
     ----------
@@ -435,36 +333,61 @@ def standardize(
         The twin.
     precision : (G,) array
         The precision of each gauge over the assumed one.
+    pairs : (n,) array
+        The pairs that are considered, in rising order.
     observation : StandardizedObservation
         The arrays `residual`, `prediction` and `log_density`, to be filled, and `present`.
     """
     control = observations.control[twin]
     _, states, gauges = predictions.log_inverse_deviation.shape
-    pairs = predictions.value.shape[2]
-    draws = pairs // states
-    for s in range(states):
-        log_scale = observations.log_density_beside[twin, s]
-        for g in range(gauges):
-            if observation.present[g]:
-                log_scale += predictions.log_inverse_deviation[control, s, g]
-        for i in range(s * draws, (s + 1) * draws):
-            observation.log_density[i] = log_scale
+    draws = predictions.value.shape[1] // states
+    is_present = np.empty(gauges)
+    reading = np.empty(gauges)
+    prediction = np.empty(gauges)
+    residual = np.empty(gauges)
     for g in range(gauges):
-        residual = observation.residual[g]
-        prediction = observation.prediction[g]
-        if observation.present[g]:
-            reading = observations.readings[twin, g]
-            value = predictions.value[control, g]
-            inverse_deviation = predictions.inverse_deviation[control, g]
-            for i in range(pairs):
-                prediction[i] = value[i] * inverse_deviation[i]
-                residual[i] = (reading - value[i]) * inverse_deviation[i]
-        else:
-            for i in range(pairs):
-                prediction[i] = 0.0
-                residual[i] = 0.0
+        is_present[g] = 1.0 if observation.present[g] else 0.0
+        reading[g] = observations.readings[twin, g] if observation.present[g] else 0.0
+    log_scale = 0.0
+    state_of_scale = -1
+    for i in pairs:
+        state = i // draws
+        if state != state_of_scale:
+            state_of_scale = state
+            log_scale = observations.log_density_beside[twin, state]
+            for g in range(gauges):
+                log_scale += is_present[g] * predictions.log_inverse_deviation[control, state, g]
+        observation.log_density[i] = log_scale
+        # The compiler vectorises loops that write to arrays of this function only.
+        for g in range(gauges):
+            value = predictions.value[control, i, g]
+            distance = reading[g] * predictions.inverse_deviation[control, i, g] - value
+            prediction[g] = is_present[g] * value
+            residual[g] = is_present[g] * distance
+        for g in range(gauges):
+            observation.prediction[i, g] = prediction[g]
+            observation.residual[i, g] = residual[g]
     if predictions.interval.shape[1] > 0:
-        _fit_within_intervals(predictions.interval[control], precision, draws, observation)
+        _fit_within_intervals(predictions.interval[control], precision, draws, pairs, observation)
+
+
+@compiled
+def number_products(degrees_after: Float, product: Index) -> None:
+    """Fill in to which product of densities each gauge (G,) belongs, in the order of the gauges."""
+    degrees = np.empty(len(product))
+    members = np.zeros(len(product), np.int64)
+    count = 0
+    for g in range(len(product)):
+        number = 0
+        while number < count and (
+            degrees[number] != degrees_after[g] or members[number] == _GAUGES_OF_A_PRODUCT
+        ):
+            number += 1
+        if number == count:
+            degrees[number] = degrees_after[g]
+            count += 1
+        product[g] = number
+        members[number] += 1
 
 
 # ----------------------------------------------------------------------------------------------
@@ -473,92 +396,192 @@ def standardize(
 
 
 @compiled
-def _add_log_density_of_residuals(
-    observation: StandardizedObservation, scale_squares: Float, log_density: Float
+def multiply_by_power(base: Float, exponent: float, product: Float) -> None:
+    """Multiply numbers (n,) by a power of others (n,) in place; the base is overwritten.
+
+    The whole part of the exponent is taken by repeated squaring.
+    """
+    whole = np.int64(np.floor(exponent))
+    fraction = exponent - whole
+    if fraction > 0.0:
+        for i in range(len(base)):
+            product[i] *= base[i] ** fraction
+    while whole > 0:
+        if whole % 2 == 1:
+            for i in range(len(base)):
+                product[i] *= base[i]
+        whole //= 2
+        if whole > 0:
+            for i in range(len(base)):
+                base[i] *= base[i]
+
+
+@compiled_with_reordered_sums
+def _multiply_kernels(
+    observation: StandardizedObservation, pairs: Index, inverse_squares: Float, kernels: Float
 ) -> None:
-    """Add the log density of all residuals, if every gauge is sound, to `log_density` (N,).
+    """Fill `kernels` (n,) with the product over the gauges of the kernels of their densities."""
+    gauges = len(inverse_squares)
+    for j in range(len(pairs)):
+        i = pairs[j]
+        kernel = 1.0
+        for g in range(gauges):
+            residual = observation.residual[i, g]
+            kernel *= 1.0 + residual * residual * inverse_squares[g]
+        kernels[j] = kernel
+
+
+@compiled
+def _density_by_products(
+    observation: StandardizedObservation,
+    pairs: Index,
+    is_counted: NDArray[np.bool_],
+    scale_squares: Float,
+    density: Float,
+) -> float:
+    """Fill in the density of the observation at pairs (n,) if every gauge is sound, up to a factor.
 
     Parameters
     ----------
     observation : StandardizedObservation
         The observation.
+    pairs : (n,) array
+        The indices of the pairs.
+    is_counted : (n,) array of bool
+        The pairs among which the reference is chosen.
     scale_squares : (G,) array
         Degrees of freedom plus the sum of squared residuals of each gauge.
-    log_density : (N,) array
-        Updated in place, up to a constant of the step.
+    density : (n,) array
+        To be filled. Where it underflows it is zero, where it overflows it may be NaN.
+
+    Returns
+    -------
+    float
+        The log of the factor.
     """
-    pairs = len(log_density)
-    product = np.ones(pairs)
-    gauges_in_product = 0
-    degrees_of_product = 0.0
-    for g in range(len(observation.present)):
-        if not observation.present[g]:
+    gauges = len(scale_squares)
+    count = len(pairs)
+    inverse_squares = np.empty(gauges)
+    kernels = np.empty(count)
+    power = np.ones(count)
+    log_factor = -np.inf
+    for j in range(count):
+        log_factor = max(log_factor, observation.log_density[pairs[j]])
+    for j in range(count):
+        log_density = observation.log_density[pairs[j]]
+        density[j] = 1.0  # mostly, because the noise seldom depends on the state
+        if log_density < log_factor:
+            density[j] = np.exp(log_density - log_factor)
+    product = 0
+    for g in range(gauges):
+        if observation.product[g] != product:
             continue
-        degrees_of_freedom = observation.degrees_after[g]
-        is_full = gauges_in_product == _GAUGES_OF_A_PRODUCT
-        if gauges_in_product > 0 and (is_full or degrees_of_freedom != degrees_of_product):
-            for i in range(pairs):
-                log_density[i] -= 0.5 * degrees_of_product * np.log(product[i])
-                product[i] = 1.0
-            gauges_in_product = 0
-        inverse = 1.0 / scale_squares[g]
-        residual = observation.residual[g]
-        for i in range(pairs):
-            product[i] *= 1.0 + residual[i] * residual[i] * inverse
-        gauges_in_product += 1
-        degrees_of_product = degrees_of_freedom
-    for i in range(pairs):
-        log_density[i] -= 0.5 * degrees_of_product * np.log(product[i])
+        for other in range(gauges):
+            is_factor = observation.product[other] == product
+            inverse_squares[other] = 1.0 / scale_squares[other] if is_factor else 0.0
+        _multiply_kernels(observation, pairs, inverse_squares, kernels)
+        smallest = np.inf
+        for j in range(count):
+            if is_counted[j]:
+                smallest = min(smallest, kernels[j])
+        for j in range(count):
+            kernels[j] = smallest / kernels[j]
+        multiply_by_power(kernels, observation.degrees_after[g], power)
+        log_factor -= 0.5 * observation.degrees_after[g] * np.log(smallest)
+        product += 1
+    for j in range(count):
+        density[j] *= np.sqrt(power[j])
+    return float(log_factor)
+
+
+@compiled
+def log_density_of_sound_gauges(
+    observation: StandardizedObservation, pairs: Index, scale_squares: Float, log_density: Float
+) -> None:
+    """Fill in the log density (n,) of the observation at pairs if every gauge is sound."""
+    for j in range(len(pairs)):
+        i = pairs[j]
+        log_density[j] = observation.log_density[i]
+        for g in range(len(scale_squares)):
+            residual = observation.residual[i, g]
+            kernel = 1.0 + residual * residual / scale_squares[g]
+            log_density[j] -= 0.5 * observation.degrees_after[g] * np.log(kernel)
+
+
+@compiled_with_reordered_sums
+def _add_expected_squares(
+    observation: StandardizedObservation, pairs: Index, belief: Float, squares: Float
+) -> None:
+    """Add the expected squared residuals under a belief (N,) to `squares` (G,)."""
+    gauges = len(squares)
+    added = np.zeros(gauges)
+    for i in pairs:
+        weight = belief[i]
+        for g in range(gauges):
+            residual = observation.residual[i, g]
+            added[g] += weight * residual * residual
+    for g in range(gauges):
+        squares[g] += added[g]
 
 
 @compiled
 def update_sound_gauges(
     observation: StandardizedObservation,
+    pairs: Index,
     degrees_of_freedom: float,
     belief: Float,
     squares: Float,
-    log_density: Float,
-) -> float:
-    """Correct the belief of a hypothesis under which all gauges are sound; return its log evidence.
+    density: Float,
+) -> SoundEvidence:
+    """Correct the belief of a hypothesis under which all gauges are sound; return its evidence.
 
     Parameters
     ----------
     observation : StandardizedObservation
         The observation.
+    pairs : (n,) array
+        The pairs that are considered, outside of which the belief is zero or negligible.
     degrees_of_freedom : float
         The degrees of freedom of the prior of the noise scale.
     belief : (N,) array
         The belief; updated in place.
     squares : (G,) array
         The expected sums of squared residuals; updated in place.
-    log_density : (N,) array
-        To be filled: the log density of the observation, up to a constant of the step.
+    density : (N,) array
+        To be filled at the pairs: the density of the observation, up to a factor of the step.
     """
-    pairs = len(log_density)
-    for i in range(pairs):
-        log_density[i] = observation.log_density[i]
+    count = len(pairs)
     scale_squares = np.empty(len(squares))
     for g in range(len(squares)):
         scale_squares[g] = degrees_of_freedom + squares[g]
-    _add_log_density_of_residuals(observation, scale_squares, log_density)
-
-    # Exponents are taken relative to the largest one of the pairs that count. Those of other pairs
-    # may be larger: they are not used.
-    largest = -np.inf
-    for i in range(pairs):
-        if belief[i] >= NEGLIGIBLE_UNDER_MODEL:
-            largest = max(largest, log_density[i])
+    prior = np.empty(count)
+    is_counted = np.empty(count, np.bool_)
+    for j in range(count):
+        is_counted[j] = belief[pairs[j]] >= NEGLIGIBLE_UNDER_MODEL
+        prior[j] = belief[pairs[j]] if is_counted[j] else 0.0
+    density_of_pairs = np.empty(count)
+    log_factor = _density_by_products(
+        observation, pairs, is_counted, scale_squares, density_of_pairs
+    )
     total = 0.0
-    for i in range(pairs):
-        is_considered = belief[i] >= NEGLIGIBLE_UNDER_MODEL
-        belief[i] = belief[i] * np.exp(log_density[i] - largest) if is_considered else 0.0
-        total += belief[i]
-    for i in range(pairs):
-        belief[i] /= total
-    for g in range(len(squares)):
-        residual = observation.residual[g]
-        added_squares = 0.0
-        for i in range(pairs):
-            added_squares += belief[i] * residual[i] * residual[i]
-        squares[g] += added_squares
-    return float(largest + np.log(total))
+    for j in range(count):
+        total += prior[j] * density_of_pairs[j] if is_counted[j] else 0.0
+    if not LEAST_TOTAL < total < np.inf:
+        # Exponents are taken relative to the largest one of the pairs that count. Those of other
+        # pairs may be larger: they are not used.
+        log_density_of_sound_gauges(observation, pairs, scale_squares, density_of_pairs)
+        log_factor = -np.inf
+        for j in range(count):
+            if is_counted[j]:
+                log_factor = max(log_factor, density_of_pairs[j])
+        total = 0.0
+        for j in range(count):
+            density_of_pairs[j] = np.exp(density_of_pairs[j] - log_factor)
+            total += prior[j] * density_of_pairs[j] if is_counted[j] else 0.0
+    for i in range(len(belief)):
+        belief[i] = 0.0
+    for j in range(count):
+        belief[pairs[j]] = prior[j] * density_of_pairs[j] / total if is_counted[j] else 0.0
+        density[pairs[j]] = density_of_pairs[j]
+    _add_expected_squares(observation, pairs, belief, squares)
+    return SoundEvidence(log_factor + np.log(total), log_factor)

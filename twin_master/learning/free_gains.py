@@ -7,192 +7,202 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe.compilation import compiled
+from fe.compilation import compiled, compiled_with_reordered_sums
 from reporting.arrays import Float, Index, Single
+from twin_master.learning.exchanged_densities import (
+    ExchangeWork,
+    GaugeDensities,
+    exchange_densities,
+    exchange_factors,
+    log_exchanged_density,
+    log_reference_density,
+)
 from twin_master.learning.fault_kernels import (
+    LEAST_TOTAL,
     NEGLIGIBLE_UNDER_FAULT,
     FaultPriors,
     FreeGainStatistics,
     StandardizedObservation,
+    log_density_of_sound_gauges,
 )
-from twin_master.learning.model_likelihood import ModelLikelihood, multiply_by_power
-
-_LEAST_RATIO = 1e-60
-"""Densities of a gauge over that of the model are multiplied if they lie between this and 1e60."""
-_GAUGES_OF_A_PRODUCT = 4
-"""So many are multiplied before a logarithm is taken."""
+from twin_master.learning.model_likelihood import ModelLikelihood
 
 
-class PairsOfFreeGains(NamedTuple):
-    """The pairs that the fault of free gains believes in, n of them, in units of the noise.
+class FreeGainWeights(NamedTuple):
+    """How the fault of free gains explains an observation at the pairs that it believes in.
 
     Attributes
     ----------
-    pair : (n,) array
-        The index of each among all pairs.
-    x, c : (G, n) array
-        The residuals, and their derivatives by the gain over its prior standard deviation.
-    kernel : (G, n) array
-        The kernel of each gauge's density under the model.
+    weight : (n,) array
+        The density times the belief, up to a factor.
+    free_part : (n, G) array
+        The probability that a gauge has a gain of its own.
+    free_square : (n, G) array
+        The squared innovation over its variance, if it has one.
     """
 
-    pair: Index
-    x: Float
-    c: Float
-    kernel: Float
-
-
-class GaugeWithFreeGain(NamedTuple):
-    """A gauge that may have a gain of its own, before an observation.
-
-    Attributes
-    ----------
-    gauge : int
-        The gauge.
-    free_probability : float
-        The probability that it has.
-    fitted_gain, gain_variance : float
-        The learnt gain over its prior standard deviation, and its variance.
-    degrees_of_freedom : float
-        Twice the power of the density.
-    model_squares, fixed_squares, free_squares : float
-        Degrees of freedom plus the sum of squares: under the model, and without and with a gain.
-    """
-
-    gauge: int
-    free_probability: float
-    fitted_gain: float
-    gain_variance: float
-    degrees_of_freedom: float
-    model_squares: float
-    fixed_squares: float
-    free_squares: float
+    weight: Float
+    free_part: Single
+    free_square: Single
 
 
 @compiled
-def _take_pairs(
-    model: ModelLikelihood, deviation: float, belief: Single, weight: Float
-) -> PairsOfFreeGains:
-    """Return the pairs with a belief that is not negligible; the belief of all others becomes zero.
+def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
+    """Return which of the n pairs have a belief that is not negligible.
 
-    Parameters
-    ----------
-    model : ModelLikelihood
-        How the model explains the observation, at the pairs that faults consider.
-    deviation : float
-        The prior standard deviation of a free gain.
-    belief : (N,) array
-        The belief; updated in place.
-    weight : (n,) array
-        Its first entries are filled with the log density of the model at the pairs.
+    The belief (N,) in all others becomes zero.
     """
-    gauges = len(model.scale_squares)
-    index = np.empty(len(model.pair), np.int64)
-    count = 0
     for i in range(len(belief)):
         if belief[i] < NEGLIGIBLE_UNDER_FAULT:
             belief[i] = 0.0
+    believed = np.empty(len(model.pair), np.int64)
+    count = 0
     for j in range(len(model.pair)):
         if belief[model.pair[j]] > 0.0:
-            index[count] = j
+            believed[count] = j
             count += 1
-    pair = np.empty(count, np.int64)
-    x = np.empty((gauges, count))
-    c = np.empty((gauges, count))
-    kernel = np.empty((gauges, count))
-    for m in range(count):
-        j = index[m]
-        pair[m] = model.pair[j]
-        weight[m] = model.log_density[j]
-        for g in range(gauges):
-            x[g, m] = model.residual[j, g]
-            c[g, m] = deviation * model.prediction[j, g]
-            kernel[g, m] = model.kernel[j, g]
-    return PairsOfFreeGains(pair, x, c, kernel)
+    return believed[:count]
 
 
 @compiled
-def mix_densities(
-    pairs: PairsOfFreeGains, gauge: GaugeWithFreeGain, mixture: Float, free_part: Float
-) -> bool:
-    """Fill in the density of a gauge over that of the model, and its part with a gain of its own.
+def free_gain_densities(
+    priors: FaultPriors, statistics: FreeGainStatistics, twin: int
+) -> GaugeDensities:
+    """Return the 2 G densities of the gauges of a twin: G with a gain of their own, G without."""
+    gauges = statistics.sum_cc.shape[1]
+    deviation = priors.free_gain_deviation
+    densities = GaugeDensities(
+        np.empty(2 * gauges, np.int64),
+        np.zeros(2 * gauges),
+        np.zeros(2 * gauges),
+        np.empty(2 * gauges),
+    )
+    for g in range(gauges):
+        variance = 1.0 / (1.0 + statistics.sum_cc[twin, g])
+        fixed = gauges + g
+        densities.gauge[g] = g
+        densities.gauge[fixed] = g
+        densities.gain[g] = deviation * variance * statistics.sum_cx[twin, g]
+        densities.gain_variance[g] = deviation * deviation * variance
+        densities.scale_squares[g] = priors.degrees_of_freedom + statistics.free_squares[twin, g]
+        densities.scale_squares[fixed] = (
+            priors.degrees_of_freedom + statistics.fixed_squares[twin, g]
+        )
+    return densities
 
-    The compiler vectorises loops that write to arrays of this function only.
+
+@compiled_with_reordered_sums
+def weigh_free_gains(
+    observation: StandardizedObservation,
+    model: ModelLikelihood,
+    densities: GaugeDensities,
+    free_probability: Float,
+    believed: Index,
+    belief: Single,
+) -> FreeGainWeights:
+    """Return how the fault of free gains explains an observation, relative to the reference pair.
+
+    The density of each gauge is a mixture of two: without and with a gain of its own.
 
     Parameters
     ----------
-    pairs : PairsOfFreeGains
-        The n pairs.
-    gauge : GaugeWithFreeGain
-        The gauge.
-    mixture, free_part : (n,) array
-        To be filled: the density, and the fraction of it that a gain of its own adds.
-
-    Returns
-    -------
-    bool
-        Whether all densities are neither so large nor so small that their products may overflow or
-        underflow.
+    observation : StandardizedObservation
+        The observation.
+    model : ModelLikelihood
+        How the model explains it.
+    densities : GaugeDensities
+        The densities of the gauges with a gain, and then those without.
+    free_probability : (G,) array
+        The probability that a gauge has a gain of its own.
+    believed : (n,) array
+        Which of the pairs of `model` the fault believes in.
+    belief : (N,) array
+        The belief.
     """
-    count = len(mixture)
-    x = pairs.x[gauge.gauge]
-    c = pairs.c[gauge.gauge]
-    kernel = pairs.kernel[gauge.gauge]
-    base_free = np.empty(count)
-    power_free = np.empty(count)
-    base_fixed = np.empty(count)
-    power_fixed = np.ones(count)
-    for j in range(count):
-        innovation = x[j] - c[j] * gauge.fitted_gain
-        variance = 1.0 + c[j] * c[j] * gauge.gain_variance
-        free_kernel = gauge.free_squares * variance + innovation * innovation
-        fixed_kernel = gauge.fixed_squares + x[j] * x[j]
-        inverse = 1.0 / (variance * free_kernel)
-        base_free[j] = kernel[j] * gauge.free_squares * variance * variance * inverse
-        power_free[j] = free_kernel * inverse
-        base_fixed[j] = kernel[j] * gauge.fixed_squares / fixed_kernel
-    multiply_by_power(base_free, gauge.degrees_of_freedom, power_free)
-    multiply_by_power(base_fixed, gauge.degrees_of_freedom, power_fixed)
-    constant_free = gauge.free_probability * np.sqrt(gauge.model_squares / gauge.free_squares)
-    constant_fixed = np.sqrt(gauge.model_squares / gauge.fixed_squares)
-    constant_fixed *= 1.0 - gauge.free_probability
-    for j in range(count):
-        base_free[j] = constant_free * np.sqrt(power_free[j])
-        power_fixed[j] = base_free[j] + constant_fixed * np.sqrt(power_fixed[j])
-        base_free[j] /= power_fixed[j]
-    largest = 0.0
-    smallest = np.inf
-    for j in range(count):
-        mixture[j] = power_fixed[j]
-        free_part[j] = base_free[j]
-        largest = max(largest, mixture[j])
-        smallest = min(smallest, mixture[j])
-    return bool(smallest > _LEAST_RATIO and largest < 1.0 / _LEAST_RATIO)
+    gauges = len(free_probability)
+    count = len(believed)
+    factors = exchange_factors(observation, model, densities)
+    factor = np.empty(2 * gauges)
+    for g in range(gauges):
+        fixed = gauges + g
+        factor[g] = free_probability[g]
+        factor[fixed] = 1.0 - free_probability[g]
+        factor[g] *= np.exp(log_reference_density(observation, model, densities, g))
+        factor[fixed] *= np.exp(log_reference_density(observation, model, densities, fixed))
+    weights = FreeGainWeights(
+        np.empty(count),
+        np.empty((count, gauges), np.float32),
+        np.empty((count, gauges), np.float32),
+    )
+    residual = np.empty(2 * gauges, np.float32)
+    prediction = np.empty(2 * gauges, np.float32)
+    square = np.empty(2 * gauges, np.float32)
+    ratio = np.empty(2 * gauges, np.float32)
+    work = ExchangeWork(
+        np.empty(2 * gauges, np.float32),
+        np.empty(2 * gauges, np.float32),
+        np.empty(2 * gauges, np.float32),
+        np.empty(2 * gauges, np.float32),
+    )
+    for m in range(count):
+        i = model.pair[believed[m]]
+        for g in range(gauges):
+            residual[g] = observation.residual[i, g]
+            prediction[g] = observation.prediction[i, g]
+            residual[gauges + g] = residual[g]
+            prediction[gauges + g] = prediction[g]
+        exchange_densities(factors, residual, prediction, square, ratio, work)
+        product = belief[i] * model.density[believed[m]]
+        for g in range(gauges):
+            free_density = factor[g] * ratio[g]
+            mixture = free_density + factor[gauges + g] * ratio[gauges + g]
+            weights.free_part[m, g] = free_density / mixture
+            weights.free_square[m, g] = square[g]
+            product *= mixture
+        weights.weight[m] = product
+    return weights
 
 
 @compiled
-def mix_densities_in_logs(
-    pairs: PairsOfFreeGains, gauge: GaugeWithFreeGain, log_mixture: Float, free_part: Float
-) -> None:
-    """Do the same as `mix_densities`, by logarithms, which neither overflow nor underflow."""
-    g = gauge.gauge
-    log_free_constant = np.log(gauge.free_probability)
-    log_free_constant += 0.5 * np.log(gauge.model_squares / gauge.free_squares)
-    log_fixed_constant = np.log1p(-gauge.free_probability)
-    log_fixed_constant += 0.5 * np.log(gauge.model_squares / gauge.fixed_squares)
-    power = 0.5 * gauge.degrees_of_freedom  # of the kernels of Student's density
-    for j in range(len(log_mixture)):
-        x = pairs.x[g, j]
-        innovation = x - pairs.c[g, j] * gauge.fitted_gain
-        variance = 1.0 + pairs.c[g, j] * pairs.c[g, j] * gauge.gain_variance
-        free_kernel = 1.0 + innovation * innovation / (gauge.free_squares * variance)
-        fixed_kernel = 1.0 + x * x / gauge.fixed_squares
-        kernel = pairs.kernel[g, j]
-        log_free = log_free_constant + power * np.log(kernel / free_kernel)
-        log_free -= 0.5 * np.log(variance)
-        log_fixed = log_fixed_constant + power * np.log(kernel / fixed_kernel)
-        log_mixture[j] = np.logaddexp(log_free, log_fixed)
-        free_part[j] = np.exp(log_free - log_mixture[j])
+def weigh_free_gains_in_logs(
+    observation: StandardizedObservation,
+    model: ModelLikelihood,
+    densities: GaugeDensities,
+    free_probability: Float,
+    believed: Index,
+    belief: Single,
+    weights: FreeGainWeights,
+) -> float:
+    """Do the same as `weigh_free_gains` by logarithms, which neither overflow nor underflow.
+
+    Returns
+    -------
+    float
+        The log of the density to which the weights are relative, over that at the reference pair.
+    """
+    gauges = len(free_probability)
+    count = len(believed)
+    log_density = np.empty(count)
+    log_density_of_sound_gauges(observation, model.pair[believed], model.scale_squares, log_density)
+    largest = -np.inf
+    for m in range(count):
+        i = model.pair[believed[m]]
+        for g in range(gauges):
+            log_free = log_exchanged_density(observation, model, densities, g, i)
+            log_fixed = log_exchanged_density(observation, model, densities, gauges + g, i)
+            log_free += np.log(free_probability[g])
+            log_mixture = np.logaddexp(log_free, log_fixed + np.log1p(-free_probability[g]))
+            log_density[m] += log_mixture
+            innovation = observation.residual[i, g]
+            innovation -= densities.gain[g] * observation.prediction[i, g]
+            variance = 1.0 + densities.gain_variance[g] * observation.prediction[i, g] ** 2
+            weights.free_part[m, g] = np.exp(log_free - log_mixture)
+            weights.free_square[m, g] = innovation * innovation / variance
+        largest = max(largest, log_density[m])
+    for m in range(count):
+        belief_in_pair = belief[model.pair[believed[m]]]
+        weights.weight[m] = belief_in_pair * np.exp(log_density[m] - largest)
+    return float(largest - model.log_density)
 
 
 @compiled
@@ -230,78 +240,42 @@ def update_free_gains(
         The log evidence, up to the same constant as that of the model; minus infinity if no pair is
         believed.
     """
-    weight_at_all = np.empty(len(model.pair))
-    pairs = _take_pairs(model, priors.free_gain_deviation, belief, weight_at_all)
-    count = len(pairs.pair)
+    believed = _believed_pairs(model, belief)
+    count = len(believed)
     if count == 0:
         return -np.inf
-    weight = weight_at_all[:count]
-    free_part = np.empty((len(observation.present), count))
-    mixture = np.empty(count)
-    product = np.ones(count)
-    gauges_in_product = 0
-    for g in range(len(observation.present)):
-        if not observation.present[g]:
-            continue
-        gauge = _gauge_with_free_gain(observation, model, priors, statistics, twin, g)
-        if not mix_densities(pairs, gauge, mixture, free_part[g]):
-            mix_densities_in_logs(pairs, gauge, mixture, free_part[g])
-            for j in range(count):
-                weight[j] += mixture[j]
-            continue
-        for j in range(count):
-            product[j] *= mixture[j]
-        gauges_in_product += 1
-        if gauges_in_product == _GAUGES_OF_A_PRODUCT:
-            for j in range(count):
-                weight[j] += np.log(product[j])
-                product[j] = 1.0
-            gauges_in_product = 0
-
-    largest = -np.inf
-    for j in range(count):
-        weight[j] += np.log(product[j])
-        largest = max(largest, weight[j])
+    densities = free_gain_densities(priors, statistics, twin)
+    free_probability = np.empty(len(observation.present))
+    for g in range(len(free_probability)):  # rounding may exceed one
+        free_probability[g] = min(max(statistics.free_probability[twin, g], 0.0), 1.0)
+    weights = weigh_free_gains(observation, model, densities, free_probability, believed, belief)
+    log_scale = model.log_density
     total = 0.0
-    for j in range(count):
-        weight[j] = belief[pairs.pair[j]] * np.exp(weight[j] - largest)
-        total += weight[j]
-    for j in range(count):
-        weight[j] /= total
-        belief[pairs.pair[j]] = weight[j]
-    _update_statistics(observation, pairs, weight, free_part, statistics, twin)
-    return float(largest + np.log(total))
-
-
-@compiled
-def _gauge_with_free_gain(
-    observation: StandardizedObservation,
-    model: ModelLikelihood,
-    priors: FaultPriors,
-    statistics: FreeGainStatistics,
-    twin: int,
-    gauge: int,
-) -> GaugeWithFreeGain:
-    """Return a gauge of a twin that may have a gain of its own."""
-    gain_variance = 1.0 / (1.0 + statistics.sum_cc[twin, gauge])
-    return GaugeWithFreeGain(
-        gauge,
-        min(max(statistics.free_probability[twin, gauge], 0.0), 1.0),  # rounding exceeds one
-        gain_variance * statistics.sum_cx[twin, gauge],
-        gain_variance,
-        observation.degrees_after[gauge],
-        model.scale_squares[gauge],
-        priors.degrees_of_freedom + statistics.fixed_squares[twin, gauge],
-        priors.degrees_of_freedom + statistics.free_squares[twin, gauge],
+    for m in range(count):
+        total += weights.weight[m]
+    if not LEAST_TOTAL < total < 1.0 / LEAST_TOTAL:
+        log_scale += weigh_free_gains_in_logs(
+            observation, model, densities, free_probability, believed, belief, weights
+        )
+        total = 0.0
+        for m in range(count):
+            total += weights.weight[m]
+    for m in range(count):
+        weights.weight[m] /= total
+        belief[model.pair[believed[m]]] = weights.weight[m]
+    _update_statistics(
+        observation, model, priors.free_gain_deviation, believed, weights, statistics, twin
     )
+    return float(log_scale + np.log(total))
 
 
-@compiled
+@compiled_with_reordered_sums
 def _update_statistics(
     observation: StandardizedObservation,
-    pairs: PairsOfFreeGains,
-    weight: Float,
-    free_part: Float,
+    model: ModelLikelihood,
+    deviation: float,
+    believed: Index,
+    weights: FreeGainWeights,
     statistics: FreeGainStatistics,
     twin: int,
 ) -> None:
@@ -311,38 +285,40 @@ def _update_statistics(
     ----------
     observation : StandardizedObservation
         The observation of the twin.
-    pairs : PairsOfFreeGains
-        The n pairs.
-    weight : (n,) array
-        Their probabilities.
-    free_part : (G, n) array
-        The probability that a gauge has a gain of its own, at each pair.
+    model : ModelLikelihood
+        How the model explains it.
+    deviation : float
+        The prior standard deviation of a free gain.
+    believed : (n,) array
+        Which of the pairs of `model` the fault believes in.
+    weights : FreeGainWeights
+        The probabilities of these pairs.
     statistics : FreeGainStatistics
         Updated for the twin.
     twin : int
         The twin.
     """
-    for g in range(len(free_part)):
-        if not observation.present[g]:
-            continue
-        gain_variance = 1.0 / (1.0 + statistics.sum_cc[twin, g])
-        fitted_gain = gain_variance * statistics.sum_cx[twin, g]
-        free_probability = 0.0
-        fixed_squares = 0.0
-        free_squares = 0.0
-        sum_cc = 0.0
-        sum_cx = 0.0
-        for j in range(len(weight)):
-            x = pairs.x[g, j]
-            c = pairs.c[g, j]
-            innovation = x - c * fitted_gain
-            free_probability += weight[j] * free_part[g, j]
-            fixed_squares += weight[j] * x * x
-            free_squares += weight[j] * innovation * innovation / (1.0 + c * c * gain_variance)
-            sum_cc += weight[j] * c * c
-            sum_cx += weight[j] * c * x
-        statistics.free_probability[twin, g] = free_probability
-        statistics.fixed_squares[twin, g] += fixed_squares
-        statistics.free_squares[twin, g] += free_squares
-        statistics.sum_cc[twin, g] += sum_cc
-        statistics.sum_cx[twin, g] += sum_cx
+    gauges = len(observation.present)
+    free_probability = np.zeros(gauges)
+    fixed_squares = np.zeros(gauges)
+    free_squares = np.zeros(gauges)
+    sum_cc = np.zeros(gauges)
+    sum_cx = np.zeros(gauges)
+    for m in range(len(believed)):
+        i = model.pair[believed[m]]
+        weight = weights.weight[m]
+        for g in range(gauges):
+            x = observation.residual[i, g]
+            weighted_c = weight * deviation * observation.prediction[i, g]
+            free_probability[g] += weight * weights.free_part[m, g]
+            free_squares[g] += weight * weights.free_square[m, g]
+            fixed_squares[g] += weight * x * x
+            sum_cc[g] += weighted_c * deviation * observation.prediction[i, g]
+            sum_cx[g] += weighted_c * x
+    for g in range(gauges):
+        if observation.present[g]:
+            statistics.free_probability[twin, g] = free_probability[g]
+            statistics.fixed_squares[twin, g] += fixed_squares[g]
+            statistics.free_squares[twin, g] += free_squares[g]
+            statistics.sum_cc[twin, g] += sum_cc[g]
+            statistics.sum_cx[twin, g] += sum_cx[g]

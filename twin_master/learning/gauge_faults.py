@@ -7,40 +7,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe.compilation import compiled
+from fe.compilation import compiled, compiled_with_reordered_sums
 from reporting.arrays import Float, Single
+from twin_master.learning.exchanged_densities import (
+    ExchangeWork,
+    GaugeDensities,
+    exchange_densities,
+    exchange_factors,
+    log_exchanged_density,
+    log_reference_density,
+)
 from twin_master.learning.fault_kernels import (
     NEGLIGIBLE_UNDER_FAULT,
     Beliefs,
     FaultPriors,
     StandardizedObservation,
+    log_density_of_sound_gauges,
 )
-from twin_master.learning.model_likelihood import ModelLikelihood, multiply_by_power
+from twin_master.learning.model_likelihood import ModelLikelihood
+from twin_master.scenario.tables import GAINS_PER_SENSOR
 
-_LEAST_TOTAL = 1e-200
+_LEAST_TOTAL = 1e-9
 """A sum of relative densities that is smaller may have lost terms by underflow."""
-
-
-class GaugeFaults(NamedTuple):
-    """The faults of single gauges before an observation, in units of the noise, each field (R,).
-
-    Attributes
-    ----------
-    gain, gain_deviation : (R,) array
-        The gain error, and its prior standard deviation.
-    fitted_gain : (R,) array
-        The learnt difference from the gain error over `gain_deviation`, kept within one.
-    gain_variance : (R,) array
-        The variance of that difference.
-    scale_squares : (R,) array
-        Degrees of freedom plus the sum of squared innovations.
-    """
-
-    gain: Float
-    gain_deviation: Float
-    fitted_gain: Float
-    gain_variance: Float
-    scale_squares: Float
 
 
 class SumsOfFaults(NamedTuple):
@@ -48,44 +36,28 @@ class SumsOfFaults(NamedTuple):
 
     Attributes
     ----------
-    weight, squares, cc, cx : (R,) array
-        Of one, of the squared innovation over its variance, of c² and of c x.
+    weight, squares, predictions, products : (R,) array
+        Of one, of the squared innovation over its variance, of the squared prediction, and of the
+        prediction times the residual of the model.
     """
 
-    weight: Float
-    squares: Float
-    cc: Float
-    cx: Float
+    weight: Single
+    squares: Single
+    predictions: Single
+    products: Single
 
 
-@compiled
-def multiply_by_powers(base: Float, exponents: Float, product: Float) -> None:
-    """Do the same for each gauge: powers of numbers (G K,) by exponents (G,) of the gauges."""
-    gains = len(base) // len(exponents)
-    are_equal = True
-    for g in range(len(exponents)):
-        are_equal &= exponents[g] == exponents[0]
-    if are_equal:
-        multiply_by_power(base, exponents[0], product)
-        return
-    for g in range(len(exponents)):
-        faults = slice(g * gains, (g + 1) * gains)
-        multiply_by_power(base[faults], exponents[g], product[faults])
-
-
-@compiled
+@compiled_with_reordered_sums
 def weigh_gauge_faults(
     observation: StandardizedObservation,
     model: ModelLikelihood,
-    faults: GaugeFaults,
+    faults: GaugeDensities,
     belief: Single,
-) -> tuple[Float, SumsOfFaults]:
+) -> tuple[Single, SumsOfFaults]:
     """Return the density of each pair times its belief under all faults of a gauge, and sums of it.
 
-    The density is that of the model, with that of the faulty gauge exchanged. It is relative to the
-    density of the model without that gauge at the reference pair: the density of the model times
-    kernel / kernel of the fault, to the power of half the degrees of freedom, over the root of the
-    variance, where the kernel of the model is divided by its value at the reference pair.
+    The density is relative to that of the model at the reference pair, times what
+    `log_reference_density` returns.
 
     The compiler vectorises loops that write to arrays of this function only.
 
@@ -95,8 +67,8 @@ def weigh_gauge_faults(
         The observation.
     model : ModelLikelihood
         How the model explains it at n pairs.
-    faults : GaugeFaults
-        The faults.
+    faults : GaugeDensities
+        The densities of the faulty gauges.
     belief : (N, R) array
         The beliefs of the faults.
 
@@ -107,65 +79,54 @@ def weigh_gauge_faults(
     sums : SumsOfFaults
         The sum of the weights, and weighted sums.
     """
-    gauges = len(observation.present)
-    count = len(faults.gain)
-    gains = count // gauges
-    weight = np.empty((len(model.pair), count))
-    row = np.empty(count)
-    residual = np.empty(count)
-    c = np.empty(count)
-    x = np.empty(count)
-    square = np.empty(count)
-    base = np.empty(count)
-    power = np.empty(count)
-    sum_weight = np.zeros(count)
-    sum_squares = np.zeros(count)
-    sum_cc = np.zeros(count)
-    sum_cx = np.zeros(count)
-    inverse_reference = np.empty(gauges)
-    for g in range(gauges):
-        inverse_reference[g] = 1.0 / model.kernel[model.reference, g]
+    count = len(faults.gauge)
+    factors = exchange_factors(observation, model, faults)
+    zero = np.float32(0.0)
+    negligible = np.float32(NEGLIGIBLE_UNDER_FAULT)
+    weight = np.empty((len(model.pair), count), np.float32)
+    residual = np.empty(count, np.float32)
+    prediction = np.empty(count, np.float32)
+    square = np.empty(count, np.float32)
+    ratio = np.empty(count, np.float32)
+    work = ExchangeWork(
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+    )
+    row = np.empty(count, np.float32)
+    sum_weight = np.zeros(count, np.float32)
+    sum_squares = np.zeros(count, np.float32)
+    sum_predictions = np.zeros(count, np.float32)
+    sum_products = np.zeros(count, np.float32)
     for j in range(len(model.pair)):
-        prior = belief[model.pair[j]]
-        density = model.density[j]
-        for g in range(gauges):
-            relative_kernel = model.kernel[j, g] * inverse_reference[g]
-            for r in range(g * gains, (g + 1) * gains):
-                residual[r] = model.residual[j, g]
-                c[r] = model.prediction[j, g]
-                base[r] = relative_kernel
+        i = model.pair[j]
+        density = np.float32(model.density[j])
         for r in range(count):
-            x[r] = residual[r] - faults.gain[r] * c[r]
-            c[r] *= faults.gain_deviation[r]
-            innovation = x[r] - c[r] * faults.fitted_gain[r]
-            variance = 1.0 + c[r] * c[r] * faults.gain_variance[r]
-            scaled_variance = faults.scale_squares[r] * variance
-            fault_kernel = scaled_variance + innovation * innovation  # over `scaled_variance`
-            inverse = 1.0 / (variance * fault_kernel)
-            base[r] *= scaled_variance * variance * inverse
-            power[r] = fault_kernel * inverse
-            square[r] = innovation * innovation * power[r]
-        multiply_by_powers(base, observation.degrees_after, power)
+            residual[r] = observation.residual[i, r // GAINS_PER_SENSOR]
+            prediction[r] = observation.prediction[i, r // GAINS_PER_SENSOR]
+        exchange_densities(factors, residual, prediction, square, ratio, work)
         for r in range(count):
-            probability = prior[r] if prior[r] >= NEGLIGIBLE_UNDER_FAULT else 0.0
-            row[r] = probability * density * np.sqrt(power[r])
+            product = density * belief[i, r] * ratio[r]
+            row[r] = product if belief[i, r] >= negligible else zero
             sum_weight[r] += row[r]
             sum_squares[r] += row[r] * square[r]
-            sum_cc[r] += row[r] * c[r] * c[r]
-            sum_cx[r] += row[r] * c[r] * x[r]
+            weighted_prediction = row[r] * prediction[r]
+            sum_predictions[r] += weighted_prediction * prediction[r]
+            sum_products[r] += weighted_prediction * residual[r]
         for r in range(count):
             weight[j, r] = row[r]
-    return weight, SumsOfFaults(sum_weight, sum_squares, sum_cc, sum_cx)
+    return weight, SumsOfFaults(sum_weight, sum_squares, sum_predictions, sum_products)
 
 
 @compiled
 def weigh_gauge_fault_in_logs(
     observation: StandardizedObservation,
     model: ModelLikelihood,
-    faults: GaugeFaults,
+    faults: GaugeDensities,
     belief: Single,
     r: int,
-    weight: Float,
+    weight: Single,
     sums: SumsOfFaults,
 ) -> float:
     """Do the same as `weigh_gauge_faults` for fault r, by logarithms, which do not underflow.
@@ -175,57 +136,59 @@ def weigh_gauge_fault_in_logs(
     float
         The log of the density to which the weights are relative.
     """
-    g = r * len(observation.present) // len(faults.gain)
-    power = 0.5 * observation.degrees_after[g]
-    log_constant = 0.5 * np.log(model.scale_squares[g] / faults.scale_squares[r])
-    log_density = np.empty(len(model.pair))
+    g = faults.gauge[r]
+    count = len(model.pair)
+    log_density = np.empty(count)
+    log_density_of_sound_gauges(observation, model.pair, model.scale_squares, log_density)
     largest = -np.inf
-    for j in range(len(model.pair)):
-        log_density[j] = model.log_density[j]
-        if observation.present[g]:
-            c = faults.gain_deviation[r] * model.prediction[j, g]
-            x = model.residual[j, g] - faults.gain[r] * model.prediction[j, g]
-            innovation = x - c * faults.fitted_gain[r]
-            variance = 1.0 + c * c * faults.gain_variance[r]
-            fault_kernel = 1.0 + innovation * innovation / (faults.scale_squares[r] * variance)
-            log_density[j] += log_constant + power * np.log(model.kernel[j, g] / fault_kernel)
-            log_density[j] -= 0.5 * np.log(variance)
-        if belief[model.pair[j], r] >= NEGLIGIBLE_UNDER_FAULT:
+    for j in range(count):
+        i = model.pair[j]
+        log_density[j] += log_exchanged_density(observation, model, faults, r, i)
+        if belief[i, r] >= NEGLIGIBLE_UNDER_FAULT:
             largest = max(largest, log_density[j])
-    sums.weight[r] = 0.0
-    sums.squares[r] = 0.0
-    sums.cc[r] = 0.0
-    sums.cx[r] = 0.0
-    for j in range(len(model.pair)):
-        probability = belief[model.pair[j], r]
-        weight[j, r] = 0.0
-        if probability >= NEGLIGIBLE_UNDER_FAULT:
-            weight[j, r] = probability * np.exp(log_density[j] - largest)
-        c = faults.gain_deviation[r] * model.prediction[j, g]
-        x = model.residual[j, g] - faults.gain[r] * model.prediction[j, g]
-        innovation = x - c * faults.fitted_gain[r]
-        variance = 1.0 + c * c * faults.gain_variance[r]
-        sums.weight[r] += weight[j, r]
-        sums.squares[r] += weight[j, r] * innovation * innovation / variance
-        sums.cc[r] += weight[j, r] * c * c
-        sums.cx[r] += weight[j, r] * c * x
+    total = 0.0
+    sum_squares = 0.0
+    sum_predictions = 0.0
+    sum_products = 0.0
+    for j in range(count):
+        i = model.pair[j]
+        residual = observation.residual[i, g]
+        prediction = observation.prediction[i, g]
+        innovation = residual - faults.gain[r] * prediction
+        variance = 1.0 + faults.gain_variance[r] * prediction * prediction
+        probability = 0.0
+        if belief[i, r] >= NEGLIGIBLE_UNDER_FAULT:
+            probability = belief[i, r] * np.exp(log_density[j] - largest)
+        weight[j, r] = probability
+        total += probability
+        sum_squares += probability * innovation * innovation / variance
+        sum_predictions += probability * prediction * prediction
+        sum_products += probability * prediction * residual
+    sums.weight[r] = total
+    sums.squares[r] = sum_squares
+    sums.predictions[r] = sum_predictions
+    sums.products[r] = sum_products
     return largest
 
 
 @compiled
-def _gauge_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeFaults:
-    """Return the faults of single gauges of a twin before an observation."""
+def _densities_of_faults(priors: FaultPriors, beliefs: Beliefs, twin: int) -> GaugeDensities:
+    """Return the densities of the faulty gauges of a twin before an observation.
+
+    A gain is kept within one prior standard deviation of the gain error.
+    """
     count = beliefs.gauge.shape[2]
-    gains = len(priors.gains)
-    faults = GaugeFaults(
-        np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    faults = GaugeDensities(
+        np.empty(count, np.int64), np.empty(count), np.empty(count), np.empty(count)
     )
     for r in range(count):
-        gain_variance = 1.0 / (1.0 + beliefs.gauge_sum_cc[twin, r])
-        faults.gain[r] = priors.gains[r % gains]
-        faults.gain_deviation[r] = priors.gain_deviations[r % gains]
-        faults.fitted_gain[r] = min(max(gain_variance * beliefs.gauge_sum_cx[twin, r], -1.0), 1.0)
-        faults.gain_variance[r] = gain_variance
+        gain_error = priors.gains[r % GAINS_PER_SENSOR]
+        deviation = priors.gain_deviations[r % GAINS_PER_SENSOR]
+        variance = 1.0 / (1.0 + beliefs.gauge_sum_cc[twin, r])
+        fitted_gain = min(max(variance * beliefs.gauge_sum_cx[twin, r], -1.0), 1.0)
+        faults.gauge[r] = r // GAINS_PER_SENSOR
+        faults.gain[r] = gain_error + deviation * fitted_gain
+        faults.gain_variance[r] = deviation * deviation * variance
         faults.scale_squares[r] = priors.degrees_of_freedom + beliefs.gauge_squares[twin, r]
     return faults
 
@@ -260,29 +223,34 @@ def update_gauge_faults(
         To be filled: the log evidence of each fault, up to the same constant as that of the model.
     """
     count = len(log_evidence)
-    gains = len(priors.gains)
-    faults = _gauge_faults(priors, beliefs, twin)
+    faults = _densities_of_faults(priors, beliefs, twin)
     belief = beliefs.gauge[twin]
     weight, sums = weigh_gauge_faults(observation, model, faults, belief)
-    inverse = np.empty(count)
+    inverse = np.empty(count, np.float32)
+    zero = np.float32(0.0)
     for r in range(count):
-        g = r // gains
-        log_scale = model.log_density[model.reference]
-        if observation.present[g]:
-            kernel = model.kernel[model.reference, g]
-            log_scale += 0.5 * np.log(model.scale_squares[g] / faults.scale_squares[r])
-            log_scale += 0.5 * observation.degrees_after[g] * np.log(kernel)
-        if not _LEAST_TOTAL < sums.weight[r] < np.inf:
+        log_scale = model.log_density + log_reference_density(observation, model, faults, r)
+        largest = sums.weight[r] + sums.squares[r] + sums.predictions[r] + abs(sums.products[r])
+        if not (sums.weight[r] > _LEAST_TOTAL and largest < np.inf):
             log_scale = weigh_gauge_fault_in_logs(
                 observation, model, faults, belief, r, weight, sums
             )
-        inverse[r] = 1.0 / sums.weight[r] if sums.weight[r] > 0.0 else 0.0
-        log_evidence[r] = log_scale + np.log(sums.weight[r]) if inverse[r] > 0.0 else -np.inf
+        inverse[r] = 0.0
+        log_evidence[r] = -np.inf
+        if sums.weight[r] > 0.0:
+            inverse[r] = 1.0 / sums.weight[r]
+            log_evidence[r] = log_scale + np.log(np.float64(sums.weight[r]))
+        gain = priors.gains[r % GAINS_PER_SENSOR]
+        deviation = priors.gain_deviations[r % GAINS_PER_SENSOR]
+        sum_of_c_squared = deviation * deviation * sums.predictions[r]
+        sum_of_c_x = deviation * (sums.products[r] - gain * sums.predictions[r])
         beliefs.gauge_squares[twin, r] += sums.squares[r] * inverse[r]
-        beliefs.gauge_sum_cc[twin, r] += sums.cc[r] * inverse[r]
-        beliefs.gauge_sum_cx[twin, r] += sums.cx[r] * inverse[r]
+        beliefs.gauge_sum_cc[twin, r] += sum_of_c_squared * inverse[r]
+        beliefs.gauge_sum_cx[twin, r] += sum_of_c_x * inverse[r]
     for j in range(len(model.pair)):
-        row = weight[j]
-        posterior = belief[model.pair[j]]
+        i = model.pair[j]
+        believing = np.int64(0)
         for r in range(count):
-            posterior[r] = row[r] * inverse[r]
+            belief[i, r] = weight[j, r] * inverse[r]
+            believing += belief[i, r] > zero
+        beliefs.gauge_is_nonzero[twin, i] = believing > 0

@@ -15,7 +15,7 @@ from reporting.arrays import Float, Index
 from twin_master.learning import hypothesis_weights
 from twin_master.learning.fault_filter import FaultFilter
 from twin_master.learning.fault_kernels import Observations
-from twin_master.learning.hypothesis_weights import HypothesisBeliefs
+from twin_master.learning.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.learning.notices import NoticeWriter
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
@@ -176,14 +176,9 @@ class GaugeWatch:
         self.faults.assimilate(state, checked.observations)
         notices = self._report_absurd_readings(state, checked, step)
         self._raise_alarms(state, notices, step)
-        beliefs = self.beliefs(state, model_belief)
-        self._report_followed_hypothesis(state, beliefs, notices, step)
-        state.mixed = hypothesis_weights.mix_beliefs(state.weights, beliefs)
+        self._report_followed_hypothesis(state, notices, step)
+        state.mixed = hypothesis_weights.mix_beliefs(state.weights, model_belief, state.beliefs)
         return notices
-
-    def beliefs(self, state: WatchState, model_belief: Float) -> HypothesisBeliefs:
-        """Return the beliefs about the state under all hypotheses that believe in one."""
-        return HypothesisBeliefs(model_belief, state.beliefs.recovered, state.beliefs.gauge)
 
     def _report_absurd_readings(
         self, state: WatchState, checked: CheckedReadings, step: int
@@ -219,11 +214,7 @@ class GaugeWatch:
             )
 
     def _report_followed_hypothesis(
-        self,
-        state: WatchState,
-        beliefs: HypothesisBeliefs,
-        notices: Sequence[list[Notice]],
-        step: int,
+        self, state: WatchState, notices: Sequence[list[Notice]], step: int
     ) -> None:
         """Append a notice for each twin that follows another hypothesis than before."""
         hypothesis, probability = hypothesis_weights.most_probable_hypothesis(
@@ -250,11 +241,11 @@ class GaugeWatch:
         log_begins_later = np.log(self.faults.probability_to_begin_after(state.step_count - 1.0))
         twins, gauges = state.left_out.shape
         by_gauge = state.log_gauge_evidence.reshape(twins, gauges, -1)
-        log_fault_has_begun = np.logaddexp.reduce(by_gauge, axis=2)
-        each_gauge = np.logaddexp(log_fault_has_begun, log_begins_later[:, None])
+        log_fault_has_begun = log_of_sums(by_gauge)
+        each_gauge = log_of_sum(log_fault_has_begun, log_begins_later[:, None])
         return AlarmEvidence(
-            free_gains=np.logaddexp(state.log_free_gains_evidence, log_begins_later),
-            any_gauge=np.logaddexp.reduce(each_gauge + self.faults.log_gauge_prior, axis=1),
+            free_gains=log_of_sum(state.log_free_gains_evidence, log_begins_later),
+            any_gauge=log_of_sums(each_gauge + self.faults.log_gauge_prior),
             each_gauge=each_gauge,
         )
 
@@ -280,7 +271,6 @@ class GaugeWatch:
         model_belief : (1, S) array
             Its filtered belief under the model.
         """
-        beliefs = self.beliefs(state, model_belief)
         return hypothesis_weights.list_hypotheses(
-            state.weights, beliefs, self._notices.hypothesis_names
+            state.weights, model_belief, state.beliefs, self._notices.hypothesis_names
         )

@@ -22,8 +22,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reporting.arrays import Float, Index, Single
-from twin_master.learning.fault_kernels import weighted_belief
+from reporting.arrays import Float, Index
+from twin_master.learning.belief_transitions import average_competing_beliefs
+from twin_master.learning.fault_kernels import Beliefs
 from twin_master.network.estimator import Hypothesis
 
 MODEL = 0
@@ -49,8 +50,24 @@ SHOWS_ELSEWHERE = 0.5
 """Prior probability that a fault shows under another control than that in which it began."""
 LEAST_SHOWING = 1e-3
 """Least probability that a fault shows under a control: one that grows is seen there in the end."""
+_LEAST_PROBABILITY = 1e-300
+"""Weights of hypotheses do not fall below this in a step, so that they have a logarithm."""
 _LEAST_REPORTED = 0.01
 """Faults of gauges that are less probable are not listed among the hypotheses."""
+
+
+def log_of_sum(first: Float, second: Float) -> Float:
+    """Return log(exp(first) + exp(second)); several times as fast as `np.logaddexp`."""
+    return np.asarray(np.maximum(first, second) + np.log(1.0 + np.exp(-np.abs(first - second))))
+
+
+def log_of_sums(values: Float) -> Float:
+    """Return the log of the sum of exponentials over the last axis."""
+    largest = values.max(axis=-1)
+    is_finite = largest > -np.inf
+    reference = np.where(is_finite, largest, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(reference + np.log(np.exp(values - reference[..., None]).sum(axis=-1)))
 
 
 @dataclass
@@ -163,36 +180,35 @@ class HypothesisWeights:
         (..., 1 + G K) array
             The probability of each fault that it has ended in the step.
         """
-        before = self.current
-        log_hazard = np.asarray(log_hazard)
-        log_ended = np.log(END_PROBABILITY) + before
+        probability = np.exp(self.current)
+        hidden = np.exp(self.hidden)
+        hazard = np.exp(np.asarray(log_hazard))
+        ended = END_PROBABILITY * probability[..., FAULTS]
 
         # A new fault begins from the model. If the gauges are right again after a fault, only free
         # gains may begin: the beliefs of single gauges have not followed what happened since.
-        log_free_gains_begin = log_hazard + log_begin[FREE_GAINS]
-        log_right_after_fault = self._log_right_after_fault()
-        log_begun = (before[..., MODEL] + log_hazard)[..., None] + log_begin[FAULTS]
-        log_begun[..., FREE_GAINS_OF_FAULTS] = np.logaddexp(
-            log_begun[..., FREE_GAINS_OF_FAULTS], log_right_after_fault + log_free_gains_begin
-        )
+        free_gains_begin = hazard * np.exp(log_begin[FREE_GAINS])
+        right_after_fault = probability[..., RECOVERED] + hidden.sum(axis=-1)
+        begun = (probability[..., MODEL] * hazard)[..., None] * np.exp(log_begin[FAULTS])
+        begun[..., FREE_GAINS_OF_FAULTS] += right_after_fault * free_gains_begin
 
         # Each hypothesis keeps the probability that it does not pass on to others.
-        log_stay = np.full_like(before, np.log1p(-END_PROBABILITY))
-        log_stay[..., MODEL] = np.log1p(-np.exp(log_hazard))
-        log_stay[..., RECOVERED] = np.log1p(-END_PROBABILITY - np.exp(log_free_gains_begin))
-        log_incoming = np.empty_like(before)
-        log_incoming[..., MODEL] = log_ended[..., RECOVERED]
-        log_incoming[..., RECOVERED] = np.logaddexp.reduce(log_ended[..., FAULTS], axis=-1)
-        log_incoming[..., FAULTS] = log_begun
-        self.current = np.logaddexp(before + log_stay, log_incoming)
-        self.hidden = self.hidden + np.log1p(-np.exp(log_free_gains_begin))[..., None]
+        stay = np.full_like(probability, 1.0 - END_PROBABILITY)
+        stay[..., MODEL] = 1.0 - hazard
+        stay[..., RECOVERED] = 1.0 - END_PROBABILITY - free_gains_begin
+        advanced = probability * stay
+        advanced[..., MODEL] += END_PROBABILITY * probability[..., RECOVERED]
+        advanced[..., RECOVERED] += ended.sum(axis=-1)
+        advanced[..., FAULTS] += begun
+        self.current = np.log(np.maximum(advanced, _LEAST_PROBABILITY))
+        self.hidden = self.hidden + np.log1p(-free_gains_begin)[..., None]
 
         # For a fault that began in this step nothing is known about the other controls: it has the
         # prior probability to show there.
-        log_fault = np.logaddexp(self.current[..., FAULTS], self.hidden)
-        begun_fraction = np.exp(log_begun - log_fault)
-        self.showing += begun_fraction[..., None] * (SHOWS_ELSEWHERE - self.showing)
-        return np.asarray(np.exp(log_ended[..., FAULTS]))
+        hidden *= (1.0 - free_gains_begin)[..., None]
+        of_fault = np.maximum(advanced[..., FAULTS] + hidden, _LEAST_PROBABILITY)
+        self.showing += (begun / of_fault)[..., None] * (SHOWS_ELSEWHERE - self.showing)
+        return np.asarray(ended)
 
     def update(self, log_ratio: Float) -> None:
         """Correct the weights by an observation, in place, and normalise them.
@@ -205,56 +221,36 @@ class HypothesisWeights:
         """
         self.current = self.current + log_ratio
         self.hidden = self.hidden + log_ratio[..., RECOVERED, None]
-        log_total_weight = np.logaddexp(
-            np.logaddexp.reduce(self.current, axis=-1), np.logaddexp.reduce(self.hidden, axis=-1)
-        )
-        self.current -= log_total_weight[..., None]
-        self.hidden -= log_total_weight[..., None]
-
-    def _log_right_after_fault(self) -> Float:
-        """Return the log probability (...) of a fault that ended or is hidden.
-
-        The gauges are right then.
-        """
-        return np.asarray(
-            np.logaddexp(self.current[..., RECOVERED], np.logaddexp.reduce(self.hidden, axis=-1))
-        )
+        largest = np.maximum(self.current.max(axis=-1), self.hidden.max(axis=-1))[..., None]
+        total = np.exp(self.current - largest).sum(axis=-1)
+        total += np.exp(self.hidden - largest).sum(axis=-1)
+        log_total_weight = largest + np.log(total)[..., None]
+        self.current -= log_total_weight
+        self.hidden -= log_total_weight
 
     @property
     def right_after_fault(self) -> Float:
         """Probability (...) of a fault that ended or is hidden, so that the gauges are right."""
-        return np.asarray(np.exp(self._log_right_after_fault()))
+        return np.asarray(np.exp(self.current)[..., RECOVERED] + np.exp(self.hidden).sum(axis=-1))
 
     @property
     def free_gains_probability(self) -> Float:
         """Probability (...) that several gauges have unknown gains, whether this shows or not."""
-        log_hidden = self.hidden[..., FREE_GAINS_OF_FAULTS]
-        return np.asarray(np.exp(np.logaddexp(self.current[..., FREE_GAINS], log_hidden)))
+        return np.asarray(self._fault_probability[..., FREE_GAINS_OF_FAULTS])
 
     @property
     def gauge_fault_probability(self) -> Float:
         """Probability (..., G K) of K gain errors of G gauges, whether it shows or not."""
-        log_hidden = self.hidden[..., GAUGES_OF_FAULTS]
-        return np.asarray(np.exp(np.logaddexp(self.current[..., GAUGE_FAULTS], log_hidden)))
+        return np.asarray(self._fault_probability[..., GAUGES_OF_FAULTS])
 
+    @property
+    def _fault_probability(self) -> Float:
+        """Probability (..., 1 + G K) of each fault, whether it shows or not.
 
-@dataclass(frozen=True)
-class HypothesisBeliefs:
-    """The beliefs about the state under all hypotheses but free gains, which no state explains.
-
-    Attributes
-    ----------
-    model : (B, S) array
-        The belief of each twin about the state under the model.
-    recovered : (B, S E) array
-        The belief over states and draws under "recovered", and under a gauge fault that is hidden.
-    gauge : (B, S E, G K) array
-        The same under each fault of a gauge that shows, gauge by gauge.
-    """
-
-    model: Float
-    recovered: Float
-    gauge: Single
+        Exponentials are taken of whole arrays: NumPy takes those of every n-th number by another
+        algorithm, whose last bits differ, so that they would depend on the number of twins.
+        """
+        return np.asarray(np.exp(self.current)[..., FAULTS] + np.exp(self.hidden))
 
 
 @dataclass(frozen=True)
@@ -276,7 +272,7 @@ class MixedBelief:
     model_weight: Float
 
 
-def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> MixedBelief:
+def mix_beliefs(weights: HypothesisWeights, model_belief: Float, beliefs: Beliefs) -> MixedBelief:
     """Return the beliefs about the state, averaged over all hypotheses but free gains.
 
     Under free gains no state explains the sensors, so that they add nothing to the belief.
@@ -285,36 +281,41 @@ def mix_beliefs(weights: HypothesisWeights, beliefs: HypothesisBeliefs) -> Mixed
     ----------
     weights : HypothesisWeights
         The log weights of B twins.
-    beliefs : HypothesisBeliefs
-        Their beliefs under each hypothesis.
+    model_belief : (B, S) array
+        Their beliefs about the state under the model.
+    beliefs : Beliefs
+        Their beliefs under each other hypothesis.
     """
     # Normalise the weights without free gains, under which no state is believed.
     log_hidden = weights.hidden[:, GAUGES_OF_FAULTS]
-    log_believing = np.concatenate(
-        [np.delete(weights.current, FREE_GAINS, axis=1), log_hidden], axis=1
-    )
-    log_total = np.logaddexp.reduce(log_believing, axis=1)[:, None]
-    current_weight = np.exp(weights.current - log_total)
-    hidden_weight = np.exp(log_hidden - log_total)
+    largest = np.maximum(
+        weights.current[:, SOUND_HYPOTHESES].max(axis=1),
+        np.maximum(weights.current[:, GAUGE_FAULTS].max(axis=1), log_hidden.max(axis=1)),
+    )[:, None]
+    sound_weight = np.exp(weights.current[:, SOUND_HYPOTHESES] - largest)
+    gauge_weight = np.exp(weights.current[:, GAUGE_FAULTS] - largest)
+    hidden_weight = np.exp(log_hidden - largest).sum(axis=1)
+    total = sound_weight.sum(axis=1) + gauge_weight.sum(axis=1) + hidden_weight
+    gauge_weight /= total[:, None]
 
-    model_weight = current_weight[:, MODEL]
-    right_after_fault = current_weight[:, RECOVERED] + hidden_weight.sum(axis=1)
-    gauge_weight = np.ascontiguousarray(current_weight[:, GAUGE_FAULTS])
-    by_pair = weighted_belief(gauge_weight, beliefs.gauge)
-    by_pair += right_after_fault[:, None] * beliefs.recovered
-    twins, states = beliefs.model.shape
-    competing = by_pair.reshape(twins, states, -1).sum(axis=2)
+    model_weight = sound_weight[:, MODEL] / total
+    right_after_fault = (sound_weight[:, RECOVERED] + hidden_weight) / total
+    competing = np.empty_like(model_belief)
+    average_competing_beliefs(right_after_fault, gauge_weight, beliefs, competing)
     competing_sum = competing.sum(axis=1)[:, None]
     is_any_competing = competing_sum > 0.0
     competing = np.where(
-        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), beliefs.model
+        is_any_competing, competing / np.where(is_any_competing, competing_sum, 1.0), model_belief
     )
-    belief = model_weight[:, None] * beliefs.model + (1.0 - model_weight)[:, None] * competing
+    belief = model_weight[:, None] * model_belief + (1.0 - model_weight)[:, None] * competing
     return MixedBelief(belief, competing, model_weight)
 
 
 def list_hypotheses(
-    weights: HypothesisWeights, beliefs: HypothesisBeliefs, gauge_names: tuple[str, ...]
+    weights: HypothesisWeights,
+    model_belief: Float,
+    beliefs: Beliefs,
+    gauge_names: tuple[str, ...],
 ) -> tuple[Hypothesis, ...]:
     """Return the competing hypotheses of one twin, with their probabilities and beliefs.
 
@@ -325,8 +326,10 @@ def list_hypotheses(
     ----------
     weights : HypothesisWeights
         The log weights, with a leading axis of length one.
-    beliefs : HypothesisBeliefs
-        The belief of each hypothesis about the state, of one twin.
+    model_belief : (1, S) array
+        The belief about the state under the model.
+    beliefs : Beliefs
+        The beliefs under each other hypothesis, of one twin.
     gauge_names : tuple of str
         The names of the G faults of the gauges, such as "gauge 5 off".
     """
@@ -336,12 +339,12 @@ def list_hypotheses(
     showing_probability = probability[GAUGE_FAULTS].reshape(gauge_count, -1)  # (G, K)
     hidden_probability = np.exp(log_hidden[GAUGES_OF_FAULTS]).reshape(gauge_count, -1)  # (G, K)
     gauge_probability = (showing_probability + hidden_probability).sum(axis=1)  # (G,)
-    state_count = beliefs.model.shape[1]
+    state_count = model_belief.shape[1]
     recovered_belief = beliefs.recovered.reshape(state_count, -1).sum(axis=1)  # (S,)
 
     # The gauges are right: the mixture of the model's belief and of that after a fault has ended.
     sound_probability = probability[SOUND_HYPOTHESES].sum()
-    sound_belief = beliefs.model[0]
+    sound_belief = model_belief[0]
     if probability[RECOVERED] > 0.0:
         joint = probability[MODEL] * sound_belief + probability[RECOVERED] * recovered_belief
         sound_belief = joint / sound_probability

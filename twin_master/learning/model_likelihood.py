@@ -1,4 +1,4 @@
-"""Compiled loops: how the model explains an observation, at the pairs that faults consider.
+"""Compiled loops: which pairs are considered, and how the model explains an observation at them.
 
 Notation and method are those of `fault_kernels`.
 """
@@ -10,10 +10,15 @@ import numpy as np
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.learning.fault_kernels import (
+    LEAST_TOTAL,
     NEGLIGIBLE_UNDER_FAULT,
+    NEGLIGIBLE_UNDER_MODEL,
     Beliefs,
     StandardizedObservation,
+    log_density_of_sound_gauges,
 )
+
+_NEGLIGIBLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
 
 
 class ModelLikelihood(NamedTuple):
@@ -25,51 +30,69 @@ class ModelLikelihood(NamedTuple):
         The indices of the pairs that some fault considers, among all pairs.
     scale_squares : (G,) array
         Degrees of freedom plus the expected sum of squared residuals before the observation.
-    residual, prediction : (n, G) array
-        Those of the observation at these pairs.
-    kernel : (n, G) array
-        The kernel 1 + x² / scale_squares of each gauge's density.
-    log_density : (n,) array
-        The log density of the observation, up to a constant of the step.
     density : (n,) array
-        The density over its largest value.
+        The density of the observation over that at the reference pair.
+    log_density : float
+        The log density at the reference pair, up to a constant of the step.
     reference : int
-        The pair with the largest density.
+        The pair, among all pairs, with the largest density.
     """
 
     pair: Index
     scale_squares: Float
-    residual: Float
-    prediction: Float
-    kernel: Float
-    log_density: Float
     density: Float
+    log_density: float
     reference: int
 
 
 @compiled
-def considered_pairs(beliefs: Beliefs, twin: int) -> Index:
-    """Return the indices (n,) of the pairs that some fault of a twin considers."""
+def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
+    """Return the indices (n,) of the pairs that some fault of a twin considers.
+
+    The rows of all other pairs among the beliefs of the faults become zero.
+    """
     _, pairs, faults = beliefs.gauge.shape
     considered = np.empty(pairs, np.int64)
     count = 0
     for i in range(pairs):
-        belief = beliefs.gauge[twin, i]
-        largest = beliefs.free_gains[twin, i]
-        for r in range(faults):
-            largest = max(largest, belief[r])
-        if largest >= NEGLIGIBLE_UNDER_FAULT:
+        considering = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
+        if beliefs.gauge_is_nonzero[twin, i]:
+            for r in range(faults):
+                considering += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
+        if considering > 0:
             considered[count] = i
             count += 1
-        else:
+        elif beliefs.gauge_is_nonzero[twin, i]:
             for r in range(faults):
-                belief[r] = 0.0
+                beliefs.gauge[twin, i, r] = 0.0
+            beliefs.gauge_is_nonzero[twin, i] = False
+    return considered[:count]
+
+
+@compiled
+def pairs_of_hypotheses(beliefs: Beliefs, twin: int, pairs_of_faults: Index) -> Index:
+    """Return the indices of the pairs that any hypothesis of a twin considers, in rising order."""
+    pairs = beliefs.model.shape[1]
+    is_considered = np.zeros(pairs, np.bool_)
+    for i in pairs_of_faults:
+        is_considered[i] = True
+    considered = np.empty(pairs, np.int64)
+    count = 0
+    for i in range(pairs):
+        largest = max(beliefs.model[twin, i], beliefs.recovered[twin, i])
+        if is_considered[i] or largest >= NEGLIGIBLE_UNDER_MODEL:
+            considered[count] = i
+            count += 1
     return considered[:count]
 
 
 @compiled
 def model_likelihood(
-    observation: StandardizedObservation, pair: Index, scale_squares: Float, log_density: Float
+    observation: StandardizedObservation,
+    pair: Index,
+    scale_squares: Float,
+    density: Float,
+    log_factor: float,
 ) -> ModelLikelihood:
     """Return how the model explains an observation at some pairs.
 
@@ -81,49 +104,32 @@ def model_likelihood(
         The indices of the pairs.
     scale_squares : (G,) array
         Degrees of freedom plus the expected sum of squared residuals before the observation.
-    log_density : (N,) array
-        The log density of all pairs under the model.
+    density : (N,) array
+        The density at all pairs under the model, up to a factor.
+    log_factor : float
+        The log of the factor, up to a constant of the step.
     """
-    gauges = len(scale_squares)
     count = len(pair)
-    residual = np.empty((count, gauges))
-    prediction = np.empty((count, gauges))
-    kernel = np.empty((count, gauges))
-    chosen_density = np.empty(count)
+    relative_density = np.empty(count)
+    largest = 0.0
+    is_finite = True
+    for j in range(count):
+        relative_density[j] = density[pair[j]]
+        largest = max(largest, relative_density[j])
+        is_finite &= relative_density[j] < np.inf
+    if not is_finite or largest < LEAST_TOTAL:
+        log_density_of_sound_gauges(observation, pair, scale_squares, relative_density)
+        log_factor = -np.inf
+        for j in range(count):
+            log_factor = max(log_factor, relative_density[j])
+        largest = 1.0
+        for j in range(count):
+            relative_density[j] = np.exp(relative_density[j] - log_factor)
     reference = 0
     for j in range(count):
-        i = pair[j]
-        chosen_density[j] = log_density[i]
-        if chosen_density[j] > chosen_density[reference]:
+        relative_density[j] /= largest
+        if relative_density[j] > relative_density[reference]:
             reference = j
-        for g in range(gauges):
-            residual[j, g] = observation.residual[g, i]
-            prediction[j, g] = observation.prediction[g, i]
-            kernel[j, g] = 1.0 + residual[j, g] * residual[j, g] / scale_squares[g]
-    density = np.empty(count)
-    for j in range(count):
-        density[j] = np.exp(chosen_density[j] - chosen_density[reference])
     return ModelLikelihood(
-        pair, scale_squares, residual, prediction, kernel, chosen_density, density, reference
+        pair, scale_squares, relative_density, log_factor + np.log(largest), pair[reference]
     )
-
-
-@compiled
-def multiply_by_power(base: Float, exponent: float, product: Float) -> None:
-    """Multiply numbers (n,) by a power of others (n,) in place; the base is overwritten.
-
-    The whole part of the exponent is taken by repeated squaring.
-    """
-    whole = np.int64(np.floor(exponent))
-    fraction = exponent - whole
-    if fraction > 0.0:
-        for i in range(len(base)):
-            product[i] *= base[i] ** fraction
-    while whole > 0:
-        if whole % 2 == 1:
-            for i in range(len(base)):
-                product[i] *= base[i]
-        whole //= 2
-        if whole > 0:
-            for i in range(len(base)):
-                base[i] *= base[i]

@@ -100,6 +100,7 @@ class WatchState:
                 model=model_belief,
                 recovered=model_belief.copy(),
                 gauge=gauge_belief.astype(np.float32, order="C"),
+                gauge_is_nonzero=model_belief > 0.0,
                 free_gains=model_belief.astype(np.float32),
                 model_squares=np.zeros(by_gauge),
                 recovered_squares=np.zeros(by_gauge),
@@ -218,6 +219,7 @@ class WatchState:
         }
         gauge_belief = np.zeros((sensors * gains, draws, states), dtype=np.float32)
         gauge_belief.ravel()[stored_arrays["gauge_place"]] = stored_arrays["gauge"]
+        gauge = _by_state(np.moveaxis(gauge_belief, 0, -1))
         # Contiguous as in a new state: for strided arrays the loops would be compiled once more,
         # which takes five seconds.
         gauge_sum_cc, gauge_sum_cx = np.ascontiguousarray(
@@ -229,7 +231,8 @@ class WatchState:
             beliefs=Beliefs(
                 model=_by_state(stored_arrays["model"]),
                 recovered=_by_state(stored_arrays["mended"]),
-                gauge=_by_state(np.moveaxis(gauge_belief, 0, -1)),
+                gauge=gauge,
+                gauge_is_nonzero=np.any(gauge > 0.0, axis=2),
                 free_gains=_by_state(stored_arrays["none"][0]),
                 model_squares=stored_arrays["model_squares"][None],
                 recovered_squares=stored_arrays["mended_squares"][None],
