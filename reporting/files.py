@@ -22,6 +22,7 @@ TEMPORARY_SUFFIX = ".partial"
 
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_TOO_MANY_FILES = frozenset({errno.EMFILE, errno.ENFILE})
 _temporary_file_numbers = itertools.count()
 
 
@@ -48,6 +49,11 @@ def write_error(error: OSError, path: Path) -> FileNotWrittenError:
     if error.errno in (errno.ENOENT, errno.ENOTDIR) and not path.parent.is_dir():
         return FileNotWrittenError(
             f"{path} cannot be written because its folder {path.parent} does not exist."
+        )
+    if error.errno in _TOO_MANY_FILES:
+        return FileNotWrittenError(
+            f"{path} could not be written because too many files are open: allow more by "
+            "`ulimit -n`."
         )
     return FileNotWrittenError(f"{path} could not be written: {error.strerror or error}.")
 
@@ -95,6 +101,36 @@ def synchronise(path: Path) -> None:
         # Some file systems cannot flush a folder; moving a file is still atomic there.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
             raise
+    finally:
+        os.close(descriptor)
+
+
+def write_at(path: Path, data: bytes, position: int) -> None:
+    """Write bytes into an existing file, which is open for this time alone.
+
+    Once this returns, the bytes survive if the process is killed, but not a loss of power.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    data : bytes
+        The bytes.
+    position : int
+        The position of the first one [bytes].
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or if the system could not write all of the bytes.
+    """
+    descriptor = open_descriptor(path, os.O_WRONLY)
+    try:
+        os.lseek(descriptor, position, os.SEEK_SET)
+        written_bytes = 0
+        # The operating system may write less than it is given
+        while written_bytes < len(data):
+            written_bytes += os.write(descriptor, data[written_bytes:])
     finally:
         os.close(descriptor)
 

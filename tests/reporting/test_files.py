@@ -74,6 +74,7 @@ def old_file(tmp_path):
         (errno.EDQUOT, DiskFullError, "No space is left"),
         (errno.EACCES, FileNotWrittenError, "not permitted"),
         (errno.EROFS, FileNotWrittenError, "not permitted"),
+        (errno.EMFILE, FileNotWrittenError, "too many files are open: allow more by `ulimit -n`"),
         (errno.EIO, FileNotWrittenError, "could not be written"),
     ],
 )

@@ -365,7 +365,7 @@ class Session:
         """Read all packets that have come, and write those that wait; return paho's error code.
 
         The loop of paho itself waits by `select`, which knows no file beyond the first 1,024 of a
-        process; the watch of a fleet has two open files for each asset. Some brokers send more than
+        process; the watch of a fleet may follow thousands of files. Some brokers send more than
         they were asked for, so that nothing is read while `_UNREAD_BYTES` wait here.
         """
         error = client.loop_misc()
