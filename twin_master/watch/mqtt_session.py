@@ -391,6 +391,8 @@ class Session:
         Brokers send only so many messages before the first is acknowledged, so that the number of
         those that wait here does not tell how many wait there. Whether all were processed at some
         time does. The operator is told once if this does not happen between two heartbeats.
+        A heartbeat that is sent early, because the connection was just made, tells what the last
+        one told.
         """
         now = time.monotonic()
         elapsed = max(now - self._pace_begin, 1e-3)
@@ -398,6 +400,8 @@ class Session:
             "busy": round(min(1.0, self._processing_seconds / elapsed), 2),
             "keeps_up": self._was_idle,
         }
+        if elapsed < HEARTBEAT_SECONDS / 2.0:
+            return pace | {"keeps_up": self._kept_up}
         if not self._was_idle and self._kept_up:
             self.note(
                 f"Messages come faster than they are processed: for {elapsed:.0f} s some have "
