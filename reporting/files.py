@@ -10,6 +10,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,9 @@ TEMPORARY_SUFFIX = ".partial"
 
 _NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_SERVICE = re.compile(r"[a-z][a-z0-9+.-]+:")
+"""The beginning of an address; the drives of Windows have one letter."""
+_TOO_MANY_FILES = frozenset({errno.EMFILE, errno.ENFILE})
 _temporary_file_numbers = itertools.count()
 
 
@@ -49,6 +53,11 @@ def write_error(error: OSError, path: Path) -> FileNotWrittenError:
         return FileNotWrittenError(
             f"{path} cannot be written because its folder {path.parent} does not exist."
         )
+    if error.errno in _TOO_MANY_FILES:
+        return FileNotWrittenError(
+            f"{path} could not be written because too many files are open: allow more by "
+            "`ulimit -n`."
+        )
     return FileNotWrittenError(f"{path} could not be written: {error.strerror or error}.")
 
 
@@ -70,8 +79,9 @@ def explained_write_errors(path: Path) -> Iterator[None]:
 def _destination(path: Path) -> Path:
     """Return the file that a path leads to, following symbolic links.
 
-    A folder or a device is refused.
+    A folder, a device or an address is refused.
     """
+    refuse_address(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "not an ordinary file"
@@ -79,6 +89,24 @@ def _destination(path: Path) -> Path:
             f"{path} cannot be written because it is {kind}: choose another name."
         )
     return target
+
+
+def refuse_address(path: Path) -> None:
+    """Refuse a path that is the address of a service, such as s3://BUCKET/NAME.
+
+    `Path` has made one slash of two; the first part is left, such as "s3:".
+
+    Raises
+    ------
+    FileNotWrittenError
+        If the path begins like an address, and no folder of this machine has that name.
+    """
+    first_part = path.parts[0] if path.parts else ""
+    if _SERVICE.fullmatch(first_part) and not Path(first_part).exists():
+        raise FileNotWrittenError(
+            f"{path} is an address, but a file or folder of this machine is expected: choose "
+            "another name."
+        )
 
 
 def synchronise(path: Path) -> None:
@@ -95,6 +123,36 @@ def synchronise(path: Path) -> None:
         # Some file systems cannot flush a folder; moving a file is still atomic there.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
             raise
+    finally:
+        os.close(descriptor)
+
+
+def write_at(path: Path, data: bytes, position: int) -> None:
+    """Write bytes into an existing file, which is open for this time alone.
+
+    Once this returns, the bytes survive if the process is killed, but not a loss of power.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    data : bytes
+        The bytes.
+    position : int
+        The position of the first one [bytes].
+
+    Raises
+    ------
+    OSError
+        If there is no such file, or if the system could not write all of the bytes.
+    """
+    descriptor = open_descriptor(path, os.O_WRONLY)
+    try:
+        os.lseek(descriptor, position, os.SEEK_SET)
+        written_bytes = 0
+        # The operating system may write less than it is given
+        while written_bytes < len(data):
+            written_bytes += os.write(descriptor, data[written_bytes:])
     finally:
         os.close(descriptor)
 

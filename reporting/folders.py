@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from reporting.errors import FileNotWrittenError
-from reporting.files import explained_write_errors
+from reporting.files import explained_write_errors, refuse_address
 from reporting.operating_system import lock_folder
 
 _NEW = "new"
@@ -38,7 +38,10 @@ def fresh_folder(folder: Path) -> Path:
     ------
     OSError
         If the location is not writable.
+    FileNotWrittenError
+        If the path is an address.
     """
+    refuse_address(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _make_folder_beside(folder, _NEW)
     # The umask can only be read by setting it.

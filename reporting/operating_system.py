@@ -69,7 +69,7 @@ def read_at(descriptor: int, count: int, position: int) -> bytes:
         os.lseek(descriptor, former_position, os.SEEK_SET)
 
 
-def lock_descriptor(descriptor: int, *, wait: bool) -> None:
+def lock_descriptor(descriptor: int, *, wait: bool, shared: bool = False) -> None:
     """Lock an open file for this process until its descriptor is closed.
 
     Windows locks a byte far behind the content, so that others can still read it.
@@ -80,6 +80,8 @@ def lock_descriptor(descriptor: int, *, wait: bool) -> None:
         The descriptor of the file.
     wait : bool
         Whether to wait while another process holds the lock.
+    shared : bool
+        Whether others may hold a shared lock at the same time; Windows has none.
 
     Raises
     ------
@@ -91,7 +93,8 @@ def lock_descriptor(descriptor: int, *, wait: bool) -> None:
     except ImportError:
         _lock_byte(descriptor, wait=wait)
         return
-    fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    fcntl.flock(descriptor, kind | (0 if wait else fcntl.LOCK_NB))
 
 
 def _lock_byte(descriptor: int, *, wait: bool) -> None:
@@ -121,13 +124,20 @@ def _lock_byte(descriptor: int, *, wait: bool) -> None:
         os.lseek(descriptor, former_position, os.SEEK_SET)
 
 
-def lock_folder(folder: Path) -> int | None:
+def lock_folder(folder: Path, *, shared: bool = False) -> int | None:
     """Lock a folder for this process.
 
     The lock belongs to the folder itself, so it stays when the folder is renamed. The system
     releases it when the process ends. Where folders cannot be opened (Windows), a file in the
     folder for temporary files, named after the number of the folder, is locked in its place: then
     only processes with the same folder for temporary files see the lock.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    shared : bool
+        Whether others may hold a shared lock at the same time; see `lock_descriptor`.
 
     Returns
     -------
@@ -140,7 +150,7 @@ def lock_folder(folder: Path) -> int | None:
     else:
         descriptor = open_descriptor(_lock_file_of(folder), os.O_RDWR | os.O_CREAT)
     try:
-        lock_descriptor(descriptor, wait=False)
+        lock_descriptor(descriptor, wait=False, shared=shared)
     except OSError:
         os.close(descriptor)
         return None

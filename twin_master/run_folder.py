@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ VERDICT, PATCH, PICTURE = "verdict.json", "patch.json", "figures/missing_force.s
 missing force, if motion was observed."""
 KIND = "uav-twin run"
 """The value of `kind` in the `config.json` of a run folder."""
+WATCHED_FLEET_KIND = "uav-twin fleet watch"
+"""The value of `kind` in the `config.json` of a watched fleet; its assets have folders in it."""
 HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
 """Packages that may change before a run is resumed, because no stored figure depends on them."""
 
@@ -63,6 +66,7 @@ def create_run_folder(
     files: Mapping[str, bytes] | None = None,
     *,
     replace: bool = False,
+    fleet_is_locked: bool = False,
 ) -> Iterator[None]:
     """Create a run folder with configuration and copies of all flown files, in one step; lock it.
 
@@ -78,6 +82,10 @@ def create_run_folder(
         The contents of further files, by their paths in the folder.
     replace : bool
         Whether to replace an existing folder of the same kind. Any other folder is never replaced.
+    fleet_is_locked : bool
+        Whether this process watches the fleet that the folder belongs to, and has locked the
+        fleet's folder. No lock is kept on the folder itself then, so that a fleet has any number of
+        assets.
 
     Raises
     ------
@@ -100,10 +108,13 @@ def create_run_folder(
             f"{folder} holds a run already: choose another --out, go on with it by --resume, or "
             "give --replace."
         )
+    lock = partial(lock_run_folder, fleet_is_locked=fleet_is_locked)
     with ExitStack() as locks:
-        with whole_folder(folder, lock_run_folder, locks) as new_folder:
+        with whole_folder(folder, lock, locks) as new_folder:
             write_members(new_folder, files or {})
             atomic_write_text(new_folder / CONFIG_NAME, to_json(config))
+        if fleet_is_locked:
+            locks.close()
         yield
 
 
@@ -136,13 +147,23 @@ def read_config(folder: Path) -> JsonObject:
     return config
 
 
-def lock_run_folder(folder: Path) -> int:
+def lock_run_folder(folder: Path, *, fleet_is_locked: bool = False) -> int:
     """Lock a folder for this process; return a file descriptor, whose closing ends the lock.
+
+    The folder of an asset of a watched fleet, `FLEET/GROUP/NAME`, is also locked while a process
+    watches the fleet.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    fleet_is_locked : bool
+        Whether it is this process that watches the fleet.
 
     Raises
     ------
     RunFolderError
-        If another process is flying in the folder.
+        If another process is flying in the folder, or watches the fleet that it belongs to.
     """
     descriptor = lock_folder(folder)
     if descriptor is None:
@@ -153,7 +174,26 @@ def lock_run_folder(folder: Path) -> int:
         raise RunFolderError(
             f"another process has just put another run into {folder}: look at that one."
         )
+    # Asked after the folder was locked: a watch of the fleet that begins later finds that lock
+    fleet_folder = folder.resolve().parent.parent
+    if not fleet_is_locked and _is_watched_fleet(fleet_folder):
+        os.close(descriptor)
+        raise RunFolderError(
+            f"another process watches the fleet in {fleet_folder}, to which {folder} belongs: wait "
+            "for it to end."
+        )
     return descriptor
+
+
+def _is_watched_fleet(folder: Path) -> bool:
+    """Return whether a folder is that of a fleet which another process watches at present."""
+    if find_config(folder, WATCHED_FLEET_KIND) is None:
+        return False
+    lock = lock_folder(folder, shared=True)
+    if lock is None:
+        return True
+    os.close(lock)
+    return False
 
 
 def remove_half_written_files(folder: Path) -> None:
@@ -294,6 +334,7 @@ def new_run_folder(
     watched: bool = False,
     parts: Mapping[str, str] | None = None,
     inputs: Mapping[str, str] | None = None,
+    fleet_is_locked: bool = False,
 ) -> Iterator[LockedRun]:
     """Create and lock the folder of a run or a watch.
 
@@ -317,6 +358,8 @@ def new_run_folder(
     inputs : mapping of str to str, optional
         The SHA-256 hash of each input, if asset and belief are prepared already; see
         `record_inputs`.
+    fleet_is_locked : bool
+        See `create_run_folder`.
 
     Raises
     ------
@@ -333,12 +376,14 @@ def new_run_folder(
     config["provenance"] = collect_provenance(resolved_scenario.mission.seed).as_dict()
     if inputs is not None:
         config["inputs"] = dict(inputs)
-    with create_run_folder(folder, config, files, replace=replace):
+    with create_run_folder(folder, config, files, replace=replace, fleet_is_locked=fleet_is_locked):
         yield LockedRun(config, resolved_scenario.portable().with_paths_from(folder))
 
 
 @contextmanager
-def hold_run_folder(folder: Path, loaded_scenario: LoadedScenario | None) -> Iterator[LockedRun]:
+def hold_run_folder(
+    folder: Path, loaded_scenario: LoadedScenario | None, *, fleet_is_locked: bool = False
+) -> Iterator[LockedRun]:
     """Lock the folder of an earlier run or watch, in order to continue it.
 
     Parameters
@@ -347,6 +392,8 @@ def hold_run_folder(folder: Path, loaded_scenario: LoadedScenario | None) -> Ite
         The path of the folder.
     loaded_scenario : LoadedScenario or None
         The scenario that the user expects there; it is compared with that of the folder.
+    fleet_is_locked : bool
+        See `create_run_folder`.
 
     Raises
     ------
@@ -364,7 +411,10 @@ def hold_run_folder(folder: Path, loaded_scenario: LoadedScenario | None) -> Ite
             f"{folder} {verb} another scenario ({scenario.mission.name}, {file.get('name')}) than "
             f"{loaded_scenario.path}: resume it without naming a scenario."
         )
-    with closing_lock(lock_run_folder(folder)):
+    with ExitStack() as locks:
+        locks.enter_context(closing_lock(lock_run_folder(folder, fleet_is_locked=fleet_is_locked)))
+        if fleet_is_locked:
+            locks.close()
         yield LockedRun(config, scenario.with_paths_from(folder))
 
 

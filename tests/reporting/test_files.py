@@ -6,11 +6,13 @@ import stat
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from reporting import files
 from reporting.errors import DiskFullError, FileNotWrittenError
+from reporting.folders import whole_folder
 from tests.refusals import refused
 
 
@@ -74,6 +76,7 @@ def old_file(tmp_path):
         (errno.EDQUOT, DiskFullError, "No space is left"),
         (errno.EACCES, FileNotWrittenError, "not permitted"),
         (errno.EROFS, FileNotWrittenError, "not permitted"),
+        (errno.EMFILE, FileNotWrittenError, "too many files are open: allow more by `ulimit -n`"),
         (errno.EIO, FileNotWrittenError, "could not be written"),
     ],
 )
@@ -90,6 +93,18 @@ def test_a_failing_disk_gives_one_sentence_and_keeps_the_old_file(
     assert str(old_file) in str(caught.value)
     assert old_file.read_bytes() == b"old"
     assert names_in(old_file.parent) == [old_file.name]
+
+
+def test_an_address_is_not_taken_for_a_folder_of_this_machine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with refused(FileNotWrittenError, "s3:/bucket/learnt.toml is an address"):
+        files.atomic_write_bytes(Path("s3://bucket/learnt.toml"), b"new")
+    with (
+        refused(FileNotWrittenError, "s3:/bucket/run is an address"),
+        whole_folder(Path("s3://bucket/run")),
+    ):
+        pass
+    assert names_in(tmp_path) == []
 
 
 def test_a_writer_that_fails_keeps_the_old_file(old_file):

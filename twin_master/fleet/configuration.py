@@ -16,7 +16,7 @@ from twin_master.scenario import reading as scenario_reading
 
 KIND = "uav-twin fleet"
 """The kind in the configuration of a fleet that is flown."""
-WATCHED_KIND = "uav-twin fleet watch"
+WATCHED_KIND = run_folder.WATCHED_FLEET_KIND
 """The kind in the configuration of a fleet that is watched."""
 GROUPS = "groups"
 """The folder with the prepared knowledge of the twins of each group: model, policy and draws."""

@@ -9,7 +9,7 @@ import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -179,9 +179,16 @@ def fly_fleet(
     engine = engine or Engine()
     if store:
         fleet = fleet.with_store(store)
-    StoreAddress(folder, fleet.store).check()
+    address = StoreAddress(folder, fleet.store)
+    address.check()
     check_installed("zarr", *(["distributed"] if engine.needs_dask else []))
-    check = partial(check_fleet, fleet)
+
+    def check() -> None:
+        """Check what may keep the fleet from flying, before anything is written."""
+        check_fleet(fleet)
+        if replace_old or run_folder.find_config(folder, KIND) is None:
+            address.check_new(replace_old=replace_old)
+
     with locked_fleet_folder(
         folder, KIND, fleet.record(), replace_old=replace_old, check=check
     ) as config:

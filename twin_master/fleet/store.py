@@ -14,7 +14,7 @@ from reporting.json_file import JsonObject
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.members import Member, RecordedMembers
-from twin_master.fleet.store_address import address_of
+from twin_master.fleet.store_address import STORE_NAME, address_of
 from twin_master.fleet.store_layout import (
     NOTICE_KINDS,
     TWIN_AXIS,
@@ -326,7 +326,9 @@ def open_group(folder: Path, group: str, *, names: bool = True) -> "xr.DataTree"
         )
     stored_group = tree.to_dataset()
     if is_former_layout(stored_group):
-        warn_of_former_names(f"{address.for_zarr()}", former_names_used(stored_group))
+        warn_of_former_names(
+            str(address.remote or folder / STORE_NAME), former_names_used(stored_group)
+        )
         scenario = Scenario.model_validate(record["scenarios"][0])
         members = RecordedMembers(record)
         all_names = [members.name(row) for row in range(len(members))] if names else None

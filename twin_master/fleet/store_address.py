@@ -9,8 +9,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import util
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from twin_master.errors import FleetError
+from reporting.errors import ReportingError
+from reporting.words import one_line
+from twin_master.errors import FleetError, TwinMasterError
+
+if TYPE_CHECKING:
+    from twin_master.fleet.remote_store import RemoteStore
 
 STORE_NAME = "fleet.zarr"
 """The folder of the store in the folder of a fleet, unless the store has an address elsewhere."""
@@ -31,9 +37,15 @@ class StoreAddress:
     folder: Path
     remote: str = ""
 
-    def for_zarr(self) -> Path | str:
+    def for_zarr(self) -> "Path | RemoteStore":
         """Return what zarr and xarray open."""
-        return self.remote or self.folder / STORE_NAME
+        if not self.remote:
+            return self.folder / STORE_NAME
+        from zarr.storage import FsspecStore
+
+        from twin_master.fleet.remote_store import RemoteStore
+
+        return RemoteStore(FsspecStore.from_url(self.remote), self.explained_errors)
 
     def check(self) -> None:
         """Check that the address is of a kind for which a package is installed.
@@ -57,12 +69,48 @@ class StoreAddress:
         from fsspec.core import url_to_fs
 
         try:
-            url_to_fs(self.remote)
-        except (ImportError, ValueError, OSError) as error:
+            _, path = url_to_fs(self.remote)
+        except Exception as error:
             raise FleetError(
-                f"the store cannot be at {self.remote} ({error}): give an address that fsspec "
-                "knows, such as s3://BUCKET/NAME.zarr, and install the package for it."
+                f"the store cannot be at {self.remote} ({one_line(error)}): give an address that "
+                "fsspec knows, such as s3://BUCKET/NAME.zarr, and install the package for it."
             ) from error
+        if not path.strip("/"):
+            raise FleetError(
+                f"the store cannot be at {self.remote}: the name of the store is missing, as in "
+                "s3://BUCKET/NAME.zarr."
+            )
+
+    def check_new(self, *, replace_old: bool) -> None:
+        """Check that a new store can be written at the address, before anything is written here.
+
+        Parameters
+        ----------
+        replace_old : bool
+            Whether a store that is at the address may be replaced.
+
+        Raises
+        ------
+        FleetError
+            If the service does not answer or refuses to write, or if a store is there already.
+        """
+        if not self.remote:
+            return
+        import zarr
+
+        try:
+            root = zarr.open_group(self.for_zarr(), mode="a", zarr_format=3)
+            is_occupied = any(True for _ in root.members())
+        except _ServiceError as error:
+            raise FleetError(
+                f"the store cannot be at {self.remote} ({error.reason}): correct the address, or "
+                "the keys and the service that its package finds; nothing was flown."
+            ) from error
+        if is_occupied and not replace_old:
+            raise FleetError(
+                f"there is a store at {self.remote} already, which may be that of another fleet: "
+                "choose another --store, or give --replace."
+            )
 
     def send(self, file: Path, path: str) -> None:
         """Send a complete file to the store at its address, and remove it here.
@@ -97,13 +145,31 @@ class StoreAddress:
         """
         try:
             yield
-        except (OSError, ImportError, ValueError) as error:
+        except (TwinMasterError, ReportingError):
+            raise
+        except Exception as error:
             if not self.remote:
                 raise
-            raise FleetError(
-                f"the store at {self.remote} cannot be read or written ({error}): "
-                "what was flown is kept, repeat the command to go on."
-            ) from error
+            raise _ServiceError(self.remote, one_line(error) or type(error).__name__) from error
+
+
+class _ServiceError(FleetError):
+    """The service of a store does not answer, or refuses what is asked of it.
+
+    Parameters
+    ----------
+    address : str
+        The address of the store.
+    reason : str
+        What the service, or the package for it, says.
+    """
+
+    def __init__(self, address: str, reason: str) -> None:
+        super().__init__(
+            f"the store at {address} cannot be read or written ({reason}): what was flown is kept, "
+            "repeat the command once the service answers."
+        )
+        self.reason = reason
 
 
 def address_of(config_of_fleet: dict[str, object], folder: Path) -> StoreAddress:

@@ -85,6 +85,8 @@ class WatchedAsset:
         The feed of its observations.
     previous_record : mapping or None
         The record of the asset when it was watched last; None if it is new.
+    keeps_file_open : bool
+        Whether the file of its observations, if there is one, stays open between two looks.
 
     Attributes
     ----------
@@ -107,8 +109,11 @@ class WatchedAsset:
         watch: Watch,
         feed: Feed,
         previous_record: JsonRecord | None,
+        *,
+        keeps_file_open: bool = True,
     ) -> None:
         self.name = name
+        self.keeps_file_open = keeps_file_open
         self.watch = watch
         self.feed = feed
         self._knowledge = watch.models[-1].knowledge

@@ -44,10 +44,12 @@ LONGEST_IDLE = 1.0
 """Longest pause if no message has come [s]."""
 BUSY_SHARE = 0.2
 """Fraction of a processor's time that polling sources without new messages may take."""
-FILES_OF_ASSET = 2
-"""Files that an asset keeps open: its journal, and its folder for the lock."""
 FURTHER_FILES = 60
-"""Files beside those of assets: what is opened for a moment, and connections."""
+"""Files beside the observations that are followed: what is opened for a moment, and connections.
+
+An asset itself keeps no file open: its journal is opened for each line, and the lock of the fleet's
+folder is that of all assets.
+"""
 STATE_SHARE = 0.1
 """Fraction of the time that the writing of the state may take."""
 _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")
@@ -148,10 +150,7 @@ class FleetWatch:
         self.folder_locks.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
         self.standing = read_standing(folder)
         self._records_of_lost = dict(self.standing["assets"])
-        self._most_assets = LARGEST_FLEET
-        most_files = allow_many_files()
-        if most_files < LARGEST_FLEET * FILES_OF_ASSET:
-            self._most_assets = int(most_files - FURTHER_FILES) // FILES_OF_ASSET
+        self._most_followed_files = allow_many_files() - FURTHER_FILES
 
     def note(self, sentence: str) -> None:
         """Tell the operator a sentence."""
@@ -262,6 +261,8 @@ class FleetWatch:
                     break
             if steps == 0 and not asset.watch.intake.has_ended:
                 asset.watch.report_silence(partial(self._hand_on, asset))
+            if not asset.keeps_file_open:
+                asset.feed.release_file()
         except Exception as error:  # noqa: BLE001 - whatever happens to one asset, the others go on
             self.lose(key, error)
         return steps
@@ -279,11 +280,10 @@ class FleetWatch:
                 "the name of an asset must consist of letters, digits, dots and hyphens, but "
                 f"{name!r} was given."
             )
-        if len(self.assets) >= self._most_assets:
+        if len(self.assets) >= LARGEST_FLEET:
             raise FleetError(
-                f"a process watches {self._most_assets} assets at most, because each keeps "
-                f"{FILES_OF_ASSET} files open: allow more open files by `ulimit -n`, or watch the "
-                "others in another process."
+                f"a process watches {LARGEST_FLEET:,} assets at most: watch the others in another "
+                "process."
             )
         key = f"{group.name}/{name}"
         asset = self._open_asset(group, name, feed)
@@ -302,19 +302,32 @@ class FleetWatch:
         folder = self.folder / group.name / name
         sibling = self._sibling.get(group.name)
         if (folder / CONFIG_NAME).is_file():
-            watch_context = resume_watch(folder, None, SilentProgress(), sibling)
+            watch_context = resume_watch(
+                folder, None, SilentProgress(), sibling, fleet_is_locked=True
+            )
         else:
             with explained_write_errors(folder):
                 folder.parent.mkdir(exist_ok=True)
             watch_context = begin_watch(
-                group.scenarios[0], group.scenario_file, folder, SilentProgress(), sibling=sibling
+                group.scenarios[0],
+                group.scenario_file,
+                folder,
+                SilentProgress(),
+                sibling=sibling,
+                fleet_is_locked=True,
             )
         with ExitStack() as closing:
             watch = closing.enter_context(watch_context)
             closing.enter_context(watch.begin(feed))
             if isinstance(feed, Topic):
                 feed.attach(watch)
-            asset = WatchedAsset(key, watch, feed, self._records_of_lost.get(key))
+            asset = WatchedAsset(
+                key,
+                watch,
+                feed,
+                self._records_of_lost.get(key),
+                keeps_file_open=len(self.assets) < self._most_followed_files,
+            )
             asset.close = closing.pop_all().close
         return asset
 

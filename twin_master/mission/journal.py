@@ -26,10 +26,9 @@ from typing import BinaryIO, NamedTuple, Self
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.files import explained_write_errors, synchronise, write_error
+from reporting.files import explained_write_errors, synchronise, write_at, write_error
 from reporting.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord, plain
-from reporting.operating_system import open_descriptor
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal_packing import (
     array_from_json,
@@ -255,7 +254,10 @@ def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -
 
 
 class JournalFile:
-    """The journal of a run folder that this process holds, open for appending.
+    """The journal of a run folder that this process holds, to which it appends.
+
+    The file is opened for each line and closed again, so that a process can have any number of
+    journals.
 
     Parameters
     ----------
@@ -294,8 +296,9 @@ class JournalFile:
             check_header(self.path, config_hash)
             last_line = next(records_backwards(self.path), None)
             self.size = 0 if last_line is None else last_line.end
-            self._descriptor = open_descriptor(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-            os.truncate(self._descriptor, self.size)
+            if self.size == 0:
+                self.path.touch()
+            os.truncate(self.path, self.size)
             if self.size == 0:
                 self.append(_header(config_hash))
                 self.flush()
@@ -306,13 +309,12 @@ class JournalFile:
 
     def __exit__(self, *_error: object) -> None:
         with suppress(OSError):
-            os.fsync(self._descriptor)
-        os.close(self._descriptor)
+            self.flush()
 
     def truncate(self, size: int) -> None:
         """Drop all lines after the first `size` bytes, which must be the end of a line."""
         self.size = size
-        os.truncate(self._descriptor, size)
+        os.truncate(self.path, size)
 
     def append(self, record: Mapping[str, object], parts: JsonObject | None = None) -> None:
         """Append a line; once this returns, the line survives if the process is killed.
@@ -331,27 +333,24 @@ class JournalFile:
             If the disk is full or the folder cannot be written; the earlier lines are still there.
         """
         line = encode_line(record)
-        written_bytes = 0
         try:
             if parts:
                 self.recent.append(int(str(record["step"])), line[:_HASH_LENGTH], parts)
             else:
                 self.recent.pass_over(line[:_HASH_LENGTH])
-            # The operating system may write less than it is given.
-            while written_bytes < len(line):
-                written_bytes += os.write(self._descriptor, line[written_bytes:])
+            write_at(self.path, line, self.size)
             if time.monotonic() - self._flushed_at >= self._flush_seconds:
                 self.flush()
         except OSError as error:
             # Remove what was written of the line.
             with suppress(OSError):
-                os.truncate(self._descriptor, self.size)
+                os.truncate(self.path, self.size)
             raise write_error(error, self.path) from error
         self.size += len(line)
 
     def flush(self) -> None:
         """Flush the appended lines to the disk."""
-        os.fsync(self._descriptor)
+        synchronise(self.path)
         self._flushed_at = time.monotonic()
 
 

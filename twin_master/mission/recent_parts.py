@@ -19,6 +19,7 @@ from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 
+from reporting.files import write_at
 from reporting.json_file import JsonObject
 
 RECENT_NAMES = ("recent_0.jsonl", "recent_1.jsonl")
@@ -175,12 +176,7 @@ class RecentPartsFile(RecentParts):
             self._size = 0 if self._block is not None else _size_to_keep(path, step, line_hash)
             with path.open("ab") as file:
                 file.truncate(self._size)
-        with path.open("r+b", buffering=0) as file:
-            file.seek(self._size)
-            written_bytes = 0
-            # The operating system may write less than it is given.
-            while written_bytes < len(entry):
-                written_bytes += file.write(entry[written_bytes:])
+        write_at(path, entry, self._size)
         self._size += len(entry)
         self._block = block
         self._newest = (line_hash, parts)

@@ -42,5 +42,8 @@ class Feed:
     def send_decision(self, decision: Decision) -> None:
         """Send a decision to the publisher of the messages, if it listens."""
 
+    def release_file(self) -> None:
+        """Close the file of the feed, if it has one, until the next message is asked for."""
+
     def close(self) -> None:
         """Release the connection to the publisher of the messages."""

@@ -226,6 +226,10 @@ class GrowingFile(Lines):
     ) -> None:
         self._followed_path = followed_path
         self._is_copy = False
+        # While the file is released: its inode, and up to where it was read [bytes]
+        self._released_inode = 0
+        self._released_at = 0
+        self._was_missed = False
         self._start_reading(file, position)
 
     def _start_reading(self, file: BinaryIO, position: Position | None) -> None:
@@ -269,6 +273,9 @@ class GrowingFile(Lines):
         None is yielded while nothing comes.
         """
         while True:
+            if self._file.closed and not self._reopen(path):
+                yield from self._switch_after_loss(path)
+                continue
             piece = self._file.read(_PIECE_BYTES)
             if self._was_cut():
                 yield from self._switch_after_cut(path)
@@ -284,6 +291,58 @@ class GrowingFile(Lines):
                     next_file.close()
             self._note_beginning(piece)
             yield piece or None
+
+    def release(self) -> None:
+        """Close a file that is followed until its next piece is asked for.
+
+        So a process can follow more files than it may have open. A file that gets another name
+        meanwhile is found again; one that is removed meanwhile is read no further.
+        """
+        if not self._file.closed:
+            self._released_inode = os.fstat(self._file.fileno()).st_ino
+            self._released_at = self._file.tell()
+            self._file.close()
+
+    def _reopen(self, path: Path) -> bool:
+        """Open the released file again, under the name that it has now; return whether it is there.
+
+        Parameters
+        ----------
+        path : Path
+            The name that is followed.
+        """
+        for name in (path, *reversed(rotated_files(path))):
+            with suppress(FileNotFoundError), ExitStack() as closing:
+                file = closing.enter_context(name.open("rb", buffering=0))
+                if os.fstat(file.fileno()).st_ino == self._released_inode:
+                    closing.pop_all()
+                    file.seek(self._released_at)
+                    self._file = file
+                    self._was_missed = False
+                    return True
+        return False
+
+    def _switch_after_loss(self, path: Path) -> Iterator[bytes | Refused | None]:
+        """Go on in a copy of a released file that was removed, or in what has taken its place.
+
+        None is yielded while there is neither, and after the first look, in which the file may only
+        have been missed because it was being renamed. If there is no copy, a refusal is yielded,
+        and reading goes on at the beginning of the new file.
+        """
+        was_missed_before = self._was_missed
+        self._was_missed = True
+        if not was_missed_before or not path.exists():
+            yield None
+            return
+        self._was_missed = False
+        copy = find_file(path, self.position, follow=True)
+        if copy is None:
+            yield Refused(
+                f"the file that was {path.name} before was removed when it was read to byte "
+                f"{self.end}: what followed and was not read yet is lost"
+            )
+        file = (copy or path).open("rb", buffering=0)
+        yield from self._switch_to(file, is_copy=copy is not None)
 
     def _note_beginning(self, piece: bytes) -> None:
         """Add a piece to the beginning that identifies the file, until it is long enough."""

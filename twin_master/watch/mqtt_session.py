@@ -365,7 +365,7 @@ class Session:
         """Read all packets that have come, and write those that wait; return paho's error code.
 
         The loop of paho itself waits by `select`, which knows no file beyond the first 1,024 of a
-        process; the watch of a fleet has two open files for each asset. Some brokers send more than
+        process; the watch of a fleet may follow thousands of files. Some brokers send more than
         they were asked for, so that nothing is read while `_UNREAD_BYTES` wait here.
         """
         error = client.loop_misc()
@@ -391,6 +391,8 @@ class Session:
         Brokers send only so many messages before the first is acknowledged, so that the number of
         those that wait here does not tell how many wait there. Whether all were processed at some
         time does. The operator is told once if this does not happen between two heartbeats.
+        A heartbeat that is sent early, because the connection was just made, tells what the last
+        one told.
         """
         now = time.monotonic()
         elapsed = max(now - self._pace_begin, 1e-3)
@@ -398,6 +400,8 @@ class Session:
             "busy": round(min(1.0, self._processing_seconds / elapsed), 2),
             "keeps_up": self._was_idle,
         }
+        if elapsed < HEARTBEAT_SECONDS / 2.0:
+            return pace | {"keeps_up": self._kept_up}
         if not self._was_idle and self._kept_up:
             self.note(
                 f"Messages come faster than they are processed: for {elapsed:.0f} s some have "

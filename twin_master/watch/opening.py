@@ -56,6 +56,7 @@ def begin_watch(
     *,
     replace_run: bool = False,
     sibling: Watch | None = None,
+    fleet_is_locked: bool = False,
 ) -> Iterator[Watch]:
     """Create the folder of a new watch, and give the watch while its folder is locked.
 
@@ -73,6 +74,9 @@ def begin_watch(
         Whether to take the place of an existing folder.
     sibling : Watch, optional
         A watch of the same scenario, whose model and plan this one shares.
+    fleet_is_locked : bool
+        Whether the folder belongs to a fleet whose folder this process has locked; see
+        `run_folder.create_run_folder`.
 
     Raises
     ------
@@ -91,6 +95,7 @@ def begin_watch(
         replace=replace_run,
         watched=True,
         inputs=None if sibling is None else sibling.inputs,
+        fleet_is_locked=fleet_is_locked,
     )
     with opened as (config, located_scenario):
         yield Watch(folder, config, located_scenario, progress, sibling)
@@ -116,6 +121,8 @@ def resume_watch(
     loaded_scenario: LoadedScenario | None,
     progress: Progress,
     sibling: Watch | None = None,
+    *,
+    fleet_is_locked: bool = False,
 ) -> Iterator[Watch]:
     """Give the watch in an existing folder while the folder is locked.
 
@@ -129,6 +136,9 @@ def resume_watch(
         Shows stages and notes.
     sibling : Watch, optional
         A watch of the same scenario, whose model and plan this one shares.
+    fleet_is_locked : bool
+        Whether the folder belongs to a fleet whose folder this process has locked; see
+        `run_folder.create_run_folder`.
 
     Raises
     ------
@@ -139,7 +149,8 @@ def resume_watch(
         raise NotResumableError(
             f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
         )
-    with run_folder.hold_run_folder(folder, loaded_scenario) as (config, scenario):
+    held = run_folder.hold_run_folder(folder, loaded_scenario, fleet_is_locked=fleet_is_locked)
+    with held as (config, scenario):
         try:
             run_folder.check_versions(folder, config, scenario.mission.seed)
             resumed = Watch(folder, config, scenario, progress, sibling)

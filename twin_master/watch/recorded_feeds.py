@@ -69,6 +69,7 @@ class RecordedFeed(Feed):
         self.follow = follow
         self.scenario = scenario
         self.reader = MessageReader(scenario)
+        self._lines_of_file: GrowingFile | None = None
 
     def contains_position(self, position: Position) -> bool:
         """Return whether a position is in this file, or, if it is followed, in a rotated one."""
@@ -89,6 +90,7 @@ class RecordedFeed(Feed):
         followed_path = self.path if self.follow else None
         lines = GrowingFile(self.open_file(position), position, followed_path)
         lines.longest = self.longest_line
+        self._lines_of_file = lines
         for line in lines:
             content: MessageContent | None = line
             if isinstance(line, bytes):
@@ -105,6 +107,11 @@ class RecordedFeed(Feed):
             self.position = lines.position
             for message in messages[-1:]:
                 yield message, beginning_of(line)
+
+    def release_file(self) -> None:
+        """Close the file until the next message is asked for; see `GrowingFile.release`."""
+        if self.follow and self._lines_of_file is not None:
+            self._lines_of_file.release()
 
     def read_content(self, content: MessageContent) -> Sequence[Message | Refused]:
         """Return the messages in a line, or the reasons why there are none."""

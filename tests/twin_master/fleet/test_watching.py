@@ -3,6 +3,9 @@
 import json
 import re
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
@@ -14,7 +17,8 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.command_line import command, said, seen
+from reporting.folders import closing_lock
+from tests.command_line import command, refused, said, seen
 from tests.twin_master.fleet.recordings import (
     LOGS,
     STEPS,
@@ -34,9 +38,10 @@ from twin_master.fleet.reading import ControlForecast
 from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.store_layout import ALL_ROWS
 from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
-from twin_master.fleet.watched_asset import WatchedAsset
-from twin_master.fleet.watching import FILES_OF_ASSET, FURTHER_FILES, FleetWatch
+from twin_master.fleet.watched_asset import WatchedAsset, read_standing
+from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.run_folder import lock_run_folder
 from twin_master.watch.folder import Watch
 from twin_master.watch.metrics_server import MetricsServer
 from uav_twin import fly_fleet, open_fleet
@@ -562,21 +567,102 @@ def test_the_figures_of_all_assets_are_served_for_prometheus(fleet_file, tmp_pat
     assert "Metrics: http://127.0.0.1:" in done.stderr
 
 
-def test_assets_beyond_the_files_of_a_process_are_refused_and_leave_the_others_alone(
-    fleet_file, tmp_path, monkeypatch
-):
-    files = FURTHER_FILES + 2 * FILES_OF_ASSET
-    monkeypatch.setattr("twin_master.fleet.watching.allow_many_files", lambda: files)
-    fleet = watched(fleet_file, tmp_path / "out")
-    assert set(fleet.assets) == {"north/wing-0", "north/wing-1"}
-    assert "a process watches 2 assets at most" in fleet.failures["north/wing-2"]
+WIDE = 80
+"""More wings than a process with `MOST_FILES` open files has room for."""
+MOST_FILES = 100
+WITH_FEW_FILES = (
+    "import resource; "
+    f"resource.setrlimit(resource.RLIMIT_NOFILE, ({MOST_FILES}, {MOST_FILES})); "
+    "from uav_twin.cli import main; main()"
+)
 
 
-def test_an_asset_keeps_as_many_files_open_as_the_limit_counts(fleet_file, tmp_path):
+@pytest.fixture(scope="module")
+def wide_fleet(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a fleet of many wings."""
+    file = write_fleet(library_file, tmp_path_factory.mktemp("wide_fleet"))
+    for number in range(3, WIDE):
+        shutil.copy(log_of(file.parent, number % 3), log_of(file.parent, number))
+    return file
+
+
+def with_few_files(*words: object) -> list[str]:
+    """Return the command line of `uav-twin` in a process that may have few open files."""
+    return [sys.executable, "-c", WITH_FEW_FILES, *map(str, words)]
+
+
+def test_more_assets_are_watched_than_a_process_may_have_open_files(wide_fleet, tmp_path):
+    words = with_few_files("fleet", "watch", wide_fleet, "--out", tmp_path / "out")
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    alone = watch_alone(wide_fleet.parent)
+    assert done.returncode == 0, done.stderr
+    assert f"{WIDE} assets, {WIDE * STEPS} steps" in done.stderr
+    assert set(journals(tmp_path / "out")) == set(alone)
+
+
+class FollowedLogs:
+    """A wide fleet whose logs are followed by the command, and get a row more while they are."""
+
+    def __init__(self, fleet_file: Path, out: Path) -> None:
+        self.out = out
+        words = with_few_files("fleet", "watch", fleet_file, "--follow", "--out", out)
+        messages = fleet_file.with_name("messages.txt")
+        with messages.open("w") as file:
+            process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=file)
+        try:
+            wait_until(lambda: self.last_steps() == [STEPS - 1] * WIDE)
+            # A watch of one asset of the fleet, by another process
+            asset = out / "north" / "wing-7"
+            self.refusal = refused("watch", "--resume", "--steps", 0, "--out", asset)
+            for number in range(WIDE):
+                log = log_of(fleet_file.parent, number)
+                row = log.read_text().splitlines()[1].partition(",")[2]
+                with log.open("a") as file:
+                    file.write(f"{STEPS},{row}\n")
+            wait_until(lambda: self.last_steps() == [STEPS] * WIDE)
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait()
+        self.said = messages.read_text()
+
+    def last_steps(self) -> list[int]:
+        """Return the last step of each asset that has one."""
+        assets = read_standing(self.out)["assets"].values()
+        return [asset["last"]["step"] for asset in assets if asset["last"] is not None]
+
+
+@pytest.fixture(scope="module")
+def followed_logs(wide_fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> FollowedLogs:
+    folder = shutil.copytree(wide_fleet.parent, tmp_path_factory.mktemp("followed") / "fleet")
+    return FollowedLogs(folder / wide_fleet.name, folder / "out")
+
+
+def test_more_logs_are_followed_than_a_process_may_have_open_files(followed_logs):
+    assert f"{WIDE} assets, {WIDE * (STEPS + 1)} steps" in followed_logs.said
+    assert "not watched" not in followed_logs.said
+    rejected = followed_logs.out.glob("north/*/rejected.jsonl")
+    assert "removed" not in "".join(file.read_text() for file in rejected)
+
+
+def test_an_asset_of_a_watched_fleet_is_not_watched_by_another_process(followed_logs):
+    sentence = f"another process watches the fleet in {followed_logs.out}, to which"
+    assert sentence in followed_logs.refusal
+
+
+def test_an_asset_that_another_process_watches_is_left_to_it(watched_fleet, tmp_path):
+    file, watched_folder = watched_fleet
+    out = shutil.copytree(watched_folder, tmp_path / "out")
+    with closing_lock(lock_run_folder(out / "north" / "wing-1")):
+        fleet = watched(file, out)
+    assert set(fleet.assets) == {"north/wing-0", "north/wing-2"}
+    assert "another process is flying" in fleet.failures["north/wing-1"]
+
+
+def test_assets_keep_no_file_open(fleet_file, tmp_path):
     numbers: list[int] = []
 
-    def count(asset: WatchedAsset, _decision: Decision) -> None:
+    def count(_asset: WatchedAsset, _decision: Decision) -> None:
         numbers.append(psutil.Process().num_fds())
 
     FleetWatch(load_fleet(fleet_file), tmp_path / "out", count, str).run()
-    assert max(numbers) - numbers[0] == 2 * FILES_OF_ASSET
+    assert max(numbers) == numbers[0]  # the log of the asset whose turn it is

@@ -115,14 +115,27 @@ def new(messages: Feeding) -> list[int | str]:
     return [fed.step if isinstance(fed, Message) and fed.step is not None else text for fed, text in came]
 
 
-@pytest.fixture
-def begun_log(base: Watch, tmp_path: Path) -> Begun:
-    """What begins a log with some steps, and reads them."""
+def released_between_looks(feed: CsvFeed, messages: Feeding) -> Feeding:
+    """Yield what comes, and close the file whenever nothing more has come."""
+    for fed in messages:
+        if fed[0] is None:
+            feed.release_file()
+        yield fed
+
+
+@pytest.fixture(params=["open", "released"])
+def begun_log(base: Watch, tmp_path: Path, request: pytest.FixtureRequest) -> Begun:
+    """What begins a log with some steps, and reads them; the file stays open between looks or not."""
 
     def begin(*steps: int) -> tuple[Path, Feeding]:
         path = tmp_path / "log.csv"
         path.write_text(HEADER + "".join(map(row, steps)))
-        messages = CsvFeed(path, base.scenario, follow=True).messages(None)
+        feed = CsvFeed(path, base.scenario, follow=True)
+        messages = feed.messages(None)
+        if request.param == "released":
+            if "moved" in request.node.name:
+                pytest.skip("a released log is not looked for in other folders")
+            messages = released_between_looks(feed, messages)
         assert new(messages) == [*steps]
         return path, messages
 
@@ -191,7 +204,22 @@ def test_a_copy_that_begins_with_the_same_rows_is_read_on(begun_log):
     copy = path.with_name("fresh")
     copy.write_text(path.read_text() + row(1))
     copy.rename(path)
-    assert new(messages) == [1]
+    # A file that is not open is missed in a second look, too, before another one is read
+    assert new(messages) + new(messages) == [1]
+
+
+@pytest.mark.parametrize("begun_log", ["released"], indirect=True)
+def test_a_log_that_is_removed_while_it_is_not_open_is_told(begun_log):
+    path, messages = begun_log(0)
+    size = path.stat().st_size
+    moved(path)
+    path.write_text(HEADER + row(7))
+    assert new(messages) == []
+    assert str(next(messages)[0]) == (
+        f"the file that was log.csv before was removed when it was read to byte {size}: what "
+        "followed and was not read yet is lost"
+    )
+    assert new(messages) == [7]
 
 
 def test_columns_of_a_new_file_are_read_again_also_behind_several_rotations(begun_log):

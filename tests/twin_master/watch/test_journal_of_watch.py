@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from tests.twin_master.runs import check_same, in_format_1, journal
-from tests.twin_master.watch.conftest import begun, ran, write_csv
+from tests.twin_master.watch.conftest import Mosquitto, begun, mosquitto, ran, wait_until, write_csv
+from tests.twin_master.watch.test_brokers import TOPIC, heard_at, where_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.recent_parts import RECENT_NAMES
 from twin_master.mission.replay import BelievedModel, replay
@@ -20,6 +21,7 @@ from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
+from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.recorded_feeds import FolderFeed
 from twin_master.watch.teaching import Teaching
 
@@ -56,19 +58,33 @@ class LearningWatch:
     def run(self, watch: Watch, steps: int | None = None) -> None:
         ran(watch, CsvFeed(self.recording, watch.scenario), steps)
 
+    def messages(self, steps: int) -> list[str]:
+        """Return the first steps of the recording as messages for a broker."""
+        messages = []
+        for line in self.recording.read_text().splitlines()[1 : steps + 1]:
+            step, control, *cells = line.split(",")
+            strain = [float(cell) if cell else None for cell in cells]
+            messages.append(json.dumps({"step": int(step), "control": control, "strain": strain}))
+        return messages
+
     def killed_at(self, step: int, folder: Path, name: str) -> Watch:
         """Return a watch that was killed by SIGKILL before or after a method of its journal wrote a step."""
         watch = self.new(folder)
-        child = os.fork()
-        if not child:
-            try:
-                with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr(JournalFile, "append", dying_at(step, after=name == "after"))
-                    self.run(watch)
-            finally:
-                os._exit(1)
-        assert os.waitpid(child, 0)[1] == signal.SIGKILL
+        kill_at(step, lambda: self.run(watch), after=name == "after")
         return watch
+
+
+def kill_at(step: int, run: Callable[[], object], *, after: bool) -> None:
+    """Run in a process of its own, which is killed before or after its journal has a step."""
+    child = os.fork()
+    if not child:
+        try:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(JournalFile, "append", dying_at(step, after=after))
+                run()
+        finally:
+            os._exit(1)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
 
 
 def dying_at(step: int, *, after: bool) -> Callable[..., None]:
@@ -179,3 +195,50 @@ def test_a_journal_of_the_first_format_is_fed_again(former, learning):
     first, second = ([message.observed for message, _ in feed.messages(None)] for feed in feeds)
     assert len(first) == STEPS
     np.testing.assert_array_equal(first, second)
+
+
+KILLED_AFTER = (40, 63, 64)
+"""Steps after which the watch is killed; 64 begins the other file of recent parts."""
+STEPS_OVER_BROKER = 70
+
+
+class KilledOverBroker:
+    """A learning watch that is killed several times over a broker, and the decisions that are heard."""
+
+    def __init__(self, learning: LearningWatch, broker: Mosquitto, folder: Path) -> None:
+        self.watch, self.broker = learning.new(folder), broker
+        messages = learning.messages(STEPS_OVER_BROKER)
+        listener, self.heard = heard_at(broker, "listener")
+
+        def publish(_note: str) -> None:
+            for message in messages:
+                listener.publish(TOPIC, message, qos=1)
+
+        # All messages but the first wait at the broker
+        self.run(1, publish)
+        listener.disconnect()
+        listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
+        for step in KILLED_AFTER:
+            learning.over(self.watch)
+            kill_at(step, lambda: self.run(STEPS_OVER_BROKER), after=True)
+        learning.over(self.watch)
+        self.run(STEPS_OVER_BROKER)
+        listener = broker.client("listener", self.heard)
+        wait_until(lambda: self.heard and self.heard[-1]["step"] == STEPS_OVER_BROKER - 1)
+        listener.disconnect()
+
+    def run(self, steps: int, note: Callable[[str], object] = str) -> None:
+        """Watch over the broker up to a number of steps."""
+        feed = MqttFeed(where_of(self.broker), self.watch, note)
+        self.watch.run(feed, str, step_limit=steps)
+        feed.close()
+
+
+def test_a_killed_watch_publishes_what_it_has_learnt_again_with_the_same_bits(learning, tmp_path):
+    with mosquitto(tmp_path) as broker:
+        heard = KilledOverBroker(learning, broker, tmp_path / "watch").heard
+    expected = json.loads(json.dumps(learning.decisions[:STEPS_OVER_BROKER]))
+    told_again = {decision["step"] for decision in heard if decision.pop("told_again", False)}
+    assert {decision["step"] for decision in heard} == set(range(STEPS_OVER_BROKER))
+    assert [decision for decision in heard if decision != expected[decision["step"]]] == []
+    assert told_again >= set(KILLED_AFTER)

@@ -95,6 +95,23 @@ def test_the_operator_is_told_once_that_messages_come_too_fast_and_that_it_is_ov
     assert reader.notes[2] == "All messages that waited are processed."
 
 
+def test_a_heartbeat_that_follows_a_connection_at_once_does_not_tell_of_too_many_messages(
+    broker, tmp_path, monkeypatch
+):
+    """When a broker comes back, messages wait, and heartbeats are sent without a pause."""
+    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 1000.0)
+    monkeypatch.setattr("twin_master.watch.mqtt_session.EXCHANGE_SECONDS", 0.0)
+    heard: list[dict[str, Any]] = []
+    broker.client("listener", heard).subscribe("wings/fleet/heartbeat")
+    reader = Reader(broker, tmp_path)
+    publish(broker, 150)
+    for _ in range(3):
+        reader.session._next_heartbeat = 0.0  # as after a connection
+        reader.read(5, pause=0.01)
+    wait_until(lambda: sum("keeps_up" in beat for beat in heard) >= 3)
+    assert [note for note in reader.notes if "faster" in note] == []
+
+
 def test_what_waits_in_memory_is_limited_whatever_a_broker_sends(broker, tmp_path, monkeypatch):
     """Mosquitto 2.0.11 sends all that it has, once a message is acknowledged, whatever was agreed."""
     monkeypatch.setattr("twin_master.watch.mqtt_session._UNREAD_BYTES", 300_000)
