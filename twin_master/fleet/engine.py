@@ -28,6 +28,12 @@ WAITING_PER_CORE = 2
 """Number of shards that wait at each core of the workers; the others wait in this process."""
 CONNECTING = 10.0
 """Longest time that a scheduler may take to answer [s]."""
+_WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
+"""Environment variables of local workers: one thread for each.
+
+Dask would also set MALLOC_TRIM_THRESHOLD_, with which glibc takes fresh memory from the system for
+every array above 128 kB: a quarter of the processor time of a fleet.
+"""
 ALLOWED_DEATHS = 2
 """Number of workers that may die while they fly a shard before its twins are flown one by one."""
 
@@ -281,6 +287,7 @@ def _connected_client(engine: Engine) -> "Iterator[Client]":
         "distributed.admin.large-graph-warning-threshold": "1 GiB",
         # Dask would keep the last 1,000 messages to each worker: hundreds of megabytes of tasks.
         "distributed.admin.low-level-log-length": 10,
+        "distributed.nanny.pre-spawn-environ": _WORKER_ENVIRONMENT,
         "logging.distributed": "critical",
     }
     with dask.config.set(quiet_settings):
