@@ -1,6 +1,8 @@
 """Evidence on grids and at draws, the search for a grid, and workers, against the filter and each other."""
 
+import gc
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -146,6 +148,34 @@ def test_twins_over_which_workers_die_again_and_again_end_the_command_with_a_sen
         refused(FleetError, "3 workers died over the same twins"),
     ):
         list(pool.results(end_this_process, [1]))
+
+
+def variable_of_worker(name: str) -> str | None:
+    """Return an environment variable of the process that computes the task."""
+    return os.environ.get(name)
+
+
+def test_local_workers_keep_memory_for_their_next_arrays():
+    """With this variable, which Dask sets, glibc would take fresh memory for each array."""
+    with open_task_pool(Engine(1), Progress()) as pool:
+        assert list(pool.results(variable_of_worker, ["MALLOC_TRIM_THRESHOLD_"])) == [None]
+
+
+class Load:
+    """What a task carries."""
+
+
+def nothing_of(_load: Load) -> None:
+    """Compute nothing."""
+
+
+def test_a_pool_forgets_the_tasks_that_are_done():
+    """Dask logs the last messages to a worker, with the tasks in them."""
+    with open_task_pool(Engine(1), Progress()) as pool:
+        list(pool.results(nothing_of, (Load() for _ in range(200))))
+        gc.collect()
+        kept = sum(isinstance(thing, Load) for thing in gc.get_objects())
+    assert kept < 40
 
 
 class DistantPool(TaskPool):
