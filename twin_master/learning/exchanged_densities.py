@@ -47,7 +47,12 @@ class GaugeDensities(NamedTuple):
 
 
 class ExchangeFactors(NamedTuple):
-    """What is the same at all pairs in the ratios of L densities to those of the model.
+    """Numbers for the ratios of L densities to those of the model that hold at all pairs.
+
+    A density of Student is k^(-n / 2), where n is the number of degrees of freedom plus one. Its
+    kernel is k = 1 + (innovation)^2 / (variance times scale squares), and that of the model is
+    k_0 = 1 + (residual)^2 / (scale squares). With r, the ratio k_0 / k at the reference pair, the
+    ratio of two densities is the power n / 2 of k_0 / (r k). Each number below is made for this.
 
     Attributes
     ----------
@@ -56,16 +61,15 @@ class ExchangeFactors(NamedTuple):
     inverse_model_squares : (L,) array
         One over the scale squares of the model.
     factor, offset : (L,) array
-        With the kernel of the model over the other one at the reference pair: the ratio over the
-        scale squares, and the ratio minus one.
+        r over the scale squares of the density, and r - 1.
     largest_excess : (L,) array
         The excess is cut to this, so that its power is still a number.
     fractions : (L,) array
-        The exponent is twice the power of the density; its fraction.
+        The fraction of the exponent n.
     has_fractions : bool
         Whether any fraction is not zero.
     digits : (6 m, L) array
-        The binary digits of its whole part, see `binary_digits`.
+        The binary digits of the whole part of n, see `binary_digits`.
     """
 
     gain: Single
@@ -137,7 +141,10 @@ def log_exchanged_density(
     number: int,
     pair: int,
 ) -> float:
-    """Return the log of a density at a pair over that of the model, by logarithms."""
+    """Return the log of the ratio of a density to that of the model at a pair.
+
+    Logarithms are taken from the start, so that nothing overflows; `number` tells which density.
+    """
     g = densities.gauge[number]
     if not observation.present[g]:
         return 0.0
@@ -172,7 +179,7 @@ def binary_digits(exponents: Float) -> Single:
 def exchange_factors(
     observation: StandardizedObservation, model: ModelLikelihood, densities: GaugeDensities
 ) -> ExchangeFactors:
-    """Return what is the same at all pairs in the ratios of densities to those of the model."""
+    """Return the numbers for the ratios of densities to those of the model at all pairs."""
     count = len(densities.gauge)
     inverse_model_squares = np.empty(count, np.float32)
     factor = np.empty(count, np.float32)
@@ -186,6 +193,7 @@ def exchange_factors(
         factor[number] = ratio / densities.scale_squares[number]
         offset[number] = ratio - 1.0
         exponents[number] = observation.degrees_after[g]
+        # Many densities in succession have the same exponent, and `expm1` is slow.
         if number > 0 and exponents[number] == exponents[number - 1]:
             largest_excess[number] = largest_excess[number - 1]
         else:

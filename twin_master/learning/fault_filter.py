@@ -198,10 +198,11 @@ class FaultFilter:
             self._begin_gauge_faults(state, log_begins_now),
             self._begin_free_gains(state, log_begins_now),
         )
-        ended_or_hidden = self._switch_hypotheses(
+        ended_or_hidden = self._advance_weights(
             state, log_begins_now, previous_control, control_index
         )
-        recoveries = self._move_to_recovered(state, ended_or_hidden)
+        recoveries = self._recoveries(state, ended_or_hidden)
+        self._mix_squares(state, recoveries)
         advance_beliefs(
             self._model.transition.forward_lists,
             previous_control,
@@ -286,7 +287,7 @@ class FaultFilter:
         """
         return (1.0 - FROM_THE_START) / (1.0 + step / self._settings.onset_steps)
 
-    def _switch_hypotheses(
+    def _advance_weights(
         self,
         state: WatchState,
         log_begins_now: Float,
@@ -310,7 +311,7 @@ class FaultFilter:
             The probability of each fault that it ended or was hidden in this step.
         """
         # Hazard: probability to begin now, given that no fault of either kind has begun before.
-        fault_probability = 2.0 * self._settings.prior
+        fault_probability = 2.0 * self._settings.prior  # faults of one gauge, and free gains
         begins_now_or_later = self.probability_to_begin_after(state.step_count - 1.0)
         log_no_fault_so_far = np.log1p(fault_probability * (begins_now_or_later - 1.0))
         log_hazard = np.log(fault_probability) + log_begins_now - log_no_fault_so_far
@@ -319,40 +320,56 @@ class FaultFilter:
         ended_or_hidden += state.weights.advance(log_hazard, self._log_begin)
         return ended_or_hidden
 
-    def _move_to_recovered(self, state: WatchState, right_again: Float) -> Recoveries:
-        """Mix the sums of ended and hidden faults into the hypothesis "recovered".
+    def _recoveries(self, state: WatchState, ended_or_hidden: Float) -> Recoveries:
+        """Return by how much each fault enters the hypothesis "recovered" in this step.
 
-        "Recovered" is the hypothesis that the gauges are right again after a fault. The weights
-        are returned with which beliefs are mixed.
+        "Recovered" is the hypothesis that the gauges are right again after a fault.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch.
+        ended_or_hidden : (B, 1 + G K) array
+            The probability of each fault that it ended or was hidden in this step.
+        """
+        probability_of_all = ended_or_hidden.sum(axis=1)
+        has_ended = probability_of_all > 0.0
+        # The fraction of the probability of "recovered" that was added in this step.
+        probability_recovered = state.weights.right_after_fault
+        new_fraction = np.zeros_like(probability_of_all)
+        np.divide(
+            probability_of_all,
+            probability_recovered,
+            out=new_fraction,
+            where=probability_recovered > 0.0,
+        )
+        new_fraction = np.where(has_ended, np.minimum(new_fraction, 1.0), 0.0)
+        fault_weight = ended_or_hidden / np.where(has_ended, probability_of_all, 1.0)[:, None]
+        return Recoveries(
+            new_fraction,
+            np.ascontiguousarray(fault_weight[:, hypothesis_weights.GAUGES_OF_FAULTS]),
+            np.ascontiguousarray(fault_weight[:, hypothesis_weights.FREE_GAINS_OF_FAULTS]),
+        )
+
+    def _mix_squares(self, state: WatchState, recoveries: Recoveries) -> None:
+        """Mix the sums of squares of ended and hidden faults into those of "recovered".
+
+        A gauge has the sum of the fault if the fault is its own, and otherwise that of the model.
+        The sums are averaged over the faults by their weights, and the average enters "recovered"
+        by the fraction that is new.
 
         Parameters
         ----------
         state : WatchState
             The state of the watch; updated in place.
-        right_again : (B, 1 + G K) array
-            The probability of each fault that it ended or was hidden in this step.
+        recoveries : Recoveries
+            By how much each fault enters.
         """
-        probability_of_all = right_again.sum(axis=1)
-        is_any_right = probability_of_all > 0.0
-        divisor = np.where(is_any_right, probability_of_all, 1.0)
-        # The fraction of the probability of "recovered" that was added in this step.
-        right_after_fault = state.weights.right_after_fault
-        fraction_new = np.zeros_like(divisor)
-        np.divide(
-            probability_of_all, right_after_fault, out=fraction_new, where=right_after_fault > 0.0
-        )
-        fraction_new = np.where(is_any_right, np.minimum(fraction_new, 1.0), 0.0)
-        fault_weight = right_again / divisor[:, None]
-        free_gains_weight = fault_weight[:, hypothesis_weights.FREE_GAINS_OF_FAULTS]
-        gauge_weight = np.ascontiguousarray(fault_weight[:, hypothesis_weights.GAUGES_OF_FAULTS])
-
         beliefs = state.beliefs
-        # Sums of squares: those of the model for a sound gauge and those of the fault for a faulty
-        # one, averaged over the faults by their weights.
         model_squares = beliefs.model_squares
         gains = len(_GAINS)
         difference = beliefs.gauge_squares - np.repeat(model_squares, gains, axis=1)
-        by_gauge = (gauge_weight * difference).reshape(len(difference), -1, gains)
+        by_gauge = (recoveries.gauge_weight * difference).reshape(len(difference), -1, gains)
         new_squares = model_squares + by_gauge.sum(axis=2)
         statistics = state.free_gain_statistics
         free_probability = statistics.free_probability
@@ -360,11 +377,10 @@ class FaultFilter:
             free_probability * statistics.free_squares
             + (1.0 - free_probability) * statistics.fixed_squares
         )
-        new_squares += free_gains_weight[:, None] * (free_gains_squares - model_squares)
-        beliefs.recovered_squares[:] += fraction_new[:, None] * (
+        new_squares += recoveries.free_gains_weight[:, None] * (free_gains_squares - model_squares)
+        beliefs.recovered_squares[:] += recoveries.new_fraction[:, None] * (
             new_squares - beliefs.recovered_squares
         )
-        return Recoveries(fraction_new, gauge_weight, np.ascontiguousarray(free_gains_weight))
 
     def assimilate(self, state: WatchState, observations: Observations) -> None:
         """Correct the beliefs and weights of all hypotheses of B twins by an observation of each.

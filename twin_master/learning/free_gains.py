@@ -48,9 +48,9 @@ class FreeGainWeights(NamedTuple):
 
 @compiled
 def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
-    """Return which of the n pairs have a belief that is not negligible.
+    """Return the positions in `model.pair` of pairs whose belief (N,) is not negligible.
 
-    The belief (N,) in all others becomes zero.
+    Negligible beliefs become zero.
     """
     for i in range(len(belief)):
         if belief[i] < NEGLIGIBLE_UNDER_FAULT:
@@ -173,12 +173,15 @@ def weigh_free_gains_in_logs(
     belief: Single,
     weights: FreeGainWeights,
 ) -> float:
-    """Do the same as `weigh_free_gains` by logarithms, which neither overflow nor underflow.
+    """Fill `weights` as `weigh_free_gains` does, but by logarithms.
+
+    They neither overflow nor underflow. The first G of `densities` are those of gauges with a gain
+    of their own, and the other G those of gauges without.
 
     Returns
     -------
     float
-        The log of the density to which the weights are relative, over that at the reference pair.
+        The log of the largest density, which has the weight 1, minus `model.log_density`.
     """
     gauges = len(free_probability)
     count = len(believed)

@@ -126,7 +126,13 @@ class HypothesisWeights:
         )
 
     def change_controls(self, previous_control: Index, control: Index) -> Float:
-        """Do the same as `change_control` for B twins with controls (B,) of their own, in place."""
+        """Do what `change_control` does for B twins, each with its own controls (B,), in place.
+
+        Returns
+        -------
+        (B, 1 + G K) array
+            The probability of each fault that it showed before and is hidden now.
+        """
         newly_hidden = np.zeros_like(self.hidden)
         pairs = np.stack([previous_control, control], axis=1)
         for previous, present in np.unique(pairs, axis=0).tolist():
@@ -143,12 +149,15 @@ class HypothesisWeights:
         return newly_hidden
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Divide each fault into a showing and a hidden part under the next control, in place.
+        """Divide the probability of each fault anew into a part that shows and one that is hidden.
+
+        A fault may show under one control and be hidden under another. Its total stays the same.
+        The weights are changed in place.
 
         Parameters
         ----------
         previous_control, control : int
-            The controls of the previous step and of the next one.
+            The controls before and after the change.
 
         Returns
         -------

@@ -47,19 +47,19 @@ class ModelLikelihood(NamedTuple):
 
 @compiled
 def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
-    """Return the indices (n,) of the pairs that some fault of a twin considers.
+    """Return the indices (n,) of the pairs in which some fault of a twin believes.
 
-    The rows of all other pairs among the beliefs of the faults become zero.
+    The beliefs of gauge faults in all other pairs become zero.
     """
     _, pairs, faults = beliefs.gauge.shape
     considered = np.empty(pairs, np.int64)
     count = 0
     for i in range(pairs):
-        considering = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
+        believing_faults = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
         if beliefs.gauge_is_nonzero[twin, i]:
             for r in range(faults):
-                considering += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
-        if considering > 0:
+                believing_faults += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
+        if believing_faults > 0:
             considered[count] = i
             count += 1
         elif beliefs.gauge_is_nonzero[twin, i]:
@@ -94,7 +94,7 @@ def model_likelihood(
     density: Float,
     log_factor: float,
 ) -> ModelLikelihood:
-    """Return how the model explains an observation at some pairs.
+    """Return the density of an observation under the model at some pairs, over the largest of them.
 
     Parameters
     ----------
@@ -105,9 +105,9 @@ def model_likelihood(
     scale_squares : (G,) array
         Degrees of freedom plus the expected sum of squared residuals before the observation.
     density : (N,) array
-        The density at all pairs under the model, up to a factor.
+        The density at all pairs under the model, over a factor.
     log_factor : float
-        The log of the factor, up to a constant of the step.
+        The log of this factor, up to a constant of the step.
     """
     count = len(pair)
     relative_density = np.empty(count)
@@ -117,7 +117,7 @@ def model_likelihood(
         relative_density[j] = density[pair[j]]
         largest = max(largest, relative_density[j])
         is_finite &= relative_density[j] < np.inf
-    if not is_finite or largest < LEAST_TOTAL:
+    if not is_finite or largest < LEAST_TOTAL:  # overflow or underflow: compute by logarithms
         log_density_of_sound_gauges(observation, pair, scale_squares, relative_density)
         log_factor = -np.inf
         for j in range(count):
