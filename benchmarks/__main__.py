@@ -11,7 +11,7 @@ import pkgutil
 import shutil
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
 from functools import partial
 from importlib import metadata
@@ -21,6 +21,7 @@ import benchmarks
 from benchmarks import lines
 from benchmarks.comparison import NOTEWORTHY, Change, change_since
 from benchmarks.measurement import Measurement, NotAvailableError
+from benchmarks.own_process import Benchmark, figures_of_own_process
 from benchmarks.peer_networks import PEER_PYTHON
 from benchmarks.record import (
     BenchmarkRecord,
@@ -34,9 +35,6 @@ from benchmarks.record import (
 from fe.reduction.built_once import cache_folder
 from reporting.errors import FileNotWrittenError
 from reporting.words import counted, in_one_line
-
-Benchmark = Callable[[], Iterable[Measurement]]
-"""Measures figures, and yields each as soon as it is known."""
 
 _PREFIX = "bench_"
 
@@ -191,6 +189,11 @@ def chosen_benchmarks(words: Sequence[str]) -> list[str]:
 
 
 def load_benchmark(name: str) -> Benchmark:
+    """Return the function that measures a benchmark in a process of its own."""
+    return partial(figures_of_own_process, partial(_imported_benchmark, name))
+
+
+def _imported_benchmark(name: str) -> Benchmark:
     """Import a benchmark and return the function that measures it."""
     benchmark: Benchmark = importlib.import_module(f"benchmarks.{_PREFIX}{name}").run
     return benchmark
