@@ -4,7 +4,8 @@
 `level_turns` with notices, side by side, and writes what the twins concluded. The same command of
 another version with `--compare FILE` flies the same flights and prints the largest differences. A
 quarter of the flights has no fault. In the other quarters a gauge shows 20 % too much or too
-little, half of the gauges show 33 % too little, or wires break.
+little, half of the gauges show 33 % too little, or wires break. The figures are in
+docs/explanation/notices.md.
 """
 
 import argparse

@@ -174,7 +174,7 @@ def test_a_pool_forgets_the_tasks_that_are_done():
     with open_task_pool(Engine(1), Progress()) as pool:
         list(pool.results(nothing_of, (Load() for _ in range(200))))
         gc.collect()
-        kept = sum(isinstance(thing, Load) for thing in gc.get_objects())
+        kept = sum(type(thing) is Load for thing in gc.get_objects())
     assert kept < 40
 
 
