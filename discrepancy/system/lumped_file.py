@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from itertools import chain, product
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
@@ -32,7 +33,7 @@ from discrepancy.system.lumped_sections import (
 from discrepancy.system.model_file import ModelDescription
 from reporting.choices import did_you_mean
 from reporting.toml_file import Check, Positive
-from reporting.words import counted
+from reporting.words import counted, listing
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
@@ -450,11 +451,16 @@ class LumpedDescription(ModelDescription):
         for kind, kind_names in unique_names.items():
             yield from self.repeated_name_checks(kind, kind_names)
         # the matrices of the file, and all that its parameters can scale
-        kinds_there = [kind for kind in KINDS if self._has_unknowns_of(kind)]
-        matrices = [*kinds_there, *part_names]
-        scalable = [*matrices, *names["input"], *names["load"], *names["law"], *names["controller"]]
-        for controller in names["controller"]:
-            scalable += [f"{controller}.{gain}" for gain in GAINS]
+        matrices = [*filter(self._has_unknowns_of, KINDS), *part_names]
+        gains = [".".join(pair) for pair in product(names["controller"], GAINS)]
+        scalable = {
+            "a matrix": matrices,
+            "an input": names["input"],
+            "a load": names["load"],
+            "a law": names["law"],
+            "a controller": [*names["controller"], *gains],
+        }
+        yield from self._ambiguous_term_checks(scalable)
         prescribed = [section.name for section in self.input if section.quantity.motion_chain]
         for kind, key, verb, allowed_names in (
             ("input", "through", "acts through", matrices),
@@ -462,9 +468,21 @@ class LumpedDescription(ModelDescription):
             ("law", "port", "acts on the port", names["port"]),
             ("output", "reaction", "is the reaction of the prescribed motion", prescribed),
             ("output", "controller", "is what a controller gives,", names["controller"]),
-            ("parameter", "terms", "scales", scalable),
+            ("parameter", "terms", "scales", [*chain.from_iterable(scalable.values())]),
         ):
             yield from self._reference_checks(kind, key, verb, allowed_names)
+
+    def _ambiguous_term_checks(self, scalable: Mapping[str, Sequence[str]]) -> Iterator[Check]:
+        """Yield the terms of parameters that name two things, both of which would be scaled."""
+        for parameter in self.parameter:
+            for term in parameter.terms:
+                meanings = [kind for kind, names in scalable.items() if term in names]
+                yield (
+                    len(meanings) > 1,
+                    f"the parameter {parameter.name!r} scales {term!r}, which is the name of "
+                    f"{listing(meanings)}: give all but one of them another name (that of an "
+                    "input stands in campaigns, too: as load_place or under [[input]])",
+                )
 
     def _reference_checks(
         self, kind: str, key: str, verb: str, known_names: Sequence[str]

@@ -70,7 +70,7 @@ def laboratory_campaigns(tmp_path_factory: pytest.TempPathFactory) -> tuple[Camp
         if trial.release:
             millimetres = 1e3 * trial.release.displacement
             options += ["--release", f"{trial.name}.csv={millimetres!r}mm"]
-    target = ("--out", "lab", "--load-place", "mass", "--model", MODEL)
+    target = ("--out", "lab", "--load-place", "tip", "--model", MODEL)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         done = command(*IMPORT, *files, *options, *COLUMNS, *target)
@@ -82,7 +82,7 @@ def test_a_folder_of_files_becomes_the_trials_of_a_campaign(laboratory_campaigns
     simulated, imported = laboratory_campaigns
     assert [trial.name for trial in imported.trials] == [trial.name for trial in simulated.trials]
     assert [trial.kind for trial in imported.trials] == [trial.kind for trial in simulated.trials]
-    assert {trial.load_place for trial in imported.trials} == {"mass"}
+    assert {trial.load_place for trial in imported.trials} == {"tip"}
 
 
 def test_imported_trials_have_the_values_of_their_files(laboratory_campaigns):

@@ -56,7 +56,7 @@ def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock():
     model = model_of(Inputs(__file__).text("one_mode.toml"))
     channel = Channel("x", Quantity.DISPLACEMENT, "displacement", NoiseRecord(2e-5, inf))
     trial = kit.blank_trial(
-        "release", TrialKind.RINGDOWN, ("x",), 0.02 * np.arange(200), load_place="mass",
+        "release", TrialKind.RINGDOWN, ("x",), 0.02 * np.arange(200), load_place="tip",
         release=Release(0.01, 0.02, mode_count=1),
     )  # fmt: skip
     effects = ("point_mass", "root_compliance", "clock_error")

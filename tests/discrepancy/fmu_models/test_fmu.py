@@ -34,7 +34,7 @@ LUMPED = LumpedModel.load("single_mass_rig")
 
 
 def trial(kind: TrialKind, time: Any = 300, **said: Any) -> Trial:
-    return asked(kind, time, **{"load_place": "mass", **said})
+    return asked(kind, time, **{"load_place": "tip", **said})
 
 
 def seen(model: Model, what: Trial, *items: Primitive, **given: Any) -> FloatArray:

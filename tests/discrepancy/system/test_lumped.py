@@ -336,3 +336,24 @@ def test_a_rig_without_an_input_and_a_damping_down_to_zero_is_a_model():
 def test_a_low_of_zero_that_would_leave_no_stiffness_is_refused():
     with pytest.raises(ModelError, match="low = 0, which would leave no stiffness at some unknown"):
         model_of(WITHOUT_INPUT.replace('terms = "damping"', 'terms = "stiffness"'))
+
+
+def test_a_mass_parameter_of_the_shipped_rig_leaves_its_force_as_it_is():
+    parameter = """
+[[parameter]]
+name = "mass_factor"
+terms = "mass"
+deviation = 0.02
+low = 0.5
+high = 2.0
+"""
+    rig = model_of((SHIPPED_MODELS / "single_mass_rig.toml").read_text(encoding="utf-8") + parameter)
+
+    displacement = seen(
+        rig,
+        asked(TrialKind.STATIC, 1, force=np.array([19.74])),
+        {"displacement": Quantity.DISPLACEMENT},
+        parameters=np.array([1.0, 1.0, 1.5]),
+    )
+
+    assert displacement[0, 0] == pytest.approx(0.01, rel=1e-12)
