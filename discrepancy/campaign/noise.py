@@ -16,9 +16,12 @@ from scipy.stats import f as f_distribution
 
 from discrepancy.campaign.noise_tests import (
     SHORTEST_SERIES,
+    LineTest,
     cumulative_periodogram,
     fisher_g,
+    largest_ordinate_test,
     ljung_box,
+    periodogram,
 )
 from discrepancy.campaign.records import Channel, FloatArray, Trial
 
@@ -38,6 +41,8 @@ WHITE_LEVEL = 1e-6
 Whitening by a chance correlation would colour white data."""
 LINE_LEVEL = 1e-4
 """Level of the test that a line of the mains stands out of a record."""
+LEAST_LINE_PERIODS = 3
+"""Fewest periods in a record that make a line in it; fewer are a drift."""
 NOISE_RECORD_LEVEL = 1e-3
 """p-value below which a noise record itself counts as not white, or as holding a line."""
 
@@ -304,6 +309,55 @@ def strongest_line_near(
     )
     stands_out = noise_power > 0.0 and line @ line > critical_ratio * noise_power
     return line if stands_out else None
+
+
+def find_line(series: FloatArray) -> LineTest:
+    """Test a noise record for a spectral line that stands out of the spectrum of its noise.
+
+    Slow noise has most of its power at low frequencies, where a test against white noise takes it
+    for a line. So the ordinates of the periodogram are divided by the spectrum of an autoregression
+    before they are tested by Fisher's g. An autoregression would follow a line, and is fitted to
+    the record without it. Two lines are tried, the strongest one, and that which stands out most of
+    an autoregression of the whole record. The p-value allows for the choice (Bonferroni).
+
+    Parameters
+    ----------
+    series : (n,) ndarray
+        The samples of the record, minus their mean.
+
+    Returns
+    -------
+    LineTest
+        Its statistic is the fraction of the variance of the record that the line has.
+    """
+    count = len(series)
+    ordinates = periodogram(series)
+    total_power = float(ordinates.sum())
+    ordinates[: LEAST_LINE_PERIODS - 1] = 0.0
+    coefficients, _ = fit_autoregression(series)
+    whitened = ordinates / _autoregressive_spectrum(coefficients, count)
+    candidates = {int(ordinates.argmax()) + 1, int(whitened.argmax()) + 1}
+    tests = []
+    for index in sorted(candidates):
+        line = _strongest_line(series, 1.0, (index - 1) / count, (index + 1) / count)
+        coefficients, _ = fit_autoregression(series - line)
+        whitened = ordinates / _autoregressive_spectrum(coefficients, count)
+        tests.append(largest_ordinate_test(whitened))
+    best = min(tests, key=lambda test: test.p_value)
+    return LineTest(
+        statistic=float(ordinates[best.frequency_index - 1]) / total_power,
+        p_value=min(1.0, len(tests) * best.p_value),
+        frequency_index=best.frequency_index,
+    )
+
+
+def _autoregressive_spectrum(coefficients: FloatArray, count: int) -> FloatArray:
+    """Return the spectrum of an autoregression at the frequencies of a periodogram of n samples.
+
+    The variance of its innovation is one.
+    """
+    filter_response = np.fft.rfft(np.r_[1.0, -coefficients], count)
+    return np.asarray(1.0 / np.abs(filter_response[1 : (count - 1) // 2 + 1]) ** 2)
 
 
 def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:

@@ -308,7 +308,14 @@ def fisher_g(series: FloatArray) -> LineTest:
     Of the sum for the p-value only the first term t = M (1 - g)^(M - 1) is used, for M ordinates,
     as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
     """
-    ordinates = periodogram(series)
+    return largest_ordinate_test(periodogram(series))
+
+
+def largest_ordinate_test(ordinates: FloatArray) -> LineTest:
+    """Test the ordinates (M,) of a periodogram by Fisher's g; the first has the frequency index 1.
+
+    All must have the same mean if there is no line.
+    """
     total_power = float(ordinates.sum())
     if total_power == 0.0:
         return LineTest(0.0, 1.0, 0)

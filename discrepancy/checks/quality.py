@@ -12,7 +12,14 @@ from scipy.stats import f as f_distribution
 
 from discrepancy.campaign.noise import LEAST_FOR_COLOUR
 from discrepancy.campaign.noise_records import repeat_record
-from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
+from discrepancy.campaign.records import (
+    BoolArray,
+    Campaign,
+    Channel,
+    FloatArray,
+    NoiseRecord,
+    Trial,
+)
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.copies import copy_faults
 from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
@@ -31,6 +38,9 @@ _LEVEL = 1e-3
 """Level of the F test between a noise record and repeats."""
 _NOISE_FACTOR = 2.0
 """Factor by which a noise record must be contradicted."""
+SLOW_NOISE_ROUGHNESS = 0.24
+"""Roughness (`estimate_roughness`) over standard deviation of noise whose neighbouring samples have
+the correlation 0.9, as an autoregression of first order; that of white noise is one."""
 
 
 def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
@@ -38,9 +48,9 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
 
     Some faults only limit what can be concluded: a channel without a noise record, or a noise
     record that contains a motion, or that contradicts repeats (F test at 0.1 %) or the roughness of
-    the readings (by a factor of two). Others make the data wrong (`DataFault.fatal`): a channel
-    that is constant (dead), clipped, stuck for a time (held) or a copy of another one, and more
-    than 3 % of outliers in a record in time.
+    the readings (by a factor of two, with slow noise allowed for). Others make the data wrong
+    (`DataFault.fatal`): a channel that is constant (dead), clipped, stuck for a time (held) or a
+    copy of another one, and more than 3 % of outliers in a record in time.
     """
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
@@ -88,13 +98,8 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         return
     stated_deviation = record.standard_deviation
     contradiction = ""
-    # One-sided: a fast motion may make a record rougher than its noise, but no record is smoother
-    # than its noise.
-    least_roughness = _least_roughness(campaign, channel.name)
-    recorded_roughness = stated_deviation
-    if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
-        recorded_roughness = estimate_roughness(record.samples)
-    if 0.0 < least_roughness < recorded_roughness / _NOISE_FACTOR:
+    least_roughness = min(_contradicting_roughness(campaign, record, channel.name), default=None)
+    if least_roughness is not None:
         contradiction = f"neighbouring samples scatter by {least_roughness:.3g}"
 
     repeats = repeat_record(channel, campaign.trials)
@@ -117,16 +122,26 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         yield DataFault(FaultKind.NOISE_LABEL, sentence, channel.name)
 
 
-def _least_roughness(campaign: Campaign, name: str) -> float:
-    """Return the least roughness of a channel's dynamic records, scaled to a noise factor of one.
+def _contradicting_roughness(campaign: Campaign, record: NoiseRecord, name: str) -> Iterator[float]:
+    """Yield the roughness of each dynamic record of a channel that is too smooth for its noise.
 
-    It is infinite if no record is long enough.
+    Slow noise is smooth as well, and as smooth as its own record at the same interval. At another
+    interval, or without samples, the noise may be as slow as `SLOW_NOISE_ROUGHNESS` says. The test
+    is one-sided: a fast motion may make a record rougher than its noise.
     """
-    least_roughness = np.inf
+    slow_roughness = SLOW_NOISE_ROUGHNESS * record.standard_deviation
+    recorded_roughness = slow_roughness
+    if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
+        recorded_roughness = estimate_roughness(record.samples)
+    record_interval = record.interval or np.inf
     for trial, values, _ in campaign.records(name):
-        if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
-            least_roughness = min(least_roughness, estimate_roughness(values) / trial.noise_factor)
-    return least_roughness
+        if not trial.is_dynamic or len(values) < LEAST_FOR_COLOUR:
+            continue
+        has_same_interval = np.isclose(trial.interval, record_interval, rtol=1e-3, atol=0.0)
+        expected_roughness = recorded_roughness if has_same_interval else slow_roughness
+        roughness = estimate_roughness(values) / trial.noise_factor
+        if 0.0 < roughness < expected_roughness / _NOISE_FACTOR:
+            yield roughness
 
 
 # ---------------------------------------------------------------- records

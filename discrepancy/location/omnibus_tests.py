@@ -7,7 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign import noise_tests
-from discrepancy.campaign.noise import NOISE_RECORD_LEVEL, record_at_rest, whiteness_is_tested
+from discrepancy.campaign.noise import (
+    NOISE_RECORD_LEVEL,
+    find_line,
+    record_at_rest,
+    whiteness_is_tested,
+)
 from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import ResidualSet, mean_square_ratio
 
@@ -217,7 +222,7 @@ def coloured_noise_remarks(residuals: ResidualSet) -> dict[str, str]:
         series = record_at_rest(channel)
         if series is None or channel.noise is None or whiteness_is_tested(channel):
             continue
-        line = noise_tests.fisher_g(series)
+        line = find_line(series)
         if line.p_value < NOISE_RECORD_LEVEL:
             frequency = ""
             if channel.noise.interval:

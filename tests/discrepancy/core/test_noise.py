@@ -10,7 +10,9 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import (
     MAINS_DEVIATION,
+    NOISE_RECORD_LEVEL,
     NoiseModel,
+    find_line,
     fit_autoregression,
     noise_model,
     remove_lines,
@@ -149,6 +151,28 @@ def test_a_line_in_noise_is_found_with_its_share_of_the_power():
     assert p_value < 1e-6
     assert frequency == 50
     assert share == pytest.approx(0.18 / 1.18, rel=0.5)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.9])
+def test_slow_noise_is_not_taken_for_a_line(correlation):
+    """The level is 0.1 %; of 200 records at most 2 % are said to hold a line."""
+    generator = np.random.default_rng(31)
+    records = [coloured(generator, (correlation,), 400) for _ in range(200)]
+    p_values = np.array([find_line(record - record.mean()).p_value for record in records])
+    assert np.mean(p_values < NOISE_RECORD_LEVEL) <= 0.02
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.9])
+def test_a_line_in_slow_noise_is_found_with_its_frequency_and_share(correlation):
+    """It has 30 % of the variance, and lies between two frequencies of the periodogram."""
+    noise = coloured(np.random.default_rng(32), (correlation,), 800)
+    amplitude = np.sqrt(2.0 * 0.3 / 0.7) * noise.std()
+    record = noise + amplitude * np.cos(2.0 * np.pi * 100.3 / 800 * np.arange(800))
+    line = find_line(record - record.mean())
+    assert line.p_value < 1e-6
+    assert line.frequency_index == 100
+    # the ordinate has this part of the power of a line that is 0.3 resolutions away
+    assert line.statistic == pytest.approx(0.3 * np.sinc(0.3) ** 2, rel=0.2)
 
 
 def test_holm_by_hand():

@@ -481,7 +481,7 @@ def test_slow_records_of_few_digits_are_not_clipped():
     ("record", "kind", "words"),
     [
         (None, FaultKind.NO_NOISE_RECORD, "g0"),
-        (NoiseRecord(1e-5, 200.0), FaultKind.NOISE_LABEL, "says 1e-05"),
+        (NoiseRecord(1e-4, 200.0), FaultKind.NOISE_LABEL, "says 0.0001"),
     ],
 )
 def test_a_noise_record_that_is_missing_or_wrong_is_a_limit(campaign, record, kind, words):
@@ -511,20 +511,48 @@ def test_a_noise_record_is_compared_with_the_scatter_of_repeats(stated):
     assert all("repeated trials scatter" in fault.sentence for fault in faults)
 
 
+def slow_noise(count, correlation=0.9, seed=2):
+    """Return noise that is an autoregression of first order, (count,)."""
+    innovation = np.random.default_rng(seed).normal(size=count + 200)
+    return lfilter([1.0], [1.0, -correlation], innovation)[200:]
+
+
+def ring_in_noise(noise, interval=0.01):
+    """Return a ring-down of one displacement under noise (N,)."""
+    time = interval * np.arange(len(noise))
+    values = (30.0 * np.cos(12.0 * time) * np.exp(-time) + noise)[:, None]
+    return Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values)
+
+
 @pytest.mark.parametrize(
-    ("has_samples", "factor", "is_faulty"), [(True, 1.0, False), (True, 3.0, True), (False, 1.0, True)]
+    ("has_samples", "factor", "is_faulty"),
+    [(True, 1.0, False), (True, 3.0, True), (False, 1.0, False), (False, 10.0, True)],
 )
-def test_slow_noise_is_compared_with_the_samples_of_its_record(has_samples, factor, is_faulty):
+def test_slow_noise_is_no_contradiction_of_its_record(has_samples, factor, is_faulty):
     """Slow noise is smooth, and so is its record; a standard deviation alone does not say so."""
-    time = 0.01 * np.arange(600)
-    noise = np.random.default_rng(2).normal(size=(2, 600))
-    slow, slow_at_rest = lfilter([1.0], [1.0, -0.9], noise)
-    values = (30.0 * np.cos(12.0 * time) * np.exp(-time) + slow)[:, None]
-    trial = Trial.plain("ring", TrialKind.RINGDOWN, ("x",), time, values=values)
-    samples = factor * slow_at_rest
+    samples = factor * slow_noise(600, seed=3)
     record = NoiseRecord(float(np.std(samples)), 599.0, samples if has_samples else None, 0.01)
-    faults = faults_of_channel([trial], record)
+    faults = faults_of_channel([ring_in_noise(slow_noise(600))], record)
     assert [fault.kind for fault in faults] == ([FaultKind.NOISE_LABEL] if is_faulty else [])
+
+
+def test_slow_noise_is_no_contradiction_of_a_record_at_a_longer_interval():
+    samples = slow_noise(6000, seed=3)[::10]
+    record = NoiseRecord(float(np.std(samples)), 599.0, samples, 0.01)
+    assert faults_of_channel([ring_in_noise(slow_noise(6000), interval=0.001)], record) == ()
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.9])
+def test_a_stated_deviation_is_not_contradicted_by_the_correlation_of_the_noise(correlation):
+    """None of 25 sound records, of noise as white or as slow as a sensor's, is doubted."""
+    deviation = 1.0 / np.sqrt(1.0 - correlation**2)
+    record = NoiseRecord(deviation, 599.0)
+    faults = [
+        fault
+        for seed in range(25)
+        for fault in faults_of_channel([ring_in_noise(slow_noise(600, correlation, seed))], record)
+    ]
+    assert faults == []
 
 
 class SpoiltReadings:
