@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr
 from scipy.stats import truncnorm
 
 from calibration.result.record import (
@@ -18,7 +17,7 @@ from calibration.result.record import (
     prior_samples,
 )
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, FloatArray
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LARGEST_DEVIATION_RATIO
 from discrepancy.errors import CampaignDataError, ModelError
@@ -196,11 +195,12 @@ FAR_FROM_PRIOR = 3.0
 reported."""
 TIED_CORRELATION = 0.95
 """Absolute correlation above which two parameters are reported as not determined separately."""
-LEAST_CUT_OFF = 0.02
-"""Probability of a posterior outside of the model's range above which it is reported.
+LARGEST_OPEN_RATIO = 0.62
+"""Distance of the outermost 2.5 % of the samples from an end of the range, over that of the
+outermost 5 %, below which a posterior is reported as cut off there.
 
-It is reported only for a parameter that the data determine, since any other is truncated just as
-its prior is."""
+It is that of a Gaussian of which the end cuts off 2 %. A posterior is reported only for a parameter
+that the data determine, since any other is truncated just as its prior is."""
 REFUSAL_DISTANCE = 4.0
 """Distance from the optimum, in standard deviations, within which a failure of the model is
 reported."""
@@ -291,14 +291,9 @@ def _range_findings(
 ) -> Iterator[str]:
     """Yield findings on posteriors at an end of the range, and on failures within it."""
     marginal = posterior.marginal
-    optimum = posterior.optima[0]
-    fitted_parameters = optimum.point.shared[marginal.parameter_indices]
-    deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.parameter_indices]), 1e-12)
-    # probability of the Gaussian posterior that lies outside of the range before it is truncated
-    probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
-    probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
-    is_determined = remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
-    is_cut_off = is_determined & (probability_below + probability_above > LEAST_CUT_OFF)
+    is_cut_off = _is_open_at(posterior.draws - marginal.low)
+    is_cut_off |= _is_open_at(marginal.high - posterior.draws)
+    is_cut_off &= remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
     for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
         if cut_off:
             yield (
@@ -321,6 +316,16 @@ def _range_findings(
             f"({first.reason.rstrip('.')}): the posterior leaves these places out; correct the "
             "range in the model's file."
         )
+
+
+def _is_open_at(distances: FloatArray) -> BoolArray:
+    """Return for which parameters (P,) the density is not small at an end of the range.
+
+    The outermost 2.5 and 5 % of the samples (N, P) lie at a ratio of distances from the end that
+    is one half for a density that is constant there, and nearly one if it vanishes.
+    """
+    inner, outer = np.quantile(distances, (0.025, 0.05), axis=0)
+    return np.asarray(inner <= LARGEST_OPEN_RATIO * outer)
 
 
 def _optimum_findings(

@@ -430,6 +430,29 @@ def test_the_prior_weighs_maxima_of_equal_likelihood(two_maxima):
     np.testing.assert_allclose(np.abs(first).mean(), 0.8, atol=0.01)
 
 
+def test_samples_at_the_end_of_the_range_are_told_where_the_best_maximum_is_within():
+    """Both signs explain the readings, and the range ends at the middle of the lesser maximum."""
+    choice = choice_of(even, (0.05, 1.0, -0.8, 5.0), SMALL_OFFSET)
+    cut_off = calibrate_parameters(campaign_of(EVEN_READINGS), choice, samples=4000)
+    assert np.mean(cut_off.samples[:, 0] < -0.79) > 0.1
+    assert any("p1 reaches the end of its range, -0.8 to 5" in text for text in cut_off.findings)
+
+
+def test_two_maxima_within_the_range_do_not_reach_its_end(two_maxima):
+    assert not any("reaches the end" in sentence for sentence in two_maxima.findings)
+
+
+@pytest.mark.parametrize(
+    ("margin", "is_told"), [(-30.0, True), (-3.0, True), (0.0, True), (1.5, True), (3.0, False)]
+)
+def test_a_posterior_is_told_to_reach_the_end_by_its_distance_in_deviations(margin, is_told):
+    deviation = NOISE / np.sqrt(np.sum((FORCE / 10.0) ** 2))
+    low = 1.0 - margin * deviation
+    choice = choice_of(lambda force, p: p[0] * force / 10.0, (low + 0.2, 1.0, low, 3.0))
+    found = calibrate_parameters(campaign_of(FORCE / 10.0), choice)
+    assert any("reaches the end" in sentence for sentence in found.findings) is is_told
+
+
 def test_of_few_samples_the_lesser_maximum_may_have_none():
     choice = choice_of(even, (0.3, 0.7, -5.0, 5.0), SMALL_OFFSET)
     few = calibrate_parameters(campaign_of(EVEN_READINGS), choice, samples=4)
