@@ -7,6 +7,9 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.stats import norm
+
 from calibration.result.file import Tailoring, load_calibration, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
@@ -28,6 +31,8 @@ from reporting.toml_file import read_toml, toml_text
 from reporting.words import capital
 
 ENDINGS = (".toml", ".json", ".fmu")
+RANGE_OF_FORCE_FACTOR = (0.1, 10.0)
+"""Range of the parameter that scales the force of an applied law [1]."""
 
 
 @dataclass(frozen=True)
@@ -288,6 +293,8 @@ def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | No
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
     """Return the file of a lumped model, as text, with the laws and parameters of a patch added.
 
+    The laws of an effect get a parameter that scales their force, with the deviation of the patch.
+
     Parameters
     ----------
     choice : ModelChoice
@@ -309,7 +316,9 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
             table["mean"] = parameter.mean
             table["deviation"] = parameter.deviation
     laws = list(model_tables.get("law", ()))
+    parameters = list(model_tables.get("parameter", ()))
     for effect in patch.effects:
+        names: list[str] = []
         for primitive in effect.patch:
             name = effect.identifier
             # laws of the same effect are numbered from the second on, so that names stay unique
@@ -317,6 +326,13 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
             if number_of_same_name:
                 name = f"{name}_{number_of_same_name + 1}"
             laws.append({"name": name, **primitive.to_mapping()})
+            names.append(name)
+        deviation = _relative_deviation_of_force(effect)
+        if deviation > 0.0:
+            low, high = RANGE_OF_FORCE_FACTOR
+            factor = {"mean": 1.0, "deviation": deviation, "low": low, "high": high}
+            parameters.append({"name": f"{names[0]}_factor", "terms": names, **factor})
+    model_tables["parameter"] = parameters
     model_tables["law"] = laws
     effects = ", ".join(effect.name for effect in patch.effects)
     model_tables["name"] = f"{model_tables['name']} with {effects}"
@@ -324,6 +340,26 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
     LumpedDescription.parse(model_tables, f"{file} with {patch.sentence}")
     comments = f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n"
     return f"{comments}\n{toml_text(model_tables)}"
+
+
+def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
+    """Return the standard deviation of the force of an effect's laws over the force.
+
+    It is taken from the 90 % interval of the number that scales the force of the first law or, in a
+    patch without intervals, of the first parameter of the effect.
+    """
+    law = effect.patch.primitives[0]
+    assert isinstance(law, PortForce)  # only laws at ports are written into a model's file
+    ranges = [
+        (interval.value, interval.low, interval.high)
+        for interval in effect.intervals
+        if interval.primitive == 0 and interval.parameter == law.proportional[0]
+    ]
+    ranges += [(estimate.value, estimate.low, estimate.high) for estimate in effect.parameters]
+    for value, low, high in ranges:
+        if value != 0.0 and np.isfinite(high - low):
+            return float((high - low) / (2.0 * norm.ppf(0.95) * abs(value)))
+    return 0.0
 
 
 def pack_patched(

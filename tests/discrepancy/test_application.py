@@ -109,9 +109,29 @@ def test_a_patched_model_says_what_it_was_patched_with(round_trip):
 def test_a_patched_model_has_the_parameters_of_its_verdict(round_trip):
     """The prior's deviation is 0.02."""
     parameters = round_trip.stored.verdict.parameters
-    rows = [(row["name"], row["mean"], row["deviation"]) for row in round_trip.model["parameter"]]
+    rows = [(row["name"], row["mean"], row["deviation"]) for row in round_trip.model["parameter"][:-1]]
     assert rows == [(item.name, item.mean, item.deviation) for item in parameters]
     assert parameters[0].deviation < 0.02
+
+
+def test_a_patched_model_has_the_deviation_of_its_law_as_a_parameter(round_trip):
+    """The force is proportional to the only size of the effect."""
+    (size,) = round_trip.stored.verdict.effects[0].parameters
+    factor = round_trip.model["parameter"][-1]
+    assert (factor["name"], factor["terms"]) == ("cubic_stiffness_factor", ["cubic_stiffness"])
+    assert factor["mean"] == 1.0
+    relative_width = (size.high - size.low) / (2.0 * 1.645 * size.value)
+    # the patch has the quantiles of draws, which scatter
+    assert factor["deviation"] == pytest.approx(relative_width, rel=0.25)
+
+
+def test_the_next_run_keeps_value_and_deviation_of_a_law(round_trip):
+    """The same records again: the value within a deviation, and the deviation not larger."""
+    prior = round_trip.model["parameter"][-1]
+    again = uav_twin.read_verdict(round_trip.folder / round_trip.words[-1]).verdict
+    (posterior,) = (item for item in again.parameters if item.name == "cubic_stiffness_factor")
+    assert posterior.mean == pytest.approx(1.0, abs=prior["deviation"])
+    assert 0.3 * prior["deviation"] < posterior.deviation <= prior["deviation"]
 
 
 def test_of_a_patched_model_nothing_is_missing_any_more(round_trip):
