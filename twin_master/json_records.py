@@ -160,7 +160,7 @@ class SuspicionRecord(TypedDict):
     log_evidence_gauge: list[float]
     """Log e-value of each sensor [nat]."""
     left_out: list[bool]
-    """Whether the readings of each sensor are absurd and left out."""
+    """Whether the readings of each sensor are left out: absurd, or stuck."""
     hypotheses: dict[str, float]
     """Probability of each hypothesis by its name [1]."""
     decided_by: str

@@ -12,7 +12,8 @@ from twin_master.learning.belief_transitions import Onsets, Recoveries, advance_
 from twin_master.learning.fault_evidence import correct_beliefs
 from twin_master.learning.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
 from twin_master.learning.hypothesis_weights import HypothesisWeights, log_of_sum
-from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, FROM_THE_START, WatchState
+from twin_master.learning.stuck_gauges import FROM_THE_START
+from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, WatchState
 from twin_master.network.estimator import Carried
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -26,7 +27,7 @@ _MOST_BELIEF_NUMBERS = 20_000_000
 """Numbers that the beliefs of the gauge faults may take: each kept step holds them."""
 _LEAST_INFORMATION = 1e-3
 """Least information about a gain in a step, so that a gauge without load has a finite prior."""
-_STATE_FORMAT = b"3"
+_STATE_FORMAT = b"4"
 """Changes with the layout of the carried arrays: a state of another layout is not continued."""
 
 
@@ -189,11 +190,7 @@ class FaultFilter:
         control_index : (B,) array
             The controls in force in this step.
         """
-        # The prior probability to begin in exactly this step. It is positive: the probability to
-        # begin after a step decreases strictly with the step.
-        begins_later = self.probability_to_begin_after(state.step_count)
-        begins_now = self.probability_to_begin_after(state.step_count - 1.0) - begins_later
-        log_begins_now = np.log(begins_now)
+        log_begins_now = np.log(self.probability_to_begin_now(state.step_count))
         onsets = Onsets(
             self._begin_gauge_faults(state, log_begins_now),
             self._begin_free_gains(state, log_begins_now),
@@ -286,6 +283,14 @@ class FaultFilter:
         It decreases slowly, as 1 / step, so that a fault may still begin after years.
         """
         return (1.0 - FROM_THE_START) / (1.0 + step / self._settings.onset_steps)
+
+    def probability_to_begin_now(self, step: Float) -> Float:
+        """Return the prior probability that a fault begins in exactly a step (B,), from 1.
+
+        It is positive, because the probability to begin after a step decreases strictly with it.
+        """
+        begins_later = self.probability_to_begin_after(step)
+        return self.probability_to_begin_after(step - 1.0) - begins_later
 
     def _advance_weights(
         self,

@@ -1,4 +1,4 @@
-"""The watch over the gauges of many twins: absurd readings, faults as hypotheses, notices.
+"""The watch over the gauges of many twins: useless readings, faults as hypotheses, notices.
 
 A single twin is watched in the same way, as one of one, so that its results are the same to the
 last bit.
@@ -17,6 +17,7 @@ from twin_master.learning.fault_filter import FaultFilter
 from twin_master.learning.fault_kernels import Observations
 from twin_master.learning.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.learning.notices import NoticeWriter
+from twin_master.learning.stuck_gauges import StandstillTest, StuckGauges
 from twin_master.learning.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
@@ -26,16 +27,18 @@ from twin_master.scenario.tables import Noticing
 
 @dataclass(frozen=True)
 class CheckedReadings:
-    """The observations of B twins in a step, without absurd readings.
+    """The observations of B twins in a step, without readings that are absurd or stand still.
 
     Attributes
     ----------
     rows : (B, G + I) array
-        All observed values, SI; NaN where nothing was received or a reading is absurd.
+        All observed values, SI; NaN where nothing was received or a reading is left out.
     readings : (B, G) array
         The values of the gauges as they were received.
     is_absurd : (B, G) array of bool
         Whether no state can show a reading.
+    stuck_gauges : StuckGauges
+        Which gauges stand still, after this step.
     observations : Observations
         The values that are used.
     """
@@ -43,7 +46,14 @@ class CheckedReadings:
     rows: Float
     readings: Float
     is_absurd: NDArray[np.bool_]
+    stuck_gauges: StuckGauges
     observations: Observations
+
+    @property
+    def is_left_out(self) -> NDArray[np.bool_]:
+        """Whether a reading (B, G) was received and is not used."""
+        is_stuck = (self.stuck_gauges.is_stuck > 0.0) & ~np.isnan(self.readings)
+        return self.is_absurd | is_stuck
 
 
 class AlarmEvidence(NamedTuple):
@@ -100,6 +110,7 @@ class GaugeWatch:
         self._sensor_model = sensor_model
         self.faults = FaultFilter(model, sensor_model, draws, settings)
         self._notices = self._notice_writer(wording, settings)
+        self._standstill = StandstillTest.of(sensor_model.standard_deviation, settings)
 
     def _notice_writer(self, wording: NoticeWording, settings: Noticing) -> NoticeWriter:
         """Return the writer of notices.
@@ -117,14 +128,19 @@ class GaugeWatch:
             log_gauge_prior=self.faults.log_gauge_prior,
             lowest_plausible=(value.min(axis=0) - margin).min(axis=0),
             highest_plausible=(value.max(axis=0) + margin).max(axis=0),
+            noise=self._sensor_model.standard_deviation,
             hypothesis_names=tuple(f"{wording.name_sensors([g])} off" for g in sensors),
         )
 
-    def leave_out_absurd_readings(self, rows: Float, control_index: Index) -> CheckedReadings:
-        """Return the observations of B twins without readings that no state can explain.
+    def leave_out_useless_readings(
+        self, state: WatchState | None, rows: Float, control_index: Index
+    ) -> CheckedReadings:
+        """Return the observations of B twins without readings that are absurd or stand still.
 
         Parameters
         ----------
+        state : WatchState or None
+            The state of the watch after the previous step; None if this is the first one.
         rows : (B, G + I) array
             The values of G sensors and the readings of I inspections, SI; NaN where nothing was
             received.
@@ -134,11 +150,13 @@ class GaugeWatch:
         Returns
         -------
         CheckedReadings
-            The sensor values with and without the absurd ones; readings of inspections are kept.
+            The sensor values with and without those left out; readings of inspections are kept.
         """
         values, inspections_log_density = self._sensor_model.split_observation(rows)
         is_absurd = self._notices.is_absurd(values, control_index)
-        used_values = np.where(is_absurd, np.nan, values)
+        stuck_gauges = self._update_stuck_gauges(state, values)
+        is_useless = is_absurd | (stuck_gauges.is_stuck > 0.0)
+        used_values = np.where(is_useless, np.nan, values)
         inspections = rows[:, values.shape[1] :]
         used_rows = np.concatenate([used_values, inspections], axis=1)
         inspections_log_density = np.broadcast_to(
@@ -149,7 +167,18 @@ class GaugeWatch:
             np.ascontiguousarray(inspections_log_density),
             control_index.astype(np.int64),
         )
-        return CheckedReadings(used_rows, values, is_absurd, observations)
+        return CheckedReadings(used_rows, values, is_absurd, stuck_gauges, observations)
+
+    def _update_stuck_gauges(self, state: WatchState | None, readings: Float) -> StuckGauges:
+        """Return which gauges stand still, given their readings (B, G) in the next step."""
+        if state is None:
+            step_count = np.zeros(len(readings))
+            before = StuckGauges.initial(*readings.shape)
+        else:
+            step_count = state.step_count
+            before = state.stuck_gauges
+        begins_now = self.faults.probability_to_begin_now(step_count)
+        return self._standstill.update(before, readings, step_count, begins_now)
 
     def assimilate(
         self, state: WatchState, checked: CheckedReadings, model_belief: Float, step: int
@@ -174,30 +203,41 @@ class GaugeWatch:
             The notices of each twin.
         """
         self.faults.assimilate(state, checked.observations)
-        notices = self._report_absurd_readings(state, checked, step)
+        notices = self._report_useless_readings(state, checked, step)
         self._raise_alarms(state, notices, step)
         self._report_followed_hypothesis(state, notices, step)
         state.mixed = hypothesis_weights.mix_beliefs(state.weights, model_belief, state.beliefs)
         return notices
 
-    def _report_absurd_readings(
+    def _report_useless_readings(
         self, state: WatchState, checked: CheckedReadings, step: int
     ) -> list[list[Notice]]:
-        """Return the notices of each twin about readings that begin or cease to be absurd."""
-        is_absurd = checked.is_absurd
+        """Return the notices of each twin about readings that begin or cease to be left out."""
+        is_left_out = checked.is_left_out
         is_missing = np.isnan(checked.readings)
         was_left_out = state.left_out
         # A gauge that was left out and sends no reading now counts as left out still.
-        state.left_out = is_absurd | (was_left_out & is_missing)
-        notices: list[list[Notice]] = [[] for _ in is_absurd]
+        state.left_out = is_left_out | (was_left_out & is_missing)
+        state.stuck_gauges = checked.stuck_gauges
+        notices: list[list[Notice]] = [[] for _ in is_left_out]
         for twin in np.flatnonzero(np.any(state.left_out != was_left_out, axis=1)).tolist():
-            notices[twin] = self._notices.report_absurd_readings(
-                was_left_out[twin],
-                is_absurd[twin],
-                checked.readings[twin],
-                int(checked.observations.control[twin]),
-                step,
-            )
+            # The step counts from the first one of this model, which may have replaced another.
+            first_step = step + 1 - round(float(state.step_count[twin]))
+            readings = checked.readings[twin]
+            begins = is_left_out[twin] & ~was_left_out[twin]
+            is_absurd = checked.is_absurd[twin]
+            still_since = first_step + state.stuck_gauges.still_since[twin]
+            notices[twin] = [
+                *self._notices.report_absurd_readings(
+                    begins & is_absurd, readings, int(checked.observations.control[twin]), step
+                ),
+                *self._notices.report_stuck_gauges(
+                    begins & ~is_absurd, readings, still_since, step
+                ),
+                *self._notices.report_gauges_back(
+                    was_left_out[twin] & ~state.left_out[twin], readings, step
+                ),
+            ]
         return notices
 
     def _raise_alarms(self, state: WatchState, notices: Sequence[list[Notice]], step: int) -> None:

@@ -1,4 +1,4 @@
-"""The watch over the gauges: it notices faulty gauges, unexplained readings and absurd readings.
+"""The watch over the gauges: it notices faulty and stuck gauges, unexplained and absurd readings.
 
 By the model, every gauge shows the value that belongs to the state and to a draw of the parameter,
 plus noise of unknown scale. Two kinds of fault compete with the model: a gauge shows a stated
@@ -31,7 +31,7 @@ from twin_master.scenario.tables import Noticing
 
 
 class WatchfulEstimator:
-    """An estimator that is watched: absurd readings are left out, and faults of gauges are noticed.
+    """An estimator that is watched: useless readings are left out, faults of gauges are noticed.
 
     The belief is that of a mixture of hypotheses: the inner estimator, each gauge that is off, and
     gauges that are right again after a fault (see `hypothesis_weights`). Beside the arrays of the
@@ -111,16 +111,20 @@ class WatchfulEstimator:
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         controls = np.array([control_index])
-        checked = self.watch.leave_out_absurd_readings(np.asarray(observation)[None], controls)
+        faults = self.watch.faults
+        state = None
+        if before is not None and self._continues(before):
+            state = faults.restore(before)
+        checked = self.watch.leave_out_useless_readings(
+            state, np.asarray(observation)[None], controls
+        )
         estimate = self._inner.step(before, checked.rows[0], control_index, step)
 
         # Advance and correct the hypotheses about the gauges.
-        faults = self.watch.faults
-        if before is not None and self._continues(before):
-            state = faults.restore(before)
-            faults.advance(state, np.array([before.control_index]), controls)
-        else:
+        if before is None or state is None:
             state = faults.start(estimate.forecast[None], controls)
+        else:
+            faults.advance(state, np.array([before.control_index]), controls)
         model_belief = estimate.filtered[None]
         (notices,) = self.watch.assimilate(state, checked, model_belief, step)
         if before is None:

@@ -40,6 +40,8 @@ class NoticeWriter:
         The log prior probability of each gauge to be the one that is off.
     lowest_plausible, highest_plausible : (U, G) array
         Readings beyond these are absurd under a control, SI.
+    noise : (G,) array
+        The standard deviation of the assumed noise, SI.
     hypothesis_names : tuple of str
         The name of the hypothesis that a gauge is off, for each gauge.
     """
@@ -50,6 +52,7 @@ class NoticeWriter:
     log_gauge_prior: Float
     lowest_plausible: Float
     highest_plausible: Float
+    noise: Float
     hypothesis_names: tuple[str, ...]
 
     def is_absurd(self, readings: Float, control_index: Index) -> NDArray[np.bool_]:
@@ -62,21 +65,14 @@ class NoticeWriter:
         return np.asarray(is_too_low | is_too_high)
 
     def report_absurd_readings(
-        self,
-        was_left_out: NDArray[np.bool_],
-        is_absurd: NDArray[np.bool_],
-        readings: Float,
-        control_index: int,
-        step: int,
+        self, begins: NDArray[np.bool_], readings: Float, control_index: int, step: int
     ) -> list[Notice]:
-        """Return a notice for each gauge whose readings begin or cease to be absurd.
+        """Return a notice for each gauge whose readings begin to be absurd.
 
         Parameters
         ----------
-        was_left_out : (G,) array of bool
-            Whether the gauge was left out before this step.
-        is_absurd : (G,) array of bool
-            Whether its reading is absurd now.
+        begins : (G,) array of bool
+            Whether the reading of the gauge is absurd now, and was used before.
         readings : (G,) array
             The readings, SI; NaN where nothing was received.
         control_index : int
@@ -85,7 +81,7 @@ class NoticeWriter:
             The number of this step.
         """
         notices = []
-        for g in np.flatnonzero(is_absurd & ~was_left_out).tolist():
+        for g in np.flatnonzero(begins).tolist():
             reading, low, high = self.wording.format_values(
                 g,
                 readings[g],
@@ -98,7 +94,42 @@ class NoticeWriter:
                 "until they come back."
             )
             notices.append(Notice("gauge_left_out", sentence, (g + 1,), float(readings[g])))
-        for g in np.flatnonzero(was_left_out & ~is_absurd & ~np.isnan(readings)).tolist():
+        return notices
+
+    def report_stuck_gauges(
+        self, begins: NDArray[np.bool_], readings: Float, still_since: Float, step: int
+    ) -> list[Notice]:
+        """Return a notice for each gauge that is found to be stuck.
+
+        Parameters
+        ----------
+        begins : (G,) array of bool
+            Whether the gauge is found to be stuck in this step.
+        readings : (G,) array
+            The readings, SI.
+        still_since : (G,) array
+            The first step in which the gauge repeated its reading.
+        step : int
+            The number of this step.
+        """
+        notices = []
+        for g in np.flatnonzero(begins).tolist():
+            since = round(float(still_since[g]))
+            reading, noise = self.wording.format_values(g, readings[g], self.noise[g])
+            sentence = (
+                f"{self._step_text(step)}: {self.wording.name_sensors([g])} is stuck: since "
+                f"{self.wording.step} {since} it shows {reading} unchanged, in spite of noise of "
+                f"{noise}; its readings are left out until they move."
+            )
+            notices.append(Notice("gauge_left_out", sentence, (g + 1,), float(readings[g]), since))
+        return notices
+
+    def report_gauges_back(
+        self, is_back: NDArray[np.bool_], readings: Float, step: int
+    ) -> list[Notice]:
+        """Return a notice for each gauge (G,) whose readings are used again."""
+        notices = []
+        for g in np.flatnonzero(is_back).tolist():
             sentence = (
                 f"{self._step_text(step)}: the readings of {self.wording.name_sensors([g])} are "
                 "back, and used again."

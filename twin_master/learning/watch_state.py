@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index, Unsigned
 from twin_master.learning.fault_kernels import Beliefs, FreeGainStatistics
 from twin_master.learning.hypothesis_weights import HypothesisWeights, MixedBelief
+from twin_master.learning.stuck_gauges import FROM_THE_START, StuckGauges
 from twin_master.network.estimator import CarriedArrays
 
 _Number = TypeVar("_Number", bound=np.floating[Any])
@@ -17,8 +18,6 @@ PREFIX = "notice/"
 """Prefix of the names of its arrays; those of the inner estimator are stored without it."""
 MODEL_KEY = f"{PREFIX}model_key"
 """Name of the array that identifies the predictions for which the state holds."""
-FROM_THE_START = 0.5
-"""Prior probability that a fault, if there is one, begins in the first step, not a later one."""
 FREE_GAIN_PROBABILITY = 0.5
 """Prior probability that a certain gauge has a gain of its own, under the fault free gains."""
 
@@ -49,7 +48,9 @@ class WatchState:
     gauge_alarm_raised, free_gains_alarm_raised : (B,) array of bool
         Whether the alarm of a kind of fault has been raised.
     left_out : (B, G) array of bool
-        Whether the last reading of a gauge was absurd.
+        Whether the last reading of a gauge was left out: absurd, or stuck.
+    stuck_gauges : StuckGauges
+        Which gauges stand still.
     followed_hypothesis : (B,) array
         The hypothesis that belief and decision follow: 0 is the model, -1 free gains, and g > 0 is
         gauge g, counted from 1.
@@ -69,6 +70,7 @@ class WatchState:
     gauge_alarm_raised: NDArray[np.bool_]
     free_gains_alarm_raised: NDArray[np.bool_]
     left_out: NDArray[np.bool_]
+    stuck_gauges: StuckGauges
     followed_hypothesis: Index
     mixed: MixedBelief
 
@@ -125,6 +127,7 @@ class WatchState:
             gauge_alarm_raised=np.zeros(twins, dtype=bool),
             free_gains_alarm_raised=np.zeros(twins, dtype=bool),
             left_out=np.zeros(by_gauge, dtype=bool),
+            stuck_gauges=StuckGauges.initial(*by_gauge),
             followed_hypothesis=np.zeros(twins, dtype=np.int64),
             mixed=MixedBelief(np.empty((twins, 0)), np.empty((twins, 0)), np.ones(twins)),
         )
@@ -191,6 +194,7 @@ class WatchState:
             "steps": self.step_count,
             "alarmed": np.array(alarms, dtype=np.float64),
             "left_out": self.left_out[0].astype(np.float64),
+            "stuck": np.concatenate(self.stuck_gauges),
             "leading": self.followed_hypothesis.astype(np.float64),
             "belief": self.mixed.belief[0],
             "rivals": self.mixed.competing[0],
@@ -255,6 +259,7 @@ class WatchState:
             gauge_alarm_raised=np.array([gauge_alarm_raised > 0.0]),
             free_gains_alarm_raised=np.array([free_gains_alarm_raised > 0.0]),
             left_out=stored_arrays["left_out"][None] > 0.0,
+            stuck_gauges=StuckGauges._make(row[None] for row in stored_arrays["stuck"]),
             followed_hypothesis=stored_arrays["leading"].astype(np.int64),
             mixed=MixedBelief(
                 stored_arrays["belief"][None],

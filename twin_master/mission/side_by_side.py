@@ -153,6 +153,7 @@ class _StatelessAssets:
         self._truth = Truth.stack(truths)
         self._previous_control: Index | None = None
         self._previous_state_index: Index | None = None
+        self._previous_sensed: Float | None = None
         # What an asset shows under a control in a state, or the sentence why it shows nothing.
         self._observations: dict[tuple[int, int, bytes], Float | str] = {}
 
@@ -195,7 +196,8 @@ class _StatelessAssets:
                     failure[failing_twin] = observation
             else:
                 observations[group] = observation
-        sensed = self._truth.sense(step, observations[group_of_twin])
+        sensed = self._truth.sense(step, observations[group_of_twin], self._previous_sensed)
+        self._previous_sensed = sensed
         inspected = self._truth.inspect(step, true_states.state, control)
         return np.hstack((sensed, inspected)), true_states.state
 
@@ -337,7 +339,9 @@ class _Formation:
             beliefs = filtered_beliefs.filtered
             unexplained = np.zeros(len(beliefs))
         else:
-            checked = self._watch.leave_out_absurd_readings(observed_rows, self._control)
+            checked = self._watch.leave_out_useless_readings(
+                self._watch_state, observed_rows, self._control
+            )
             filtered_beliefs = self._filter(step, checked.rows)
             watch_state = self._watch_gauges(self._watch, step, checked, filtered_beliefs)
             beliefs = watch_state.mixed.belief

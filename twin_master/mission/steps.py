@@ -223,6 +223,15 @@ class SensorStatus(IntEnum):
     HEALTHY = 0
     LOST = 1
     DRIFTING = 2
+    STUCK = 3
+
+
+_STATUS_OF_FAULT = {
+    "drift": SensorStatus.DRIFTING,
+    "stuck": SensorStatus.STUCK,
+    "dropout": SensorStatus.LOST,
+}
+"""The status of a sensor with a fault of each kind; a later one hides those before it."""
 
 
 class Truth:
@@ -284,20 +293,18 @@ class Truth:
     def _apply_faults(self, scenario: Scenario) -> None:
         """Set `status` and `drift` in the steps and sensors of the scenario's sensor faults."""
         steps = np.arange(scenario.mission.steps)
-        for fault in scenario.truth.sensor_faults:
+        hidden_first = [*_STATUS_OF_FAULT]
+        faults = scenario.truth.sensor_faults
+        for fault in sorted(faults, key=lambda fault: hidden_first.index(fault.kind)):
             last_step = fault.last_step if fault.last_step is not None else scenario.mission.steps
             is_active = (steps >= fault.first_step) & (steps <= last_step)
             sensors = np.array(fault.sensor_indices(scenario.observation.count))
             cells = np.ix_(is_active, sensors)
-            if fault.kind == "dropout":
-                self.status[cells] = SensorStatus.LOST
-            else:
-                assert fault.rate is not None  # the schema asks for it
+            if fault.rate is not None:  # the schema asks for it if the sensors drift
                 # The drift grows by the rate in each step, from the first step of the fault on.
                 steps_of_drift = steps[is_active] - fault.first_step + 1.0
                 self.drift[cells] += (fault.rate * steps_of_drift)[:, None]
-                is_lost = self.status[cells] == SensorStatus.LOST
-                self.status[cells] = np.where(is_lost, SensorStatus.LOST, SensorStatus.DRIFTING)
+            self.status[cells] = _STATUS_OF_FAULT[fault.kind]
 
     def state(self, step: int, previous_state: Float | None, previous_control: int | None) -> Float:
         """Return the true state of a step.
@@ -338,14 +345,36 @@ class Truth:
             setattr(stacked, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
         return stacked
 
-    def sense(self, step: int, observation: Float) -> Float:
-        """Return an observation (..., G) with noise and drift, and NaN for lost sensors."""
+    def sense(self, step: int, observation: Float, previous: Float | None) -> Float:
+        """Return an observation (..., G) with noise and drift, and the faults of its sensors.
+
+        Parameters
+        ----------
+        step : int
+            The step, from 0.
+        observation : (..., G) array
+            The observation without noise, SI.
+        previous : (..., G) array or None
+            What was sensed in the step before, SI; None in the first step.
+
+        Returns
+        -------
+        (..., G) array
+            The sensed values, SI. A lost sensor has NaN, and a stuck one its value of the step
+            before, if it had any.
+        """
         sensed: Float = observation + self.noise[step] + self.drift[step]
+        if previous is not None:
+            is_held = (self.status[step] == SensorStatus.STUCK) & ~np.isnan(previous)
+            sensed = np.where(is_held, previous, sensed)
         sensed[..., self.status[step] == SensorStatus.LOST] = np.nan
         return sensed
 
     def noise_free(self, step: int, sensed: Float) -> Float:
-        """Return sensed values (G,) without noise and drift, up to rounding; 0 for lost sensors."""
+        """Return sensed values (G,) without noise and drift, up to rounding; 0 for lost sensors.
+
+        Stuck sensors have any value.
+        """
         return np.asarray(np.nan_to_num(sensed - self.drift[step] - self.noise[step]))
 
     def inspect(self, step: int, state: Float, control: Index | int) -> Float:
@@ -492,6 +521,7 @@ class Plant:
         self._truth = truth
         self._asset = asset
         self._state: Float | None = None
+        self._sensed: Float | None = None
         self.step = 0
         self.reason_of_end = ""
 
@@ -558,9 +588,10 @@ class Plant:
         observation = checked_observation(self._scenario, reading, self.step, control.name)
         sensed = reading.sensed
         if sensed is None:
-            sensed = self._truth.sense(self.step, observation)
+            sensed = self._truth.sense(self.step, observation, self._sensed)
         inspected = self._truth.inspect(self.step, state, control_index)
         self._state = state
+        self._sensed = sensed
         self.step += 1
         monitors = {name: float(value) for name, value in reading.monitors.items()}
         return Reading(
@@ -590,4 +621,5 @@ class Plant:
         """Continue after the steps of a history, from the state that the asset had then."""
         self.step = len(flown_history.steps)
         self._state = flown_history.state[-1]
+        self._sensed = flown_history.observed[-1]
         self._asset.restore_state(asset_state)

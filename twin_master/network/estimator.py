@@ -150,7 +150,7 @@ class Suspicion:
     log_evidence_gauge : (G,) array
         The log e-value of each sensor.
     left_out : (G,) array of bool
-        Whether the readings of a sensor are absurd and left out.
+        Whether the readings of a sensor are left out: absurd, or stuck.
     hypotheses : dict of str to float
         The probability of each hypothesis by name, see `Hypothesis`.
     decided_by : str

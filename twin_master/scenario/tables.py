@@ -197,8 +197,8 @@ class SensorFault(Span):
     """A fault of some sensors, numbered from 1, in a span of steps."""
 
     units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
-    kind: Literal["dropout", "drift"]
-    """Whether the sensors deliver nothing, or drift."""
+    kind: Literal["dropout", "drift", "stuck"]
+    """Whether the sensors deliver nothing, drift, or repeat their last reading."""
     sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
     """The sensors, numbered from 1, or "all"."""
     rate: Number | None = None
@@ -211,7 +211,7 @@ class SensorFault(Span):
         has_rate = self.rate is not None
         yield (
             needs_rate != has_rate,
-            "a drift needs `rate_microstrain_per_step`, and a dropout has none",
+            "a drift needs `rate_microstrain_per_step`, and other faults have none",
         )
 
     def sensor_indices(self, sensor_count: int) -> list[int]:
@@ -501,7 +501,7 @@ less makes no sense."""
 class Noticing(Section):
     """When an alarm is raised.
 
-    The belief stays as it is, except that implausible readings are left out.
+    The belief stays as it is, except that implausible and stuck readings are left out.
     """
 
     units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "all_gain": "percent"}
@@ -521,6 +521,8 @@ class Noticing(Section):
     absurd_deviations: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=3.0)] = 8.0
     """A reading is left out if it is so many assumed standard deviations beyond the readings of all
     states [1]."""
+    still_deviations: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.001
+    """A reading that moves by at most so many assumed standard deviations stands still [1]."""
     prior: Annotated[float, Field(strict=True, gt=0.0, lt=0.5)] = 0.01
     """Prior probability of each of the two kinds of fault, for their posterior [1]."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0

@@ -14,7 +14,8 @@ from twin_master.mission import side_by_side
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.steps import Truth
-from twin_master.scenario.tables import Noticing
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.tables import Noticing, SensorFault
 
 SEEDS = 4
 SOUND = np.ones(24)
@@ -50,7 +51,10 @@ class WatchedFleet:
 
 
 def watched_fleet(name, library_file) -> WatchedFleet:
-    knowledge, source = of_library(name, library_file, notice=Noticing())
+    """Return the fleet of a scenario, in which gauge 20 is stuck in steps 8 to 18."""
+    stuck = SensorFault(kind="stuck", sensors=(20,), first_step=8, last_step=18)
+    truth = load_scenario(name).scenario.truth.model_copy(update={"sensor_faults": (stuck,)})
+    knowledge, source = of_library(name, library_file, notice=Noticing(), truth=truth)
     asset = source.open()
     truths = [knowledge.truth(seed) for seed in range(4 * SEEDS)]
     for truth in truths[3 * SEEDS :]:
@@ -99,6 +103,14 @@ def test_the_fleet_has_notices_of_all_kinds_that_faults_cause(both_ways):
     assert "alarm" not in both_ways.kinds(0)
     assert {"alarm", "hypothesis"} <= both_ways.kinds(1)
     assert {"gauge_left_out", "gauge_back"} <= both_ways.kinds(3)
+
+
+def test_each_twin_of_the_fleet_finds_its_stuck_gauge(both_ways):
+    for notices in both_ways.together.notices:
+        of_gauge = [(step, notice.kind) for step, notice in notices if notice.sensors == (20,)]
+        assert of_gauge[0][1] == "gauge_left_out"
+        assert 10 <= of_gauge[0][0] <= 12
+        assert (19, "gauge_back") in of_gauge
 
 
 def test_no_state_is_believed_where_no_state_explains_the_gauges(both_ways):

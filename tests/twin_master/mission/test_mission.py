@@ -42,6 +42,7 @@ from twin_master.mission.steps import History, MissionStep, Plant, SensorStatus,
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import SensorFault
 from twin_master.seeds import PURPOSES, generator
 from uav_twin import ScenarioEnvironment, fly_fleet, open_fleet, open_run, resume
 from uav_twin import fly as new_run
@@ -68,14 +69,25 @@ def part(known: Known, folder: Path, config_hash: str = "abc", kind: type[Plant]
         return fly(knowledge.scenario, before.twin, plant, journal_sink(file, plant), history=before)
 
 
-RESUMED = ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"]
+STUCK_GAUGE = SensorFault(kind="stuck", sensors=(5,), first_step=14, last_step=30)
+RESUMED = ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning", "stuck gauge"]
+
+
+def known_of(name: str, library: Path) -> Known:
+    """Return what is known of a shipped scenario, or of level turns with a stuck gauge."""
+    if name != "stuck gauge":
+        return of_library(name, library)
+    truth = load_scenario("level_turns").scenario.truth
+    return of_library(
+        "level_turns", library, truth=truth.model_copy(update={"sensor_faults": (STUCK_GAUGE,)})
+    )
 
 
 class WholeFlight:
     """A mission that was flown in one go, with its journal."""
 
     def __init__(self, name: str, library: Path, folder: Path) -> None:
-        self.known = of_library(name, library)
+        self.known = known_of(name, library)
         self.flight = part(self.known, folder)
         self.journal = (folder / JOURNAL_NAME).read_bytes()
         self.folder = folder
@@ -232,11 +244,22 @@ def test_faults_of_gauges_are_sensed_and_leave_the_quantity():
     without_noise = {"truth": {"noise": {"standard_deviation_microstrain": 0}}}
     truth = truth_of(changed_scenario("failing_gauges", without_noise).scenario)
     quantity = np.full(24, 1e-3)
-    sensed = truth.sense(13, quantity)
+    sensed = truth.sense(13, quantity, None)
     assert np.isnan(sensed[16:20]).all()
     assert sensed[11] == pytest.approx(1e-3 + 36e-6)
-    assert np.isnan(truth.sense(36, quantity)).all()
+    assert np.isnan(truth.sense(36, quantity, sensed)).all()
     np.testing.assert_array_equal(quantity, 1e-3)
+
+
+def test_a_stuck_gauge_shows_the_reading_before_until_it_moves(library_file):
+    knowledge, source = known_of("stuck gauge", library_file)
+    flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(knowledge.truth(3), source.open()))
+
+    stands_still = np.diff(flight.observed, axis=0) == 0.0
+
+    assert [np.flatnonzero(of_gauge).tolist() for of_gauge in stands_still.T] == [
+        [*range(13, 30)] if gauge == 4 else [] for gauge in range(24)
+    ]
 
 
 class Heavy(Plant):
