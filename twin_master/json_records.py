@@ -94,10 +94,14 @@ class ObservationMessage(TypedDict):
     begin with `_` are ignored.
     """
 
-    step: NotRequired[int]
-    """Number of the step, from 0; without `step` and `time` it is the next one."""
-    time: NotRequired[float]
-    """Time of the step, in place of `step` [unit of `watch.time_unit`]."""
+    step: NotRequired[float | str]
+    """Whole number of the step, also in quotes; the first message says where counting begins.
+    Without `step` and `time` the message is the next step.
+    """
+    time: NotRequired[float | str]
+    """Time of the step, in place of `step`: a number in the unit of `watch.time_unit`, also in
+    quotes, or a date and time by ISO 8601, which is in UTC if it has no offset.
+    """
     control: NotRequired[str]
     """The control in force; by default the proposed one."""
     unit: NotRequired[str]

@@ -153,7 +153,7 @@ def _unpack_intake(packed: JsonObject) -> JsonObject:
         return packed  # of an earlier version
     statuses = [digit * int(count) for digit, count in _RUN_OF_STATUSES.findall(packed["given"])]
     return {
-        **{"origin": None, "source": None},
+        **{"clock": None, "counter": None, "source": None},
         **packed,
         "counts": dict.fromkeys(_COUNTS, 0) | packed["counts"],
         "given": "".join(statuses),

@@ -541,6 +541,10 @@ NoticingOrNot = Annotated[
 """The table, or `notice = false`."""
 
 
+Between = Literal["steps", "rest"]
+"""What happens between two messages of a watched asset."""
+
+
 class WatchSection(FileSection):
     """How a real asset is watched."""
 
@@ -551,8 +555,15 @@ class WatchSection(FileSection):
     """Number of past steps over which the twin smooths; a message may be late by this number of
     steps.
     """
+    between: Between | None = None
+    """What happens between messages: "steps" go on, or the asset is at "rest", where nothing wears
+    and no step is counted. By default it rests where messages have a time, and steps go on where
+    they have a step.
+    """
     longest_gap: Count = 1000
-    """Steps that a message may be ahead of the next one; the twin predicts those between."""
+    """Steps that a message may be ahead of the next one; beyond them counting begins anew."""
+    every: Count = 1
+    """One in this number of messages is taken, where the logger sends so many in a step."""
     seconds_per_step: Positive | None = None
     """Length of a step, for messages that have a time and no step [s]."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"

@@ -2,7 +2,7 @@
 
 import csv
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -11,25 +11,11 @@ from reporting.former_names import warn_of_former_names
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.lines import Position, first_line, rotated_files
-from twin_master.watch.message import PRESENT_NAMES, MessageContent, Refused
+from twin_master.watch.message import OTHER_KEYS, PRESENT_NAMES, MessageContent, Refused
 from twin_master.watch.recorded_feeds import RecordedFeed
 
-
-def _parse_whole_number(cell: str) -> int:
-    """Return the whole number in a cell; `12.0`, as floating-point tables write it, is 12."""
-    digits, point, decimals = cell.partition(".")
-    is_whole = point and not decimals.strip("0")
-    return int(digits if is_whole else cell)
-
-
-_CONVERSIONS: dict[str, Callable[[str], object]] = {
-    "step": _parse_whole_number,
-    "time": float,
-    "control": str,
-}
-"""The columns that are not sensors, with the conversion of their cells."""
 _MISSING_VALUES = ("nan", "null", "none")
-"""Cells of these columns that mean that there is no value."""
+"""Cells of the columns that are not sensors which mean that there is no value."""
 
 
 class CsvFeed(RecordedFeed):
@@ -102,7 +88,7 @@ class CsvFeed(RecordedFeed):
 
     def _is_column(self, name: str) -> bool:
         """Return whether a name is that of a sensor, or of another column."""
-        return name in _CONVERSIONS or self.reader.find_column(name) is not None
+        return name in OTHER_KEYS or self.reader.find_column(name) is not None
 
     def _set_columns(self, names: Sequence[str]) -> None:
         """Check the names of columns, and use them for the rows that follow.
@@ -128,7 +114,7 @@ class CsvFeed(RecordedFeed):
                 "and `control`."
             ) from None
         occurrences = Counter(columns)
-        has_double_column = any(occurrences[name] > 1 for name in _CONVERSIONS)
+        has_double_column = any(occurrences[name] > 1 for name in OTHER_KEYS)
         if len(set(sensors)) < len(sensors) or has_double_column:
             raise MissionInputError(
                 f"{self.path}: two columns stand for the same value, and only one of them is "
@@ -147,7 +133,7 @@ class CsvFeed(RecordedFeed):
         sensors = []
         unknown_names = []
         for name in columns:
-            if name in _CONVERSIONS or name.startswith("_"):
+            if name in OTHER_KEYS or name.startswith("_"):
                 continue
             column = self.reader.find_column(name)
             if column is None:
@@ -183,19 +169,15 @@ class CsvFeed(RecordedFeed):
                 return None
         if len(cells) != len(self._columns):
             return Refused(f"{len(self._columns)} cells are expected, but {len(cells)} were given")
-        try:
-            return self._record_of(cells)
-        except (ValueError, OverflowError) as error:
-            return Refused(f"a cell is not a number: {str(error)[:80]}")
+        return self._record_of(cells)
 
     def _record_of(self, cells: Sequence[str]) -> dict[str, object]:
         """Return the value of each column in a row; columns without a value are left out."""
         record: dict[str, object] = {}
         for name, cell in zip(self._columns, cells, strict=True):
-            is_missing = name in _CONVERSIONS and cell.lower() in _MISSING_VALUES
+            is_missing = name in OTHER_KEYS and cell.lower() in _MISSING_VALUES
             if cell and not is_missing:
-                convert = _CONVERSIONS.get(name, str)
-                record[name] = convert(cell)
+                record[name] = cell
         return record
 
 

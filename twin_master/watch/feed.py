@@ -20,6 +20,8 @@ class Feed:
 
     replayable = False
     """Whether a resumed watch can read the messages again from the beginning of the feed."""
+    has_every_message = True
+    """Whether the feed gives all messages of a logger, of which `watch.every` may thin out."""
     position: Position | None = None
     """The position after the message that was given last, if the feed is a file."""
 

@@ -24,7 +24,7 @@ from twin_master.watch.lines import Position
 from twin_master.watch.message import FeedItem, Message, Refused
 from twin_master.watch.rejected import RejectedFile
 from twin_master.watch.step_status import StepStatus
-from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices, unit_advice
+from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices
 
 POLL_SECONDS = 0.05
 """Seconds between two looks at a feed that may go on."""
@@ -36,6 +36,9 @@ KEPT_SNAPSHOT_STEPS = 2_048
 This is a multiple of `SNAPSHOT_STEPS`. The steps since such a line are filtered again, at 1 to 4 ms
 each, to store or try again what is older than the last steps.
 """
+
+_KINDS_OF_TIMES = ("begin", "pause", "clock", "rate")
+"""The notices about the times of messages, which hold also if a message is refused later."""
 
 
 @dataclass
@@ -89,7 +92,8 @@ class _EndRequested(BaseException):
 class Intake:
     """The messages of a feed as the source of observations of a twin.
 
-    A message belongs to the step that it names, or to that of its time, or to the next one. A
+    A message belongs to the step that it names, or to that of its time, or to the next one; both
+    count from the first message. A
     message about a step that was received before must agree with it: readings that the step lacks
     are taken in, and a contradiction is refused. What was received can never be changed.
 
@@ -130,7 +134,9 @@ class Intake:
         self._section = scenario.watch
         self._words = NoticeWording.of(scenario)
         self._width = scenario.row_width
-        self._clock = Clock(scenario.watch)
+        section = scenario.watch
+        self._clock = Clock(section, section.seconds_per_step, section.between or "rest")
+        self._counter = Clock(section, section.every, section.between or "steps", counts_steps=True)
 
         # The feed, and the positions after the last message and after the one before it
         self._feed = feed
@@ -185,11 +191,10 @@ class Intake:
         state: JsonObject = {
             "counts": vars(self.counts) | {"received": received_count},
             "given": "".join(str(int(status)) for status in self._statuses),
-            "origin": self._clock.origin,
+            "clock": self._clock.state(),
+            "counter": self._counter.state(),
             "source": self._previous_position if is_read_again else self._position,
         }
-        if self._clock.only_step is not None:
-            state["first_timed"] = self._clock.only_step
         if self._unreadable:
             state["unreadable"] = sorted(self._unreadable)
         stream_state = self.stream.state(waiting=is_read_again)
@@ -252,8 +257,8 @@ class Intake:
         feed_is_read_again = self._feed.replayable
         if state is not None:
             self.counts = Counts(**state["counts"])
-            self._clock.origin = state["origin"]
-            self._clock.only_step = state.get("first_timed")
+            self._clock.restore(state.get("clock"))
+            self._counter.restore(state.get("counter"))
             self._statuses.extend(StepStatus(int(digit)) for digit in state["given"])
             self._unreadable = set(state.get("unreadable", ()))
             self.stream.restore(state.get("stream", {}))
@@ -323,6 +328,8 @@ class Intake:
         self._messages_received += 1
         self._previous_position = self._position
         self._position = self._feed.position
+        if self._feed.has_every_message and (self.counts.received - 1) % self._section.every:
+            return True
         step: int | None = None
         try:
             if isinstance(message, Refused):
@@ -330,6 +337,8 @@ class Intake:
             step = self._step_of(twin, message)
             self._enqueue(twin, message, step)
         except Refused as refusal:
+            if isinstance(message, Message):
+                self._note_time(message, is_assimilated=False)
             self._refuse(str(refusal), step)
         return True
 
@@ -358,6 +367,8 @@ class Intake:
         self._previous_unreadable = self._unreadable
         self._previous_stream_state = self.stream.state(waiting=False)
         self.notices = self._note_unreadable_sensors(reading)
+        if isinstance(reading, Message):
+            self._note_time(reading, is_assimilated=True)
         if queued.status is StepStatus.MISSING:
             self.notices += self.stream.pop_pending()
         else:
@@ -481,8 +492,8 @@ class Intake:
         self._unreadable = self._previous_unreadable
         self._messages_with_readings -= 1
         self._refuse(str(error), self.observation_step)
-        # Only the notice that two times disagree still holds
-        self.notices = [notice for notice in self.notices if notice.kind == "clock"]
+        # Only the notices about the times of messages still hold
+        self.notices = [notice for notice in self.notices if notice.kind in _KINDS_OF_TIMES]
         if reading.revises is not None:
             return Reading(self._row_before_revision, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)
@@ -497,13 +508,30 @@ class Intake:
         """Return the step of a message.
 
         It is the step that the message names, or else the step at the time that the message names,
-        or else the next step of the twin.
+        or else the next step of the twin. A late message belongs to the nearest step that it does
+        not contradict.
         """
-        if message.step is not None:
-            return message.step
-        if message.time is None:
+        clock, time = self._time_of(message)
+        if time is None:
             return twin.steps
-        return self._clock.step_of(message.time, twin.steps, self.stream)
+        steps = clock.steps_at(time, twin.steps, self.stream)
+        for step in steps:
+            is_kept = twin.first_kept <= step < twin.steps
+            if is_kept and not self._contradiction(twin, message, step):
+                return step
+        return steps[0]
+
+    def _time_of(self, message: Message) -> tuple[Clock, float | None]:
+        """Return the clock that places a message, with the time of the message by this clock."""
+        if message.step is not None:
+            return self._counter, message.step
+        return self._clock, message.time
+
+    def _note_time(self, message: Message, *, is_assimilated: bool) -> None:
+        """Note the time of a message that was assimilated or refused; see `Clock.note_time`."""
+        clock, time = self._time_of(message)
+        if time is not None:
+            clock.note_time(time, is_assimilated=is_assimilated, stream=self.stream)
 
     def _enqueue(self, twin: Twin, message: Message, step: int) -> None:
         """Put a message into the queue of readings.
@@ -514,15 +542,9 @@ class Intake:
         Raises
         ------
         Refused
-            If the step is too far ahead or too late, or if the message contradicts an earlier one.
+            If the step is too late, or if the message contradicts an earlier one.
         """
         steps_ahead = step - twin.steps
-        if steps_ahead > self._section.longest_gap:
-            raise Refused(
-                f"step {step} is {steps_ahead} steps ahead of the next one, {twin.steps}, and "
-                f"`watch.longest_gap` is {self._section.longest_gap}"
-                f"{unit_advice(self._likely_unit(twin, message))}"
-            )
         if step < twin.first_kept and steps_ahead < 0:
             raise Refused(
                 f"step {step} is {-1 - steps_ahead} steps late, and `watch.lag` is "
@@ -560,16 +582,11 @@ class Intake:
         Refused
             If the message contradicts a reading or the control that was received of the step.
         """
+        contradiction = self._contradiction(twin, message, step)
+        if contradiction:
+            raise Refused(contradiction)
         row = twin.observed(step)
-        is_in_both = ~np.isnan(row) & ~np.isnan(message.observed)
-        if not np.array_equal(row[is_in_both], message.observed[is_in_both]):
-            raise Refused(f"it contradicts what was received of step {step} before")
         has_other_control = message.control not in (None, twin.control_of(step))
-        if has_other_control:
-            # Negative index: the last status belongs to the last step of the twin
-            former_status = self._statuses[step - twin.steps]
-            if former_status is StepStatus.WITH_CONTROL:
-                raise Refused(f"it contradicts the control of step {step}")
         merged_row = np.where(np.isnan(row), message.observed, row)
         if not has_other_control and np.array_equal(merged_row, row, equal_nan=True):
             self.counts.duplicates += 1
@@ -578,3 +595,16 @@ class Intake:
         self._row_before_revision = row
         revision = replace(message, observed=merged_row, revises=step)
         self._queue.append(_QueuedReading(step, revision, status))
+
+    def _contradiction(self, twin: Twin, message: Message, step: int) -> str:
+        """Return in which way a message contradicts what was received of a step; empty if not."""
+        row = twin.observed(step)
+        is_in_both = ~np.isnan(row) & ~np.isnan(message.observed)
+        if not np.array_equal(row[is_in_both], message.observed[is_in_both]):
+            return f"it contradicts what was received of step {step} before"
+        has_other_control = message.control not in (None, twin.control_of(step))
+        # Negative index: the last status belongs to the last step of the twin
+        has_control = self._statuses[step - twin.steps] is StepStatus.WITH_CONTROL
+        if has_other_control and has_control:
+            return f"it contradicts the control of step {step}"
+        return ""

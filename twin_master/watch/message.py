@@ -8,7 +8,9 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from difflib import get_close_matches
 from functools import lru_cache
 from typing import NamedTuple
@@ -350,21 +352,40 @@ class MessageReader:
             raise Refused(self.describe_unknown(list(readings.ignored), has_sensors=has_sensors))
 
     def _read_step(self, value: object) -> int | None:
-        """Return the step of a message; None if it names none."""
+        """Return the step of a message, a whole number in any form; None if it names none."""
         if value is None:
             return None
-        if type(value) is not int or not 0 <= value <= LARGEST_SEED:
+        step = value
+        if isinstance(value, str):
+            with suppress(ValueError):
+                step = int(value) if value.isdecimal() else float(value)
+        if isinstance(step, float) and step.is_integer():
+            step = int(step)
+        if type(step) is not int or not 0 <= step <= LARGEST_SEED:
             raise Refused(f"`step` is a whole number from 0, but {value!r:.40} was given")
-        return value
+        return step
 
     def _read_time(self, value: object) -> float | None:
-        """Return the time of a message [s]; None if it names none."""
+        """Return the time of a message [s]; None if it names none.
+
+        It is a number in the unit of the scenario, also in quotes, or a date and time by ISO 8601,
+        which counts from 1970 and is in UTC if it has no offset.
+        """
         if value is None:
             return None
-        time = float(value) if type(value) is int else value
-        if not isinstance(time, float) or not math.isfinite(time):
-            raise Refused("`time` is a number")
-        return time / self._units_per_second
+        time = math.nan
+        with suppress(ValueError, OverflowError):
+            if isinstance(value, int | float | str) and not isinstance(value, bool):
+                time = float(value) / self._units_per_second
+        if isinstance(value, str) and math.isnan(time):
+            with suppress(ValueError):
+                time = _seconds_of_date(value)
+        if not math.isfinite(time):
+            raise Refused(
+                "`time` is a number, or a date and time such as 2026-03-31T10:00:00Z, but "
+                f"{value!r:.40} was given"
+            )
+        return time
 
     def _read_control(self, value: object) -> int | None:
         """Return the index of the control in a message; None if it names none."""
@@ -454,6 +475,14 @@ class MessageReader:
         if is_strain and column.factor == 1.0:
             advice = f"; give its unit, such as `strain_{column.sensor + 1}_microstrain`"
         return f"{number:g}{advice}"
+
+
+def _seconds_of_date(text: str) -> float:
+    """Return a date and time by ISO 8601 in seconds since 1970; UTC if it has no offset."""
+    moment = datetime.fromisoformat(text.strip().removesuffix("UTC").rstrip())
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return moment.timestamp()
 
 
 @lru_cache(maxsize=1000)

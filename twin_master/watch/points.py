@@ -100,8 +100,6 @@ def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
 
 def _add_value(record: TimedRecord, name: str, value: FieldValue) -> None:
     """Add a value to a record, and refuse it if the record has another one under its name."""
-    if name == "step" and isinstance(value, float) and value.is_integer():
-        value = int(value)  # a number of line protocol without a type is floating-point
     former_value = record.values.setdefault(name, value)
     if former_value is not value and former_value != value:
         raise Refused(

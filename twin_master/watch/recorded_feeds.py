@@ -157,6 +157,8 @@ class RunFeed(RecordedFeed):
         If the file cannot be read, or has other sensors or controls than the scenario.
     """
 
+    has_every_message = False
+
     def __init__(self, path: Path, scenario: Scenario) -> None:
         super().__init__(path, scenario)
         role = scenario.observation.role
@@ -246,6 +248,7 @@ class FolderFeed(RecordedFeed):
         If the folder has no journal.
     """
 
+    has_every_message = False
     longest_line = math.inf
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:

@@ -29,7 +29,7 @@ def unit_advice(unit: str) -> str:
 
 
 class StreamNotices:
-    """Notices about the messages of a stream: gaps, clocks, refusals, and names of no sensor.
+    """Notices about the messages of a stream: gaps, pauses, clocks, refusals, unknown names.
 
     Parameters
     ----------
@@ -125,37 +125,136 @@ class StreamNotices:
         notice = Notice("gap", f"{sentence}{unit_advice(unit)}.", value=float(count))
         self._pending.append(notice)
 
-    def note_clock_jump(self, next_step: int, distance: float, unit: str) -> None:
-        """Add a notice that the time of a message lies too far from the only time before it.
+    def note_begin(self, step: int, number: int) -> None:
+        """Add a notice that the publisher counts its messages from another number.
 
-        The caller takes such a message as the next step. A further jump is not reported until two
-        times agree.
+        Parameters
+        ----------
+        step : int
+            The step of the first message that has a number.
+        number : int
+            This number.
+        """
+        step_name = self._words.step
+        sentence = (
+            f"{step_name.capitalize()} {step}: counting begins with this message, which calls "
+            f"itself {step_name} {number}."
+        )
+        self._pending.append(Notice("begin", sentence, value=float(number)))
+
+    def note_pause(self, next_step: int, steps: int, unit: str) -> None:
+        """Add a notice that the asset is taken to have rested while no message came.
+
+        A further pause is not reported until two messages follow each other without one.
+
+        Parameters
+        ----------
+        next_step : int
+            The next step, which is that of the message after the pause.
+        steps : int
+            The length of the pause in steps.
+        unit : str
+            The unit that the times seem to have; empty if the stated unit fits.
+        """
+        if self._clock_is_reported:
+            return
+        self._clock_is_reported = True
+        step_name = self._words.step
+        sentence = (
+            f"{step_name.capitalize()} {next_step}: the message came after a pause of {steps} "
+            f"{step_name}s, in which the asset is taken to have rested, so that nothing has worn; "
+            f'where {step_name}s go on without messages, give `watch.between = "steps"`'
+            f"{unit_advice(unit)}."
+        )
+        self._pending.append(Notice("pause", sentence, value=float(steps)))
+
+    def note_rate(self, interval: float, step_length: float) -> None:
+        """Add a notice that the logger sends at another rate than that of the steps.
+
+        Parameters
+        ----------
+        interval : float
+            The mean interval between two messages [s].
+        step_length : float
+            The length of a step [s].
+        """
+        step_name = self._words.step
+        if interval < step_length:
+            count = round(step_length / interval)
+            consequence = f"so that of {count} messages one is taken and the others are refused"
+            remedy = (
+                f"give `watch.every = {count}` to take one in {count}, let the logger send means "
+                f"over a {step_name}, or correct `watch.seconds_per_step`"
+            )
+        else:
+            consequence = f"so that most {step_name}s have no message"
+            remedy = (
+                f"give `watch.seconds_per_step = {interval:.4g}`, with the transitions of such a "
+                f"{step_name}, or let the logger send more often"
+            )
+        sentence = (
+            f"A message comes every {interval:.4g} s, and a {step_name} takes {step_length:.4g} s, "
+            f"{consequence}: {remedy}."
+        )
+        self._pending.append(Notice("rate", sentence, value=interval))
+
+    def note_clock_jump(
+        self,
+        next_step: int,
+        distance: float,
+        unit: str,
+        *,
+        noun: str,
+        widening: int,
+        rests: bool,
+    ) -> None:
+        """Add a notice that a message lies too far from the one before it.
+
+        The caller takes such a message as a new beginning. A further jump is not reported until two
+        messages agree.
 
         Parameters
         ----------
         next_step : int
             The next step.
         distance : float
-            The number of steps by which the time lies after the only one before it; negative if
-            it lies earlier.
+            The number of steps by which the message lies after the one before it; negative if it
+            lies earlier.
         unit : str
             The unit that the times seem to have.
+        noun : str
+            What the message is counted by, its time or its number.
+        widening : int
+            The number of steps through which the belief is predicted before the message.
+        rests : bool
+            Whether the asset rests between messages.
         """
         if self._clock_is_reported:
             return
         self._clock_is_reported = True
         step_name = self._words.step
         side = "behind" if distance > 0.0 else "before"
-        cause = unit_advice(unit) or "; see whether the clock of the logger was set"
+        cause = unit_advice(unit) or f"; see whether the {noun} of the logger was set"
+        belief = "with the belief as it was"
+        remedy = ""
+        if widening:
+            belief = f"and the belief is predicted over {widening} {step_name}s by the transitions"
+            remedy = ' If the asset has rested, give `watch.between = "rest"`.'
+        elif rests and not unit:
+            remedy = (
+                " If the asset was in service meanwhile, give `watch.longest_gap` and "
+                '`watch.between = "steps"`.'
+            )
         sentence = (
-            f"{step_name.capitalize()} {next_step}: the time of the message lies "
-            f"{abs(distance):.4g} {step_name}s {side} that of the message before{cause}. Until two "
-            f"times agree, each message is taken as the next {step_name}, and no gap can be seen."
+            f"{step_name.capitalize()} {next_step}: the {noun} of the message lies "
+            f"{abs(distance):.4g} {step_name}s {side} that of the message before{cause}. Counting "
+            f"begins anew with this message, {belief}. Until two messages agree, each is taken as "
+            f"the next {step_name}, and no gap can be seen.{remedy}"
         )
         self._pending.append(Notice("clock", sentence))
 
     def note_clock_agreement(self) -> None:
-        """Note that two times agree, so that a later jump of the clock is reported again."""
+        """Note that two messages agree, so that a later pause or jump is reported again."""
         self._clock_is_reported = False
 
     def note_refusal(self, step: int | None, reason: str) -> None:

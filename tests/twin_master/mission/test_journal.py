@@ -46,7 +46,8 @@ LEARNT = {
 INTAKE = {
     "counts": {"received": 7, "missing": 1, "late": 0, "duplicates": 0, "rejected": 0},
     "given": "2220112",
-    "origin": None,
+    "clock": None,
+    "counter": {"stretches": [[0, 5, False]], "latest": 9, "rate": None, "rate_is_reported": False},
     "source": {"beginning": "0123456789abcdef", "read": 9},
 }
 RECORDS = [
@@ -54,7 +55,7 @@ RECORDS = [
     {"step": 3, "filtered": [0.0, 0.25, 0.75], "decision_probability": [1.0, 0.0]},
     {"step": 3, "filtered": np.random.default_rng(1).dirichlet(np.ones(125)).tolist()},
     {"step": 3, "observed": [1.0], "observation_step": 3, "intake": INTAKE},
-    {"step": 3, "observed": [1.0], "observation_step": 1, "intake": INTAKE | {"given": "", "origin": 2.5}},
+    {"step": 3, "observed": [1.0], "observation_step": 1, "intake": INTAKE | {"given": ""}},
     {"step": 3, "suspicion": {"none_of_these": 0.25, "hypotheses": {"none of these": 0.25}}},
     {"step": 3, "suspicion": {"none_of_these": 0.5, "hypotheses": {"none of these": 0.25}}},
     {"group": 1, "rows": [0, 4], "failures": {}},

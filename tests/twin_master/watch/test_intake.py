@@ -270,7 +270,7 @@ def test_a_missing_time_is_a_missing_step(timed, timed_lines, strains):
     np.testing.assert_array_equal(twin.observed(7), strains[7])
 
 
-@pytest.mark.parametrize("time", [b"1700000500", b"1.6e9", b"1.7e308"])
+@pytest.mark.parametrize("time", [b"1.6e9", b"1.7e308"])
 def test_a_clock_that_two_steps_contradict_is_refused_also_after_the_watch_is_taken_up(
     timed, timed_lines, time
 ):
@@ -361,7 +361,7 @@ def test_cells_without_a_unit_or_a_finite_number_are_unreadable(csv):
 def test_a_step_is_a_whole_number(csv):
     whole, half = csv.messages("step,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n")
     assert (whole.step, whole.observed[0]) == (12, 1e-4)
-    assert "not a number" in str(half)
+    assert "`step` is a whole number" in str(half)
 
 
 def test_cells_without_an_end_and_other_bytes_are_refused(csv):

@@ -81,17 +81,18 @@ def test_times_in_a_stated_unit_show_gaps(watch, mission, unit, factor):
     assert kinds(decisions) == [(2, "gap")]
 
 
-def test_a_clock_that_changes_its_unit_is_refused_and_the_unit_is_named(watch, mission):
+def test_a_clock_that_changes_its_unit_is_counted_anew_and_the_unit_is_named(watch, mission):
     with_section(watch, seconds_per_step=1.0)
     messages = [line(mission, step, time=100.0 + step) for step in range(3)]
     messages += [line(mission, step, time=1000.0 * (100.0 + step)) for step in range(3, 7)]
     decisions = decisions_of(watch, messages)
-    assert kinds(decisions) == [(2, "refused")]
-    assert 'its times look like milliseconds: give `watch.time_unit = "ms"`' in sentence(decisions, "refused")
+    assert [decision["step"] for decision in decisions] == list(range(7))
+    assert kinds(decisions) == [(3, "clock")]
+    assert 'its times look like milliseconds: give `watch.time_unit = "ms"`' in sentence(decisions, "clock")
 
 
-def test_a_gap_of_a_clock_that_is_known_is_a_gap_however_long(watch, mission):
-    with_section(watch, seconds_per_step=1.0)
+def test_a_gap_of_a_clock_that_is_known_is_a_gap_however_long_where_steps_go_on(watch, mission):
+    with_section(watch, seconds_per_step=1.0, between="steps")
     messages = [line(mission, number, time=time) for number, time in enumerate([0.0, 1.0, 1001.0])]
     decisions = decisions_of(watch, messages)
     assert decisions[-1]["step"] == 1001
