@@ -70,6 +70,27 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert [assets[name]["last"]["step"] for name in WINGS] == [STEPS - 1] * 3
 
 
+def beliefs(folder: Path) -> list[Any]:
+    return [line["filtered"] for line in journal(folder) if "filtered" in line]
+
+
+def test_an_asset_of_a_fleet_may_pause_and_another_may_count_from_anywhere(fleet_file, alone, tmp_path):
+    """The first wing rests for an hour, and the numbers of the second begin at 5000."""
+    scenario = tmp_path / "wing.toml"
+    scenario.write_text(scenario.read_text() + "\n[watch]\nseconds_per_step = 1.0\n")
+    header, *rows = log_of(tmp_path, 0).read_text().splitlines()
+    times = ["0", "1", "2", "3603", "3604", "3605"]
+    lines = [header.replace("step", "time", 1)]
+    lines += [row.replace(row[0], time, 1) for time, row in zip(times, rows, strict=True)]
+    log_of(tmp_path, 0).write_text("\n".join(lines) + "\n")
+    offset = re.sub(r"(?m)^(?=\d,)", "500", log_of(tmp_path, 1).read_text())
+    log_of(tmp_path, 1).write_text(offset)
+    for stop in (2, 9, None):
+        watched(fleet_file, tmp_path / "fleet", stop)
+    for name in ("wing-0", "wing-1"):
+        assert beliefs(tmp_path / "fleet" / "north" / name) == beliefs(tmp_path / "alone" / name)
+
+
 @pytest.fixture(scope="module")
 def watched_fleet(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The file of a fleet, and the folder in which it was watched to its end."""
