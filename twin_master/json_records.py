@@ -80,6 +80,8 @@ class DecisionRecord(TypedDict):
     """What was learnt so far, by the name of the quantity; only if the twin learns."""
     revised_by_step: NotRequired[int]
     """The step whose late message changed the decision."""
+    message_step: NotRequired[int]
+    """The step by the count of the messages, if that differs from `step`."""
     told_again: NotRequired[bool]
     """Whether the decision may have been sent before."""
     asset: NotRequired[str]

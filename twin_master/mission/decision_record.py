@@ -51,7 +51,22 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
         decision["revised_by_step"] = line["observation_step"]
     if "learnt" in line:
         decision["learnt"] = line["learnt"]
+    message_step = _step_by_messages(line, scenario.watch.every)
+    if message_step not in (None, line["step"]):
+        decision["message_step"] = message_step
     return decision
+
+
+def _step_by_messages(line: JsonRecord, numbers_per_step: int) -> int | None:
+    """Return the number that messages give to the step of a line; None if they count no steps."""
+    counter = line.get("intake", {}).get("counter")
+    if counter is None:
+        return None
+    for first_step, first_number, _ in reversed(counter["stretches"]):
+        steps = line["step"] - first_step
+        if steps >= 0:
+            return int(first_number + steps * numbers_per_step)
+    return None
 
 
 def _health_record(

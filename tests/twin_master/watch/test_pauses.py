@@ -88,6 +88,13 @@ def test_the_first_message_says_where_counting_begins(watch, mission, first):
     assert f"calls itself step {first}." in sentence(decisions, "begin")
 
 
+def test_a_decision_has_the_step_by_the_count_of_the_messages(watch, mission):
+    with_section(watch, between="rest")
+    decisions = decisions_of(watch, numbered(mission, [1001, 1002, 2000, 2001]))
+    assert [decision["step"] for decision in decisions] == [0, 1, 2, 3]
+    assert [decision["message_step"] for decision in decisions] == [1001, 1002, 2000, 2001]
+
+
 @pytest.mark.parametrize("wrong_number", [65_538, 2**60])
 def test_a_counter_returns_from_a_wrong_number(watch, mission, wrong_number):
     with_section(watch, between="rest")
