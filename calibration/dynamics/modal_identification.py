@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibration.errors import ExperimentDataError
-from reporting.arrays import Float
+from reporting.arrays import Float, nan_where_masked
 from reporting.choices import require_one_of
 
 from .damped_cosine import ComplexArray, DampedCosineFit, DampedCosines, modal_gradients
@@ -112,7 +112,7 @@ def identify_modes(
     """
     require_one_of(kind, get_args(RecordKind), "kind")
     record = _centred_record(acceleration)
-    limits = np.array(bands, dtype=np.float64)
+    limits = np.array(nan_where_masked(bands))
     _check_bands(limits, sampling_rate)
     _refuse_dead_accelerometers(record)
     lags = _number_of_lags(limits, sampling_rate, channels=record.shape[1])
@@ -127,7 +127,7 @@ def identify_modes(
 
 def _centred_record(acceleration: ArrayLike) -> Float:
     """Return a record of N samples of A accelerometers without the mean of each."""
-    record = np.array(acceleration, dtype=np.float64)
+    record = np.array(nan_where_masked(acceleration))
     if record.ndim == 1:
         record = record[:, None]
     if record.ndim != 2 or not np.all(np.isfinite(record)):

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.lab_folder import LAB_ERRORS, possible_locations
-from reporting.arrays import Float
+from reporting.arrays import Float, nan_where_masked
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import comma_list, counted
@@ -60,8 +60,8 @@ class RingDownRecord:
     Raises
     ------
     ExperimentDataError
-        If the record is shorter than `MINIMUM_COUNT`, its time does not increase evenly, or its
-        signal stays at an extreme for 3 ms, as a clipped signal does.
+        If the record is shorter than `MINIMUM_COUNT`, a sample is lost, its time does not increase
+        evenly, or its signal stays at an extreme for 3 ms, as a clipped signal does.
     """
 
     time: Float
@@ -76,6 +76,12 @@ class RingDownRecord:
             raise ExperimentDataError(
                 f"{self.source}: the record has {self.count} samples; "
                 f"at least {MINIMUM_COUNT} are needed."
+            )
+        is_lost = ~np.isfinite(nan_where_masked(self.signal))
+        if np.any(is_lost):
+            raise ExperimentDataError(
+                f"{self.source}: sample {np.flatnonzero(is_lost)[0] + 1} is lost; cut the record "
+                "there, or fill it."
             )
         _refuse_uneven_time(self)
         _refuse_constant_signal(self)

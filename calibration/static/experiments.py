@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError
 from calibration.lab_folder import lab_table
-from reporting.arrays import Float
+from reporting.arrays import Float, nan_where_masked
 from reporting.files import hash_record
 
 STANDARD_GRAVITY = 9.81
@@ -88,12 +88,13 @@ class LoadDisplacementData:
     def __post_init__(self) -> None:
         for name in ("load", "displacement"):
             values = getattr(self, name)
-            not_positive = np.flatnonzero(values <= 0.0)
+            is_positive = nan_where_masked(values) > 0.0  # false for NaN as well
+            not_positive = np.flatnonzero(~is_positive)
             if not_positive.size:
                 index = not_positive[0]
                 raise ExperimentDataError(
                     f"{self.source}: {name} of reading {index + 1} is {values[index]:g}, "
-                    f"but every {name} must be positive; leave out zero readings."
+                    f"but every {name} must be positive; leave out zero and lost readings."
                 )
 
     @property

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, nan_where_masked
 from twin_master.errors import InvalidObservationError
 from twin_master.network.gaussian_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -35,7 +35,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
 
         The log densities (..., S) are those of other parts of an observation, which there are not.
         """
-        rows = np.asarray(observation, dtype=np.float64)
+        rows = nan_where_masked(observation)
         return rows, np.zeros((*rows.shape[:-1], self.state_count))
 
     def noise(self, joint: ArrayLike, rows: Float | None = None) -> Float:
@@ -206,7 +206,7 @@ class InspectedSensorModel(GaussianSensorModel):
         InvalidObservationError
             If a row has another length, or a value is infinite.
         """
-        rows = np.asarray(observation, dtype=np.float64)
+        rows = nan_where_masked(observation)
         sensor_count = self.sensor_count
         inspection_count = self.expected_reading.shape[1]
         values = self.check_observation(rows[..., :sensor_count])

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, nan_where_masked
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass
-from twin_master.network.transition import TransitionModel, check_controls, check_shape
+from twin_master.network.transition import TransitionModel, check_shape, checked_controls
 
 _NO_CONTROL = -1
 """The control before the first step: the belief before it is the prior, without a transition."""
@@ -106,10 +106,9 @@ def _check_sequence(
     what : str
         The noun of the rows, for the message.
     """
-    control = np.array(control_index, dtype=np.int64, order="C")
+    control = checked_controls(control_index, len(model.controls))
     check_shape("controls", control.shape, control.size)
-    check_controls(control, len(model.controls))
-    rows = np.require(log_rows, np.float64, ["C", "W"])
+    rows = np.require(nan_where_masked(log_rows), np.float64, ["C", "W"])
     check_shape(what, rows.shape, *control.shape, model.states.size)
     is_valid = rows < np.inf  # false for NaN as well
     if not np.all(is_valid):
@@ -288,8 +287,9 @@ def predict(
     Raises
     ------
     InvalidModelError
-        If shapes do not fit.
+        If shapes do not fit, or there is no such control.
     """
+    control_index = int(checked_controls(control_index, len(model.controls)))
     belief = np.asarray(belief, dtype=np.float64)
     policy = np.asarray(policy, dtype=np.float64)
     check_shape("a belief", belief.shape, model.states.size)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fe.compilation import compiled
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, nan_where_masked
 from twin_master.errors import InvalidModelError
 from twin_master.network.transition import check_shape, distribution
 
@@ -122,7 +122,7 @@ class QuantityModel:
     """
 
     def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:
-        values = np.array(value_per_draw, dtype=np.float64, order="C")
+        values = np.array(nan_where_masked(value_per_draw), order="C")
         check_shape("values", values.shape, "draws", "states", "controls", "sensors")
         if values.size == 0:
             raise InvalidModelError(f"expected one value or more, got the shape {values.shape}")
@@ -413,7 +413,7 @@ class RewardModel:
         )
 
         if observation is not None:
-            observations = np.asarray(observation, dtype=np.float64)
+            observations = nan_where_masked(observation)
             for b, row in enumerate(observations.reshape(-1, quantity.sensor_count)):
                 if not np.isnan(row).all():
                     mean[b, ERROR], variance[b, ERROR] = self._error_reward(beliefs[b], row)

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, nan_where_masked
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
@@ -22,7 +22,7 @@ from twin_master.network.gaussian_kernels import (
     separate_matrix,
 )
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.transition import check_controls, check_shape
+from twin_master.network.transition import check_shape, checked_controls
 
 Averaging = Literal["outside", "inside"]
 """Whether the likelihoods of the draws are averaged, or those of each sensor."""
@@ -150,9 +150,9 @@ class GaussianSensorModel(QuantityModel):
     ) -> None:
         require_one_of(average, get_args(Averaging), "average")
         super().__init__(strain_per_draw, draw_weight)
-        noise = np.array(standard_deviation, dtype=np.float64)
+        noise = np.array(nan_where_masked(standard_deviation))
         self._check_one_or_each(noise, noise > 0.0, "positive noise standard deviation")
-        relative_error = np.array(model_error, dtype=np.float64)
+        relative_error = np.array(nan_where_masked(model_error))
         self._check_one_or_each(
             relative_error, relative_error >= 0.0, "relative model error that is not negative"
         )
@@ -164,7 +164,7 @@ class GaussianSensorModel(QuantityModel):
         if interval is None:
             self.interval = np.zeros((*independent.shape, 0))
         else:
-            self.interval = np.array(interval, dtype=np.float64)
+            self.interval = np.array(nan_where_masked(interval))
         check_shape("changes within intervals", self.interval.shape, *independent.shape, "factors")
         if not np.all(np.isfinite(self.interval)):
             raise InvalidModelError("expected finite changes within intervals")
@@ -224,7 +224,7 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError
             If the last axis does not have G values, or a value is infinite.
         """
-        observation = np.array(observation, dtype=np.float64, order="C")
+        observation = np.array(nan_where_masked(observation), order="C")
         any_leading_axes = observation.shape[:-1]
         check_shape(
             "sensor values",
@@ -356,10 +356,9 @@ class GaussianSensorModel(QuantityModel):
             The log densities of values in SI.
         """
         observations = self.check_observation(observations)
-        control = np.array(control_index, dtype=np.int64)
+        control = checked_controls(control_index, self.control_count)
         check_shape("controls", control.shape, control.size)
         check_shape("observations", observations.shape, control.size, self.sensor_count)
-        check_controls(control, self.control_count)
         is_present = ~np.isnan(observations)
         if not self.averages_inside or draws != 1:
             return self._log_densities_of_sensors(observations, control, is_present, draws)

@@ -16,7 +16,7 @@ from math import prod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, nan_where_masked
 from reporting.memory import available_memory
 from reporting.words import comma_list
 from twin_master.errors import InvalidModelError, TwinMasterError
@@ -51,7 +51,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
     InvalidModelError
         If a row is not a distribution; the message has the index of the first.
     """
-    matrix = np.array(rows, dtype=np.float64, order="C")
+    matrix = np.array(nan_where_masked(rows), order="C")
     if matrix.ndim == 0 or matrix.size == 0:
         raise InvalidModelError(
             f"{name}: expected rows of probabilities, got an array of shape {matrix.shape}"
@@ -127,14 +127,28 @@ def check_shape(
         raise error(f"expected {what} of shape ({lengths}), got {tuple(shape)}")
 
 
-def check_controls(index: int | Index, count: int) -> None:
-    """Refuse indices of controls, an array of any shape, that are not between 0 and count - 1."""
-    low = np.min(index, initial=0)
-    high = np.max(index, initial=0)
+def checked_controls(control_index: ArrayLike, count: int) -> Index:
+    """Return indices of controls, of any shape, as whole numbers between 0 and count - 1.
+
+    Raises
+    ------
+    InvalidModelError
+        If an index is masked, is no whole number, or is out of range.
+    """
+    numbers = nan_where_masked(control_index)
+    is_whole = numbers == np.round(numbers)  # false for NaN as well
+    if not np.all(is_whole):
+        raise InvalidModelError(
+            "expected whole numbers as control indices, got "
+            f"{numbers[~is_whole].flat[0]} (NaN stands for a masked one)"
+        )
+    low = np.min(numbers, initial=0)
+    high = np.max(numbers, initial=0)
     if low < 0 or high >= count:
         raise InvalidModelError(
-            f"expected control indices between 0 and {count - 1}, got {low} to {high}"
+            f"expected control indices between 0 and {count - 1}, got {low:.0f} to {high:.0f}"
         )
+    return np.array(numbers, dtype=np.int64, order="C")
 
 
 def check_fits(parts: Mapping[str, float], advice: str) -> None:

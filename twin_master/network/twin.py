@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from reporting.arrays import AnyArray, Float
+from reporting.arrays import AnyArray, Float, nan_where_masked
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
@@ -37,7 +37,7 @@ from twin_master.network.graphical_model import (
 )
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision_probability
-from twin_master.network.transition import check_controls
+from twin_master.network.transition import checked_controls
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
@@ -290,7 +290,7 @@ class Twin:
             If the observation has another shape, is infinite or cannot be weighed, the twin is
             unchanged; if there is no such control.
         """
-        values = np.array(observation, dtype=np.float64)
+        values = np.array(nan_where_masked(observation))
         index = self._proposed if control is None else self._index_of(control)
         return self._assimilate_from(self._steps, [(values, index)])
 
@@ -328,7 +328,7 @@ class Twin:
                 f"on and has seen {self._steps}"
             )
         index = self.control_of(step) if control is None else self._index_of(control)
-        rows = [(np.array(observation, dtype=np.float64), index)]
+        rows = [(np.array(nan_where_masked(observation)), index)]
         for later_step in range(step + 1, self._steps):
             rows.append((self.observed(later_step), self.control_of(later_step)))
         return self._assimilate_from(step, rows)
@@ -472,8 +472,7 @@ class Twin:
                     f"no control is named {control!r}; there are {', '.join(controls)}"
                 )
             return controls.index(control)
-        check_controls(control, len(controls))
-        return int(control)
+        return int(checked_controls(control, len(controls)))
 
     def _decide(self, estimate: Estimate) -> TwinStep:
         """Return an estimate with prediction and decision, and set the proposed control.

@@ -192,6 +192,7 @@ def slow_mode():
     [
         (slow_mode(), [[4.0, 6.0]], "a mode decays within .* less than 10 times"),
         (np.full((5000, 2), np.nan), [[1.0, 2.0]], "finite numbers"),
+        (np.ma.masked_equal(np.arange(5000.0), 7.0), [[1.0, 2.0]], "finite numbers"),
         (np.linspace(0.0, 1.0, 100), [[1.0, 2.0]], "has 100 samples"),
         (np.zeros((5000, 1)), [[2.0, 1.0]], "two positive frequencies"),
         (np.zeros((5000, 1)), [[40.0, 60.0]], "nothing above 50 Hz"),

@@ -46,6 +46,13 @@ def fit_record(time, signal, width=0.0):
     return fit_ring_down(record, frequencies_fitted=True, start=FROM_FIRST_SAMPLE)
 
 
+def test_a_masked_sample_is_lost():
+    signal = np.ma.masked_equal(np.append(ring_down(np.arange(499) * 0.001), -9999.0), -9999.0)
+
+    with pytest.raises(ExperimentDataError, match="sample 500 is lost"):
+        RingDownRecord(np.arange(500) * 0.001, signal)
+
+
 # ---------------------------------------------------------------- modes are recovered
 
 

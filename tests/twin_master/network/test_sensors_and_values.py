@@ -36,6 +36,27 @@ def random_sensors(seed, spread=1.0):
     return rng, values, weight, deviation, observation
 
 
+@pytest.mark.parametrize("control", [[0, 1, 1], [0.0, 1.0, 1.0]])
+def test_a_masked_reading_is_a_lost_one(control):
+    rng, values, _, deviation, _ = random_sensors(0)
+    sensors = GaussianSensorModel(values, deviation)
+    readings = rng.normal(size=(3, SENSORS))
+    is_lost = np.eye(3, SENSORS, dtype=bool)
+    filled = np.where(is_lost, -9999.0, readings)
+
+    masked = sensors.log_likelihood_sequence(np.ma.masked_equal(filled, -9999.0), control)
+
+    lost = sensors.log_likelihood_sequence(np.where(is_lost, np.nan, readings), [0, 1, 1])
+    np.testing.assert_array_equal(masked, lost)
+
+
+def test_a_control_between_two_controls_is_refused():
+    _, values, _, deviation, observation = random_sensors(0)
+
+    with pytest.raises(InvalidModelError, match=r"whole numbers as control indices, got 0\.5"):
+        GaussianSensorModel(values, deviation).log_likelihood(observation, 0.5)
+
+
 @given(
     seed=SEEDS,
     spread=st.sampled_from([1.0, 50.0, 1e4]),
