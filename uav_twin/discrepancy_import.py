@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
+from reporting.errors import FileNotWrittenError
 from reporting.files import refuse_filled
+from reporting.folders import whole_folder
 from uav_twin.completion import complete_model
 from uav_twin.discrepancy_campaigns import campaign_size, shell_arguments
 from uav_twin.import_dialogue import ImportCommand, ImportDialogue
 
 if TYPE_CHECKING:
     from discrepancy.campaign.importing import LaboratoryImport
+
+_FILE_OF_IMPORT = re.compile(r"campaign\.toml|noise\.csv|\d\d+_.*\.csv")
+"""Names of the files that an import writes."""
 
 
 def import_files(
@@ -182,6 +187,9 @@ def import_files(
             help="The same as for `discrepancy run`: columns may have the names of its outputs.",
         ),
     ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the folder of an earlier import.")
+    ] = False,
     ask_nothing: Annotated[
         bool,
         typer.Option(
@@ -197,7 +205,7 @@ def import_files(
     from discrepancy.campaign.writing import write_campaign
 
     folder = out or Path(files[0].stem)
-    refuse_filled(folder)
+    _check_folder(folder, replace_it=replace)
     options = {
         "column": column,
         "unit": unit,
@@ -225,7 +233,8 @@ def import_files(
     if is_interactive:
         imported = _ask_and_confirm(ImportCommand(files, out, model), imported, folder)
     campaign = imported.campaign(folder.resolve().name)
-    write_campaign(campaign, folder, si=True, units=imported.units(), left_out_as_empty=True)
+    with whole_folder(folder) as fresh:
+        write_campaign(campaign, fresh, si=True, units=imported.units(), left_out_as_empty=True)
     terminal.say(f"Wrote {folder}: {campaign_size(campaign)}.")
     if imported.assumed:
         terminal.say(
@@ -233,6 +242,21 @@ def import_files(
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
     terminal.say(f"Next: uav-twin discrepancy check {shell_arguments(folder, model)}")
+
+
+def _check_folder(folder: Path, *, replace_it: bool) -> None:
+    """Refuse a folder that is not empty, unless it shall be replaced and holds an import alone."""
+    if not replace_it:
+        refuse_filled(folder)
+    if not folder.exists():
+        return
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name]
+    other_names = [name for name in names if not _FILE_OF_IMPORT.fullmatch(name)]
+    if other_names:
+        raise FileNotWrittenError(
+            f"{folder} is not the folder of an earlier import alone ({sorted(other_names)[0]}), "
+            "and was left unchanged: choose another --out."
+        )
 
 
 def _ask_and_confirm(
@@ -301,12 +325,19 @@ def _understand_files(
     from discrepancy.campaign.importing import LaboratoryImport
     from discrepancy.campaign.sheet import read_sheet
     from discrepancy.model_choice import choose_model
+    from discrepancy.system.load_change import choose_load_place
 
     sheets = [read_sheet(file) for file in files]
     imported = LaboratoryImport(sheets, answers)
     if model is None:
         return imported
     chosen_model = choose_model(model).model
+    if chosen_model.load_places is not None:
+        for file, place in answers["load-place"].items():
+            trials_text = f"the trial of {file}" if file else "the trials"
+            choose_load_place(
+                chosen_model.load_places, place, chosen_model.quoted_name, trials_text
+            )
     return LaboratoryImport(
         imported.sheets,
         answers,

@@ -1,7 +1,8 @@
 """How well zeros and gains of channels are known, as a user states it or by default."""
 
 from collections.abc import Mapping, Sequence
-from math import isfinite
+
+import numpy as np
 
 from discrepancy.campaign.answers import Questionnaire
 from discrepancy.campaign.columns import (
@@ -13,6 +14,7 @@ from discrepancy.campaign.columns import (
     zero_deviation,
 )
 from discrepancy.campaign.units import factor_to_si
+from discrepancy.campaign.wild_readings import numbers_or_nan, wild_readings
 from reporting.words import listing
 
 ASSUMED_ZERO = "1%"
@@ -78,7 +80,7 @@ class SensorDeviations:
         return zero_deviation(column, answer, self._largest_reading(column.head))
 
     def _largest_reading(self, head: str) -> float:
-        """Return the largest absolute reading of a column in all trials [SI].
+        """Return the largest absolute reading of a column in all trials [SI], without wild ones.
 
         It is 0 while the unit or decimal mark is not known.
         """
@@ -86,9 +88,9 @@ class SensorDeviations:
         for column in self.columns:
             if column.head != head or self.kinds[column.sheet.name] == NOISE:
                 continue
-            for cell in column.cells_in_si(self.decimals[column.sheet.name]):
-                if cell and isfinite(float(cell)):
-                    largest = max(largest, abs(float(cell)))
+            readings = numbers_or_nan(column.cells_in_si(self.decimals[column.sheet.name]))
+            is_counted = np.isfinite(readings) & ~wild_readings(readings)
+            largest = max(largest, float(np.max(np.abs(readings[is_counted]), initial=0.0)))
         return largest
 
     def _gain(self, head: str) -> float | str:

@@ -9,7 +9,7 @@ import csv
 import io
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from pathlib import Path
 
@@ -24,10 +24,11 @@ from discrepancy.campaign.cells import (
 from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.campaign.table_layout import SEPARATORS, Rows, find_table
+from discrepancy.campaign.wild_readings import is_fill_value, numbers_or_nan, wild_readings
 from discrepancy.errors import CampaignFileError
 from reporting.files import hash_file
 from reporting.text_file import read_text
-from reporting.words import counted, one_line
+from reporting.words import counted, is_or_are, listing, one_line
 
 MATLAB = ".mat"
 EXCEL = (".xlsx", ".xlsm")
@@ -48,6 +49,10 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
+LEAST_LOST_VALUE = 1e30
+"""Numbers from here on stand for no reading, as 9.9E+37 of instruments does."""
+_MOST_LISTED_LINES = 5
+"""Most lines of wild readings that a remark lists."""
 _LINES_FOR_SEPARATOR = 500
 """Number of first lines by which the separator is chosen."""
 
@@ -90,7 +95,7 @@ class Sheet:
     def numbers(self, head: str, decimal: str) -> tuple[str, ...]:
         """Return the cells of a column with a decimal point and without grouped digits.
 
-        Empty cells stay empty.
+        Empty cells stay empty, and so become numbers of `LEAST_LOST_VALUE` or more.
 
         Parameters
         ----------
@@ -103,6 +108,9 @@ class Sheet:
         numbers = []
         for cell in self.columns[column]:
             number = plain_number(cell, decimal) if cell else None
+            if number is not None and abs(float(number)) >= LEAST_LOST_VALUE:
+                numbers.append("")
+                continue
             numbers.append(number or cell)  # what is no number stays as it is printed
         return tuple(numbers)
 
@@ -127,12 +135,60 @@ def read_sheet(path: Path) -> Sheet:
         format_name, remedy = OTHER_FORMATS[ending]
         raise CampaignFileError(f"{file.name} is {format_name}, which is not read: {remedy}.")
     if ending == MATLAB:
-        return _matlab_sheet(file)
+        return _without_fill_values(_matlab_sheet(file), "row")
     if ending in EXCEL:
         rows = _excel_rows(file, sheet_name=path.name.partition("#")[2])
-        return _sheet_of_rows(path.name, file, rows, unit_of_place="row", separator="")
+        sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="row", separator="")
+        return _without_fill_values(sheet, "row")
     rows, separator = _text_rows(file)
-    return _sheet_of_rows(path.name, file, rows, unit_of_place="line", separator=separator)
+    sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="line", separator=separator)
+    return _without_fill_values(sheet, "line")
+
+
+def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
+    """Return a table with empty cells for its fill values; its remark names all wild readings.
+
+    Numbers that can be read in two ways are not judged.
+    """
+    if sheet.decimal is None:
+        return sheet
+    columns = []
+    remark = sheet.remark
+    for head, cells in zip(sheet.heads, sheet.columns, strict=True):
+        numbers = sheet.numbers(head, sheet.decimal)
+        is_lost = [bool(cell) and not number for cell, number in zip(cells, numbers, strict=True)]
+        if any(is_lost):
+            lines = [line for line, lost in zip(sheet.lines, is_lost, strict=True) if lost]
+            remark += (
+                f"; {_places(unit_of_place, lines)} of {head!r} {is_or_are(len(lines))} beyond "
+                f"{LEAST_LOST_VALUE:g} and left out"
+            )
+        cleaned_cells = list(cells)
+        lines_of_cells: dict[str, list[int]] = {}
+        for row in wild_readings(numbers_or_nan(numbers)).nonzero()[0].tolist():
+            lines_of_cells.setdefault(cells[row], []).append(sheet.lines[row])
+            if is_fill_value(numbers[row]):
+                cleaned_cells[row] = ""
+        for cell, lines in lines_of_cells.items():
+            place = f"{cell} in {_places(unit_of_place, lines)} of {head!r}"
+            number = plain_number(cell, sheet.decimal)
+            if number is not None and is_fill_value(number):
+                remark += f"; {place} is a fill value and left out"
+            else:
+                remark += (
+                    f"; no other reading supports {place}: if it is wrong, leave its cell empty"
+                )
+        columns.append(tuple(cleaned_cells))
+    return replace(sheet, columns=tuple(columns), remark=remark)
+
+
+def _places(unit_of_place: str, lines: Sequence[int]) -> str:
+    """Return lines or rows for a sentence; a long list is cut."""
+    if len(lines) == 1:
+        return f"{unit_of_place} {lines[0]}"
+    if len(lines) > _MOST_LISTED_LINES:
+        return f"{len(lines)} {unit_of_place}s from {lines[0]} on"
+    return f"{unit_of_place}s {listing(map(str, lines))}"
 
 
 def _sheet_of_rows(

@@ -624,3 +624,47 @@ def test_a_dialogue_lists_the_outputs_of_the_model_before_it_asks_for_one():
     channels = read_campaign("lab").channels.values()
     assert screen.index(f"The model has the outputs {OUTPUTS_OF_RIG}.") < screen.index("Weg: column")
     assert [channel.output for channel in channels] == ["displacement"]
+
+
+PULL_WITH_WILD_READING = "F [N],w [mm]\n0,0\n1,1\n2,2\n3,3\n4,4321\n"
+PULL = ("pull.csv", "--kind", "static", "--column", "w=displacement", "--ask-nothing", "--out", "lab")
+
+
+def test_a_wild_reading_does_not_set_the_default_of_its_zero():
+    Path("pull.csv").write_text(PULL_WITH_WILD_READING, encoding="utf-8")
+
+    text = said(*IMPORT, *PULL)
+
+    assert "the zero of 'w' to 0.03 mm" in text
+    assert "no other reading supports 4321 in line 6 of 'w'" in text
+
+
+def test_a_load_place_that_the_model_does_not_have_is_refused_at_import():
+    Path("pull.csv").write_text(PULL_WITH_WILD_READING, encoding="utf-8")
+
+    sentence = refused(*IMPORT, *PULL, *RIG, "--load-place", "mass")
+
+    assert "the load place is 'mass'" in sentence
+    assert "takes forces at tip" in sentence
+    assert not Path("lab").exists()
+
+
+def test_replace_writes_the_import_anew():
+    Path("pull.csv").write_text(PULL_WITH_WILD_READING, encoding="utf-8")
+    said(*IMPORT, *PULL)
+    Path("pull.csv").write_text(PULL_WITH_WILD_READING.replace("4321", "4.5"), encoding="utf-8")
+
+    said(*IMPORT, *PULL, "--replace")
+
+    assert read_campaign("lab").trials[0].values[-1, 0] == pytest.approx(4.5e-3, rel=1e-14)
+
+
+def test_replace_leaves_a_folder_with_other_files_unchanged():
+    Path("pull.csv").write_text(PULL_WITH_WILD_READING, encoding="utf-8")
+    said(*IMPORT, *PULL)
+    Path("lab", "notes.txt").write_text("mine", encoding="utf-8")
+
+    sentence = refused(*IMPORT, *PULL, "--replace")
+
+    assert "notes.txt" in sentence
+    assert Path("lab", "notes.txt").read_text(encoding="utf-8") == "mine"

@@ -244,6 +244,54 @@ def test_lines_that_are_long_or_ambiguous_take_no_long_time(tmp_path):
     assert time.process_time() - started < 60.0
 
 
+# ---------------------------------------------------------------- fill values
+
+
+@pytest.mark.parametrize("fill", ["-9999", "-99999", "99999.0", "7999", "-32768"])
+def test_a_fill_value_is_left_out_and_named_with_its_row(tmp_path, fill):
+    sheet = sheet_of(tmp_path, f"F [N];w [mm]\n0;0\n1;1.1\n2;{fill}\n3;3.2\n4;4.1\n".encode())
+
+    assert sheet.numbers("w", ".") == ("0", "1.1", "", "3.2", "4.1")
+    assert f"{fill} in line 4 of 'w' is a fill value and left out" in sheet.remark
+
+
+@pytest.mark.parametrize("fill", ["1e30", "9.9E+37", "-1e38"])
+def test_a_number_from_1e30_on_is_lost(tmp_path, fill):
+    sheet = sheet_of(tmp_path, f"F [N];w [mm]\n0;0\n1;{fill}\n".encode())
+
+    assert sheet.numbers("w", ".") == ("0", "")
+    assert "line 3 of 'w' is beyond 1e+30 and left out" in sheet.remark
+
+
+def test_a_wild_reading_that_is_no_fill_value_is_named_and_kept(tmp_path):
+    sheet = sheet_of(tmp_path, b"F [N];w [mm]\n0;0\n1;1.1\n2;2.2\n3;3.2\n4;4123\n")
+
+    assert sheet.numbers("w", ".")[-1] == "4123"
+    assert "no other reading supports 4123 in line 6 of 'w'" in sheet.remark
+
+
+def test_two_different_fill_values_are_both_found(tmp_path):
+    sheet = sheet_of(tmp_path, b"F [N];w [mm]\n0;0\n1;-9999\n2;2.2\n3;3.2\n4;7999\n5;-9999\n")
+
+    assert sheet.numbers("w", ".") == ("0", "", "2.2", "3.2", "", "")
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ("0", "9999", "5000", "2500"),  # a range that reaches the number
+        ("0", "0", "9999", "0"),  # nothing shows the range of the others
+        ("0", "0.1", "-0.1", "400", "9999", "3000", "30"),  # an impact
+    ],
+)
+def test_a_number_of_nines_that_others_support_is_a_reading(tmp_path, cells):
+    rows = "".join(f"{row};{cell}\n" for row, cell in enumerate(cells))
+
+    sheet = sheet_of(tmp_path, f"F [N];w [mm]\n{rows}".encode())
+
+    assert sheet.numbers("w", ".") == cells
+
+
 # ---------------------------------------------------------------- Excel
 
 
