@@ -451,8 +451,8 @@ class Verdict:
         The conclusion in one sentence.
     probability : float
         Posterior probability of the conclusion among the hypotheses compared: of all sets that
-        contain the named one, of all members of the group, of 'none' (nothing missing), or of the
-        candidates together with 'none' (below detectability). For a family it is that of the family
+        contain the named one, of all members of the group, or of 'none' (nothing missing and below
+        detectability). For a family it is that of the family
         and its members, or that of the member if only the shape gate found the family. It is nan
         for an unexplained gap [1].
     log_bayes_factor : float
@@ -484,7 +484,8 @@ class Verdict:
         Windows in time with a gap in each record, for the model without effects and for the best
         hypothesis.
     parameters : tuple of CalibratedParameter
-        Parameters of the model in the hypothesis that stands for the verdict.
+        Parameters of the model beside the named effects or the first member of a group; without an
+        effect if neither is there.
     force : ForceAtPort or None
         The missing force; None if no force is missing, or none can be determined.
     unfitted : tuple of UnfittedRecord
@@ -498,8 +499,8 @@ class Verdict:
         deviations, if these are so wide that the move is at least 2 % of the stated value (for a
         zero, of the largest reading) and three posterior standard deviations.
     sensors : tuple of SensorEstimate
-        Gains of the channels, and their zeros in each fitted trial, in the hypothesis that stands
-        for the verdict.
+        Gains of the channels, and their zeros in each fitted trial, beside the named effects;
+        without an effect if none is named.
     """
 
     kind: VerdictKind

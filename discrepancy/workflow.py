@@ -33,6 +33,7 @@ from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import errors_of_fit, prove_effects
 from discrepancy.judgement.remarks import (
+    KINDS_WITH_NAME,
     KINDS_WITHOUT_GAP,
     look_alike_remark,
     sentence_with_times,
@@ -229,6 +230,10 @@ def investigate(
             proof = prove_effects(
                 before, after, errors=errors, effects=effect_labels(fit), seed=seed
             )
+    # a hypothesis without a name says nothing of the sensors, and one below the limit of nothing
+    has_unnamed_effects = bool(fit.candidate.terms) and verdict.kind not in KINDS_WITH_NAME
+    fit_of_sensors = search.no_effect if has_unnamed_effects else fit
+    fit_of_parameters = fit_of_sensors if verdict.kind in KINDS_WITHOUT_GAP else fit
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
@@ -240,8 +245,8 @@ def investigate(
         next_experiments=experiments,
         not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
-        parameters=calibrated_parameters(problem, fit),
-        sensors=sensor_estimates(problem, fit),
+        parameters=calibrated_parameters(problem, fit_of_parameters),
+        sensors=sensor_estimates(problem, fit_of_sensors),
         force=None if missing is None else missing.at_port,
     )
     return Investigation(

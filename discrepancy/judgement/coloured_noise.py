@@ -97,15 +97,10 @@ def _nothing_missing_outcome(
         if probability > 1.0 - SEARCH.name_probability:
             possible_effects.append(name)
     possible_effects.sort()
-    total_probability = min(
-        probability_of_none
-        + sum(conclusion.inclusion_probabilities[name] for name in possible_effects),
-        1.0,
-    )
     return conclusion.build_outcome(
         VerdictKind.BELOW_LIMIT,
         below_limit_sentence(possible_effects, " that is coloured"),
-        total_probability,
+        probability_of_none,
         no_effect,
         group=tuple(possible_effects),
         gates=(gate,),

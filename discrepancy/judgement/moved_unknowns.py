@@ -15,7 +15,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue
-from reporting.words import listing
+from reporting.words import listing, plus_minus
 
 from .conclusion import calibrated_parameters
 from .sensor_estimates import sensor_estimates
@@ -254,7 +254,9 @@ def moved_sentence(unknowns: Sequence[MovedUnknown]) -> str:
 
 
 def hiding_sentences(
-    moved: Sequence[MovedUnknown], moved_within_prior: Sequence[MovedUnknown]
+    moved: Sequence[MovedUnknown],
+    moved_within_prior: Sequence[MovedUnknown],
+    sensors: Sequence[SensorEstimate],
 ) -> str:
     """Return sentences on where an error of the model may hide if the model leaves noise alone.
 
@@ -264,17 +266,27 @@ def hiding_sentences(
         The unknowns that the fit moves far from what is stated.
     moved_within_prior : sequence of MovedUnknown
         The unknowns that the fit moves far within wide stated deviations.
+    sensors : sequence of SensorEstimate
+        The gains and zeros in the same fit, with their posterior deviations.
 
     Returns
     -------
     str
         The sentences; empty if the fit moves nothing.
     """
+    gains = {_sensor_name(sensor): sensor for sensor in sensors if sensor.kind is SensorValue.GAIN}
+    moved_gains = [gains[unknown.name] for unknown in moved if unknown.name in gains]
+    other_unknowns = [unknown for unknown in moved if unknown.name not in gains]
     sentences = []
-    if moved:
+    if moved_gains:
+        gain_texts = listing(map(_gain_text, moved_gains), most=MOST_MENTIONED)
         sentences.append(
-            f"Fitted without an effect, the model moves {_moved_texts(moved)}, where an error of "
-            "the model may hide."
+            f"Fitted without an effect, {gain_texts}, where an error of the model may hide."
+        )
+    if other_unknowns:
+        sentences.append(
+            f"Fitted without an effect, the model moves {_moved_texts(other_unknowns)}, where an "
+            "error of the model may hide."
         )
     if moved_within_prior:
         sentences.append(
@@ -283,6 +295,16 @@ def hiding_sentences(
             "show."
         )
     return " ".join(sentences)
+
+
+def _gain_text(gain: SensorEstimate) -> str:
+    """Return in words by how much a channel shows too much or too little, and what was stated."""
+    side = "much" if gain.value > 0.0 else "little"
+    error = plus_minus(100.0 * abs(gain.value), 100.0 * gain.deviation)
+    return (
+        f"{gain.channel} shows {error} % too {side}; stated was "
+        f"{100.0 * gain.stated_deviation:.3g} % ({abs(gain.deviations):.1f} deviations)"
+    )
 
 
 def _moved_texts(unknowns: Sequence[MovedUnknown]) -> str:

@@ -30,6 +30,7 @@ from .moved_unknowns import (
 from .proof import check_held_out
 from .remarks import KINDS_WITHOUT_GAP
 from .rules import VerdictCase, decide_verdict, most_probable_sets
+from .sensor_estimates import sensor_estimates
 from .verdict_checks import check_against_trials
 
 INSTRUMENT_PRIMITIVES = (LoadGain, *SENSORS)
@@ -70,7 +71,8 @@ def reach_verdict(
     moved = moved_unknowns(problem, no_effect)
     moved_within_prior = unknowns_moved_within_prior(problem, no_effect)
     if verdict.kind in KINDS_WITHOUT_GAP:
-        sentences = hiding_sentences(moved, moved_within_prior)
+        sensors = sensor_estimates(problem, no_effect)
+        sentences = hiding_sentences(moved, moved_within_prior, sensors)
     else:
         sentences = moved_sentence(moved)
     verdict = replace(

@@ -18,6 +18,7 @@ from reporting.words import listing
 # ---------------------------------------------------------------- when there is a gap
 
 KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+KINDS_WITH_NAME = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY)
 """Kinds of verdicts after which the model remains unchanged: no gap was detected."""
 MOST_MENTIONED = 3
 """Windows, or effects that were not tested, that a sentence mentions one by one."""

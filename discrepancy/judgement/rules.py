@@ -270,7 +270,7 @@ class VerdictCase:
         return self.conclusion.build_outcome(
             VerdictKind.BELOW_LIMIT,
             below_limit_sentence(possible_effects),
-            total_probability(self.probabilities[names] for names in self.probable_sets),
+            self.no_effect_probability,
             self.leading_fit,
             group=tuple(possible_effects),
             gates=(check_absolute_fit(self.problem, self.leading_fit),),

@@ -25,6 +25,7 @@ from discrepancy.report.text import (
     unit_text,
 )
 from discrepancy.report.verdict_sentences import (
+    ROLE_OF_PROBABILITY,
     error_sentence,
     group_members,
     headline,
@@ -208,7 +209,10 @@ def verdict_card(verdict: Verdict) -> str:
         size = f"{parameter_text(parameters[0])} {value} {unit_text(parameters[0].unit)}".rstrip()
         clauses.append(f"{size} ({interval})")
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        clauses.append(f"probability {probability_text(verdict.probability)}")
+        role = "probability"
+        if verdict.kind is VerdictKind.BELOW_LIMIT:
+            role = ROLE_OF_PROBABILITY[verdict.kind]
+        clauses.append(f"{role} {probability_text(verdict.probability)}")
     return f"{'; '.join(clauses)}."
 
 
@@ -237,7 +241,10 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
             meaning = f"times the noise, rms on {trials} trials, before and after"
             cards.append((" → ".join(noise_levels(proof)), meaning))
     if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        cards.append((probability_text(verdict.probability), "probability of the verdict"))
+        meaning = "probability of the verdict"
+        if verdict.kind is VerdictKind.BELOW_LIMIT:
+            meaning = ROLE_OF_PROBABILITY[verdict.kind]
+        cards.append((probability_text(verdict.probability), meaning))
     gates = deciding_gates(verdict)
     if gates and proof is None and force is None:
         gate = gates[0]

@@ -81,7 +81,10 @@ def _probability_sentence(verdict: Verdict) -> str:
     """Return the probability of a verdict and its Bayes factor; empty if it has none."""
     if not isfinite(verdict.probability) or verdict.kind is VerdictKind.UNEXPLAINED:
         return ""
-    sentence = f"Probability {probability_text(verdict.probability)}"
+    subject = "Probability"
+    if verdict.kind is VerdictKind.BELOW_LIMIT:
+        subject = "Probability that nothing is missing"
+    sentence = f"{subject} {probability_text(verdict.probability)}"
     if verdict.kind is not VerdictKind.NOTHING_MISSING:
         sentence += f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
     return f"{sentence}."

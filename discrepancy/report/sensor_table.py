@@ -27,7 +27,8 @@ def sensor_table(
         table_of_records(SENSOR_COLUMNS, rows),
         title="Gains and zeros of the channels",
         caption=(
-            "Fitted together with the verdict's hypothesis, with their standard deviations; of the "
+            "Fitted beside the named effects, or without an effect if none is named, with their "
+            "standard deviations; of the "
             "zeros of a channel, the one farthest from what is stated. The last column is the "
             "distance in stated standard deviations. verdict.json has the zeros of all trials."
         ),

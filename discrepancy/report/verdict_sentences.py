@@ -23,7 +23,7 @@ ROLE_OF_PROBABILITY = {
     VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
     VerdictKind.GROUP: "together they have the probability",
     VerdictKind.FAMILY: "probability",
-    VerdictKind.BELOW_LIMIT: "together with none they have the probability",
+    VerdictKind.BELOW_LIMIT: "probability that nothing is missing",
 }
 """What the probability of a verdict is the probability of; other kinds say it themselves."""
 

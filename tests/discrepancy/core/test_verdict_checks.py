@@ -15,8 +15,10 @@ from discrepancy.fits.fitting import fit
 from discrepancy.judgement.closed_share import percent_with_interval, rms_errors_text
 from discrepancy.judgement.conclusion import VerdictOutcome
 from discrepancy.judgement.moved_unknowns import moved_sentence, moved_unknowns
+from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.judgement.verdict_checks import check_against_trials, far_held_out_records, unfitted_records
 from discrepancy.report.figures import ReportInput
+from discrepancy.report.printed import verdict_lines
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
@@ -282,6 +284,23 @@ def test_a_verdict_without_a_proof_has_no_hypothesis(case):
     found, proof = stored_case(case).found, stored_case(case).stored.proof
     assert found.verdict.kind is ENDS_IN.get(case, found.verdict.kind), found.verdict.sentence
     assert proof is not None or found.fit is None or not found.fit.candidate.terms
+
+
+def test_a_verdict_below_detectability_has_the_probability_that_nothing_is_missing():
+    found = stored_case("below limit").found
+    (none,) = [item for item in found.verdict.hypotheses if not item.effects]
+
+    printed = "\n".join(map(str, verdict_lines(ReportInput(found, ORIGIN))))
+
+    assert found.verdict.probability == none.probability < 0.95
+    assert "\nProbability that nothing is missing 0." in printed
+
+
+@pytest.mark.parametrize("case", ["below limit", "group"])
+def test_gains_and_zeros_are_those_without_an_effect_if_none_is_named(case):
+    found = stored_case(case).found
+    assert found.fit.candidate.terms
+    assert found.verdict.sensors == sensor_estimates(found.problem, found.search.no_effect)
 
 
 @pytest.mark.parametrize("case", CAMPAIGNS)

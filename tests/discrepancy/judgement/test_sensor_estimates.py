@@ -10,13 +10,17 @@ from calibration.result.sensors import MOST_PRINTED_SENSORS
 from discrepancy.catalogue.library import library
 from discrepancy.files.verdict import read_verdict_file, write_verdict
 from discrepancy.fits.normal_equations import normal_equations
-from discrepancy.judgement.moved_unknowns import moved_sentence, unknowns_moved_within_prior
+from discrepancy.judgement.moved_unknowns import (
+    hiding_sentences,
+    moved_sentence,
+    unknowns_moved_within_prior,
+)
 from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.page import render_report, verdict_card
 from discrepancy.report.printed import verdict_lines
 from discrepancy.report.sensor_table import printed_sensor_table
-from discrepancy.verdict import MovedUnknown, SensorValue, VerdictKind
+from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
 from reporting.page import Table
 from tests.discrepancy.core import kit
@@ -199,6 +203,16 @@ def test_nothing_missing_says_which_gain_is_far_from_what_is_stated(gain_far_fro
     assert f"{abs(farthest.deviations):.1f} deviations)" in gain_far_from_stated.sentence
     assert "where an error of the model may hide" in gain_far_from_stated.sentence
     assert farthest.name in verdict_card(gain_far_from_stated)
+
+
+@pytest.mark.parametrize(("value", "side"), [(0.04, "much"), (-0.04, "little")])
+def test_a_gain_far_from_what_is_stated_is_told_with_its_deviation(value, side):
+    moved = MovedUnknown("gain of y", 0.0, 0.01, value, 100.0 * value, "1")
+    gain = SensorEstimate("y", SensorValue.GAIN, "", value, 0.0004, 0.01, 100.0 * value, "1")
+
+    sentence = hiding_sentences([moved], [], [gain])
+
+    assert f"y shows 4.000 ± 0.040 % too {side}; stated was 1 % (4.0 deviations)" in sentence
 
 
 def test_a_moved_zero_has_the_unit_of_the_report():
