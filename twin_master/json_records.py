@@ -96,13 +96,14 @@ class ObservationMessage(TypedDict):
     begin with `_` are ignored.
     """
 
-    step: NotRequired[float | str]
+    step: NotRequired[int | str]
     """Whole number of the step, also in quotes; the first message says where counting begins.
     Without `step` and `time` the message is the next step.
     """
     time: NotRequired[float | str]
     """Time of the step, in place of `step`: a number in the unit of `watch.time_unit`, also in
-    quotes, or a date and time by ISO 8601, which is in UTC if it has no offset.
+    quotes, or a date and time by ISO 8601, which is in UTC if it has no offset
+    [unit of `watch.time_unit`].
     """
     control: NotRequired[str]
     """The control in force; by default the proposed one."""
