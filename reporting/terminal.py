@@ -6,6 +6,7 @@ same two.
 """
 
 import functools
+import io
 import json
 import logging
 import os
@@ -14,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -49,6 +51,20 @@ class Loudness:
 
 loudness = Loudness()
 """How much the running command prints."""
+
+
+def make_streams_writable() -> None:
+    """Let commands write to closed streams, and characters that the encoding of a stream lacks.
+
+    What is written to a closed stream is lost. The null device takes its file descriptor, so that
+    no file that is opened later gets it. A character that the encoding lacks becomes `?`.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def console() -> "Console":
@@ -234,10 +250,16 @@ def interruptible(how_to_go_on: Callable[[], str] = str) -> Iterator[None]:
 
 
 def print_json(record: Mapping[str, object]) -> None:
-    """Print a record as JSON; a number that is not finite becomes null."""
+    """Print a record as JSON; a number that is not finite becomes null.
+
+    Where the output stream is not UTF-8, characters beyond ASCII are escaped, so that none is lost.
+    """
     from reporting.json_file import plain
 
-    text = json.dumps(plain(record), indent=1, ensure_ascii=False, allow_nan=False, default=str)
+    is_utf8 = (sys.stdout.encoding or "utf-8").lower().replace("-", "") == "utf8"
+    text = json.dumps(
+        plain(record), indent=1, ensure_ascii=not is_utf8, allow_nan=False, default=str
+    )
     typer.echo(text)
 
 

@@ -407,6 +407,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
     *further_errors : type of Exception
         The base classes of errors of packages that this one may not import.
     """
+    terminal.make_streams_writable()
     try:
         with former_names_as_lines(lambda: terminal.loudness.quiet):
             application()

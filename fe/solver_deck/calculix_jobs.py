@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from scipy import sparse
 
@@ -106,6 +107,7 @@ class CalculixJobs:
         blocks: Sequence[KeywordBlock],
         *,
         preloaded: bool = True,
+        quantity: Literal["U", "RF"] = "U",
     ) -> list[dict[int, FloatArray]]:
         """Return the displacement (3,) of each node under each load alone, in the deck's unit.
 
@@ -117,6 +119,8 @@ class CalculixJobs:
             The blocks of the model.
         preloaded : bool
             Whether they follow the preload, if the model has one.
+        quantity : "U" or "RF"
+            What CalculiX prints: RF are forces at nodes instead, the loads and the reactions.
 
         Raises
         ------
@@ -126,7 +130,7 @@ class CalculixJobs:
         steps = []
         for load in loads:
             other_loads_end = ["*CLOAD, OP=NEW", "*DLOAD, OP=NEW"]
-            prints = [f"*NODE PRINT, NSET={ALL_NODES}, GLOBAL=YES", "U"]
+            prints = [f"*NODE PRINT, NSET={ALL_NODES}, GLOBAL=YES", quantity]
             steps.append(["*STATIC", *other_loads_end, *load.lines, *prints])
         # A second step of small changes would forget the preload.
         jobs = [steps]

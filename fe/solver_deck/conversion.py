@@ -1,5 +1,6 @@
 """From a deck of CalculiX to a structure from matrices, checked against CalculiX itself."""
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +20,10 @@ from fe.verification.calculix_run import required_calculix
 from .bound_motions import MOST_MOMENTS, read_rotations, read_tied_motions
 from .calculix_jobs import CalculixJobs, StoredMatrices
 from .comparison import DeckReport, compare_with_calculix, refuse_deviations
+from .couplings import share_over_couplings
 from .linear_model import (
     ContactChoice,
+    HeldMotion,
     LinearModel,
     PreloadChoice,
     read_linear_model,
@@ -33,11 +36,14 @@ from .regions import (
     with_own_materials,
     with_scaled_modulus,
 )
-from .row_vectors import LoadRows
+from .row_vectors import MotionRows
 from .structure_file import (
     MASS_FILE,
+    MOST_OUTPUTS,
     DeckStructure,
+    OutputSet,
     choose_output_sets,
+    movable_output,
     row_counts,
     write_structure_files,
 )
@@ -181,13 +187,15 @@ def _structure_of_deck(
     remarks += chosen.remarks
     if not model.has_mass:
         remarks.append("the deck has no *DENSITY: the structure has no mass, hence no modes")
+    output_rows, output_sets = _choose_outputs(jobs, blocks, matrices, options.outputs)
     structure = DeckStructure(
         model=model,
         matrices=matrices,
         region_stiffness=region_stiffness,
         loads=chosen.loads,
         load_vectors=chosen.vectors,
-        output_sets=choose_output_sets(model, row_counts(matrices.places), options.outputs),
+        output_sets=output_sets,
+        motion_rows=output_rows,
         length_unit=options.length_unit,
     )
     return structure, remarks
@@ -280,9 +288,10 @@ def _choose_loads(
     """Return the loads of a deck whose action on the rows of the matrices is known."""
     deck_loads = read_loads(jobs.model)
     remarks = list(deck_loads.remarks)
-    load_rows = _load_rows(jobs, blocks, matrices, deck_loads.loads)
+    shared_loads = share_over_couplings(jobs, blocks, deck_loads.loads)
+    load_rows = _load_rows(jobs, blocks, matrices, shared_loads)
     loads = []
-    for load in deck_loads.loads:
+    for load in shared_loads:
         if load.acceleration is not None and not jobs.model.has_mass:
             remarks.append(f"the load {load.name} is left out: the deck has no *DENSITY")
         elif load_rows.missing_rotations(load):
@@ -294,7 +303,7 @@ def _choose_loads(
         elif load_rows.missing(load):
             remarks.append(
                 f"the load {load.name} is left out: it acts on nodes whose motion does not follow "
-                "from the matrices, such as those of shells that are tied"
+                f"from the matrices, as on node {load_rows.missing(load)[0][0]}"
             )
         else:
             loads.append(load)
@@ -305,14 +314,48 @@ def _choose_loads(
     return _ChosenLoads(loads, vectors, remarks)
 
 
+def _choose_outputs(
+    jobs: CalculixJobs,
+    blocks: list[KeywordBlock],
+    matrices: StoredMatrices,
+    names: Sequence[str],
+) -> tuple[MotionRows, list[OutputSet]]:
+    """Return the sets whose mean displacement is an output, and the rows that their nodes follow.
+
+    Raises
+    ------
+    MeshError
+        If a name is no set of nodes, or if the displacement of its nodes is not known.
+    """
+    candidates = choose_output_sets(jobs.model, names)
+    held = set(jobs.model.held)
+    of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
+    eliminated = dict.fromkeys(
+        place
+        for output in candidates
+        for place in output.places()
+        if place[0] in of_elements and HeldMotion(*place) not in held
+    )
+    tied = list(eliminated.keys() - set(matrices.places))
+    rows = MotionRows(
+        matrices.places, held, read_tied_motions(jobs, blocks, matrices, sorted(tied))
+    )
+    outputs = [
+        movable_output(output, rows, option)
+        for output, option in itertools.zip_longest(candidates, names)
+    ]
+    chosen = [output for output in outputs if output is not None]
+    return rows, chosen if names else chosen[:MOST_OUTPUTS]
+
+
 def _load_rows(
     jobs: CalculixJobs,
     blocks: list[KeywordBlock],
     matrices: StoredMatrices,
     loads: list[DeckLoad],
-) -> LoadRows:
+) -> MotionRows:
     """Return how the loads act on the rows, also where CalculiX has eliminated what they move."""
-    load_rows = LoadRows(matrices.places, set(jobs.model.held))
+    load_rows = MotionRows(matrices.places, set(jobs.model.held))
     of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
     with_rows = set(matrices.places)
     tied = [
@@ -335,7 +378,7 @@ def _load_rows(
     ]
     bound = read_tied_motions(jobs, blocks, matrices, list(dict.fromkeys(tied)))
     bound |= read_rotations(jobs, blocks, matrices, list(dict.fromkeys(rotations))[:MOST_MOMENTS])
-    return LoadRows(matrices.places, load_rows.held, bound)
+    return MotionRows(matrices.places, load_rows.held, bound)
 
 
 def _gravity_forces(

@@ -99,6 +99,25 @@ def surface_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -
     return _pressure_forces(shells, faces, real(where, value))
 
 
+def surface_nodes(shells: ShellGeometry, name: str, where: str) -> list[int]:
+    """Return the nodes of the faces of a surface, each once.
+
+    Raises
+    ------
+    MeshError
+        If the deck has no such surface of faces.
+    NotReadError
+        If its faces are not read.
+    """
+    nodes: dict[int, None] = {}
+    for number, label in _surface_faces(shells, name, where):
+        element = shells.mesh.elements[number]
+        loaded_face = _loaded_face(element, label.upper())
+        face_nodes = loaded_face.kind.face_nodes[loaded_face.face]
+        nodes |= dict.fromkeys(element.nodes[index] for index in face_nodes)
+    return list(nodes)
+
+
 def _surface_faces(shells: ShellGeometry, name: str, where: str) -> list[tuple[int, str]]:
     """Return the faces of a surface: numbers of elements, each with the label of a pressure."""
     surfaces = [

@@ -72,8 +72,8 @@ class MotionReader:
 
 
 @dataclass(frozen=True)
-class LoadRows:
-    """How forces and moments at nodes act on the rows of the matrices.
+class MotionRows:
+    """How motions of nodes follow from the rows of the matrices, and loads act on these.
 
     Attributes
     ----------
@@ -93,6 +93,17 @@ class LoadRows:
     def _reader(self) -> MotionReader:
         """The rows of each motion."""
         return MotionReader(self.places)
+
+    def displacement(self, place: Place) -> WeightedRows | None:
+        """Return the displacement of a node along an axis; None if it is not known.
+
+        A held displacement follows from no row.
+        """
+        if HeldMotion(*place) in self.held:
+            return WeightedRows(np.empty(0, dtype=np.intp), np.empty(0))
+        if place in self.bound:
+            return self.bound[place]
+        return self._reader.weighted(place, READ_WEIGHTS)
 
     def names_all(self, load: DeckLoad) -> bool:
         """Return whether all forces of a load act on rows that their names tell, or on supports."""

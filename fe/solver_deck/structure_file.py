@@ -11,13 +11,13 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
-from fe.structure.matrix_files import READ_WEIGHTS
 from fe.structure.matrix_tables import Place
 
 from .calculix_jobs import StoredMatrices
 from .linear_model import TRANSLATIONS, HeldMotion, LinearModel
 from .loads import DeckLoad
 from .regions import Region, name_in_file
+from .row_vectors import MotionRows
 
 MASS_FILE = "mass.npz"
 """Name of the file of the mass matrix."""
@@ -37,7 +37,7 @@ class OutputSet(NamedTuple):
     name : str
         Name of the set in the deck.
     nodes : list of int
-        Those of its nodes that can move and have rows in the matrices.
+        Its nodes, each once. Those that are held or tied belong to the mean.
     axes : str
         The axes of the displacements: some of "xyz".
     """
@@ -45,6 +45,10 @@ class OutputSet(NamedTuple):
     name: str
     nodes: list[int]
     axes: str
+
+    def places(self) -> list[Place]:
+        """Return node and direction of all displacements that the outputs need."""
+        return [(node, "xyz".index(letter) + 1) for letter in self.axes for node in self.nodes]
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,8 @@ class DeckStructure:
         Forces of each load that nodes and directions alone do not describe, such as gravity.
     output_sets : list of OutputSet
         The sets of nodes whose displacement is an output.
+    motion_rows : MotionRows
+        How the motions of their nodes follow from the rows.
     length_unit : str
         Unit of length of the deck.
     """
@@ -75,6 +81,7 @@ class DeckStructure:
     loads: list[DeckLoad]
     load_vectors: dict[str, FloatArray]
     output_sets: list[OutputSet]
+    motion_rows: MotionRows
     length_unit: str
 
     def row_counts(self) -> dict[Place, int]:
@@ -90,29 +97,28 @@ def row_counts(places: Sequence[Place]) -> dict[Place, int]:
     return counts
 
 
-def choose_output_sets(
-    model: LinearModel, counts: dict[Place, int], names: Sequence[str]
-) -> list[OutputSet]:
-    """Return the sets of nodes whose displacement is an output.
+def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputSet]:
+    """Return the sets of nodes whose displacement may be an output.
 
     Parameters
     ----------
     model : LinearModel
         The model of the deck.
-    counts : dict of Place to int
-        How many rows each direction of a node has.
     names : sequence of str
-        Names of sets of nodes, each alone or with axes, as `TIP` or `TIP:z`; if it is empty, the
-        first sets that hold at most half of the nodes.
+        Names of sets of nodes, each alone or with axes, as `TIP` or `TIP:z`; if it is empty, all
+        sets that hold at most half of the nodes.
 
     Raises
     ------
     MeshError
-        If a name is no set or number of nodes, if its axes are none, or if none of its nodes can
-        be read.
+        If a name is no set or number of nodes, or if its axes are none.
     """
     if not names:
-        return _sets_of_deck(model, counts)
+        return [
+            OutputSet(name, list(dict.fromkeys(members)), "xyz")
+            for name, members in model.mesh.node_sets.items()
+            if members and len(members) <= 0.5 * len(model.mesh.points)
+        ]
     sets = []
     for text in names:
         name, _, axes = text.partition(":")
@@ -123,39 +129,47 @@ def choose_output_sets(
                 f"the axes {axes} were given."
             )
         members = model.mesh.nodes_named(name, f"--output {text}")
-        nodes = _readable_nodes(model, counts, members)
-        if not nodes:
-            raise MeshError(
-                f"--output {text}: a set with nodes that can move is expected, but all its nodes "
-                "are held, or tied to others; name another set."
-            )
-        sets.append(OutputSet(name.upper(), nodes, axes))
+        sets.append(OutputSet(name.upper(), list(dict.fromkeys(members)), axes))
     return sets
 
 
-def _sets_of_deck(model: LinearModel, counts: dict[Place, int]) -> list[OutputSet]:
-    """Return the first sets of a deck that can move and hold at most half of the nodes."""
-    sets = []
-    for name, members in model.mesh.node_sets.items():
-        nodes = _readable_nodes(model, counts, members)
-        if nodes and len(nodes) <= 0.5 * len(model.mesh.points):
-            sets.append(OutputSet(name, nodes, "xyz"))
-    return sets[:MOST_OUTPUTS]
+def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> OutputSet | None:
+    """Return an output along those of its axes along which its mean displacement is known.
 
+    Parameters
+    ----------
+    output : OutputSet
+        The set.
+    rows : MotionRows
+        How motions of nodes follow from the rows of the matrices.
+    option : str or None
+        The text of `--output`; None if the set was not named. A set that was not named and has no
+        such axis is no output.
 
-def _readable_nodes(
-    model: LinearModel, counts: dict[Place, int], members: Sequence[int]
-) -> list[int]:
-    """Return the members whose displacement follows from the rows of the matrices, each once."""
-    held = set(model.held)
-    return [node for node in dict.fromkeys(members) if _can_be_read(node, counts, held)]
-
-
-def _can_be_read(node: int, counts: dict[Place, int], held: set[HeldMotion]) -> bool:
-    """Return whether the displacement of a node along all axes follows from the rows."""
-    return all(
-        counts.get((node, axis)) in READ_WEIGHTS and HeldMotion(node, axis) not in held
-        for axis in TRANSLATIONS
+    Raises
+    ------
+    MeshError
+        If a named set has no such axis, or lacks one that the user named.
+    """
+    unknown_nodes = []
+    known_axes = ""
+    for letter in output.axes:
+        motions = output._replace(axes=letter).places()
+        unknown = [node for node, axis in motions if rows.displacement((node, axis)) is None]
+        unknown_nodes += unknown
+        if not unknown and not all(HeldMotion(*motion) in rows.held for motion in motions):
+            known_axes += letter
+    is_whole = known_axes == output.axes or (option is not None and ":" not in option)
+    if known_axes and (is_whole or option is None):
+        return output._replace(axes=known_axes)
+    if option is None:
+        return None
+    reason = "all its nodes are held"
+    if unknown_nodes:
+        reason = f"how node {unknown_nodes[0]} moves does not follow from the matrices of CalculiX"
+    raise MeshError(
+        f"--output {option}: a set with nodes that can move is expected, but {reason}; name "
+        "another set, or other axes."
     )
 
 
@@ -219,16 +233,36 @@ def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> 
     if not name[0].isalpha():
         name = f"n{name}"[:LARGEST_NAME]
     nodes = output.nodes
+    counts = structure.row_counts()
     for letter in output.axes:
-        axis = "xyz".index(letter) + 1
-        file = f"{name}_{letter}.txt"
-        rows = [f"{node} {axis} {1.0 / len(nodes)!r}" for node in nodes]
-        (folder / file).write_text("\n".join(rows) + "\n", encoding="ascii")
+        file = _write_mean(structure, output._replace(axes=letter), f"{name}_{letter}", folder)
         yield from ("", "[[displacement]]", f'name = "{name}_{letter}"', f'vector = "{file}"')
-    if len(nodes) == 2:
+    have_rows = all((node, axis) in counts for node in nodes for axis in TRANSLATIONS)
+    if len(nodes) == 2 and have_rows:
         first, second = (structure.model.mesh.points[node] for node in nodes)
         span = second - first
         length = float(np.linalg.norm(span))
         if length > 0.0:
             yield from ("", "[[gauge]]", f'name = "{name}"', f"nodes = {nodes}")
             yield from (f"direction = {(span / length).tolist()}", f"length = {length!r}")
+
+
+def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: Path) -> str:
+    """Write the vector of a mean displacement along one axis, and return the name of its file.
+
+    A table of nodes tells more than a vector of all rows, but cannot contain tied nodes.
+    """
+    rows = structure.motion_rows
+    weight = 1.0 / len(output.nodes)
+    places = [place for place in output.places() if HeldMotion(*place) not in rows.held]
+    if any(place in rows.bound for place in places):
+        mean = np.zeros(len(rows.places))
+        for place in places:
+            motion = rows.displacement(place)
+            assert motion is not None  # checked when the output was chosen
+            mean += weight * motion.vector(len(mean))
+        np.save(folder / f"{name}.npy", mean)
+        return f"{name}.npy"
+    lines = [f"{node} {axis} {weight!r}" for node, axis in places]
+    (folder / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
+    return f"{name}.txt"
