@@ -1,14 +1,14 @@
 """`uav-twin fmu simulate`, `ssp simulate` and `library sample`: runs of FMUs and their systems."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from fmu_asset.errors import FmuInputError
+from fmu_asset.errors import FmuInputError, FmuWorkerError
 from reporting import terminal
 from reporting.files import atomic_write_bytes, refuse_existing
 from twin_master.command_options import complete_scenario
@@ -113,26 +113,55 @@ def simulate(
             step_size=step_size,
             values=_values_by_name(values or ()),
         )
-        with closing(
-            FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
-        ) as asset:
-            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
+
+        def open_asset_of_experiment() -> FmiAsset:
+            return FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
+
+        def run_whole_experiment(asset: FmiAsset) -> "ObservationHistory":
+            return run_experiment(asset, experiment)
+
+        with closing(open_asset_of_experiment()) as asset:
+            history = _history_or_located_crash(
+                asset, open_asset_of_experiment, run_whole_experiment
+            )
+            _write_and_print_history(asset, history, file, out, plot)
         return
     # With a binding: the inputs over time from a file
     assert inputs is not None  # checked above: both options are given or neither
     fmu_binding = _with_interpolation(load_binding(binding), interpolation)
     steps, histories = read_histories(inputs, fmu_binding)
     fmu_binding = ending_with_histories(fmu_binding, steps)
-    with closing(
-        FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
-    ) as asset:
+
+    def open_bound_asset() -> FmiAsset:
+        return FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
+
+    def run_all_histories(asset: FmiAsset) -> "ObservationHistory":
+        return run_histories(asset, steps, histories)
+
+    with closing(open_bound_asset()) as asset:
         for warning in (
             unset_inputs_sentence(asset.description, asset.binding, histories),
             undeclared_units_sentence(asset.description, asset.binding),
         ):
             if warning:
                 terminal.say(f"warning: {warning}")
-        _write_and_print_history(asset, run_histories(asset, steps, histories), file, out, plot)
+        history = _history_or_located_crash(asset, open_bound_asset, run_all_histories)
+        _write_and_print_history(asset, history, file, out, plot)
+
+
+def _history_or_located_crash(
+    asset: "FmiAsset",
+    open_asset: Callable[[], "FmiAsset"],
+    run: Callable[["FmiAsset"], "ObservationHistory"],
+) -> "ObservationHistory":
+    """Return the history of a run; if the FMU crashes, find the step and what was refused."""
+    from fmu_asset.checks.crash import located_crash
+
+    try:
+        return run(asset)
+    except FmuWorkerError as crash:
+        error = crash
+    raise located_crash(open_asset, run, error)
 
 
 def _refuse_options_that_contradict(

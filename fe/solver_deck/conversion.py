@@ -3,7 +3,7 @@
 import itertools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ from .comparison import DeckReport, compare_with_calculix, refuse_deviations
 from .couplings import share_over_couplings
 from .linear_model import (
     ContactChoice,
-    HeldMotion,
     LinearModel,
     PreloadChoice,
     read_linear_model,
@@ -328,18 +327,16 @@ def _choose_outputs(
         If a name is no set of nodes, or if the displacement of its nodes is not known.
     """
     candidates = choose_output_sets(jobs.model, names)
-    held = set(jobs.model.held)
+    rows = MotionRows(matrices.places, set(jobs.model.held))
     of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
     eliminated = dict.fromkeys(
         place
         for output in candidates
         for place in output.places()
-        if place[0] in of_elements and HeldMotion(*place) not in held
+        if place[0] in of_elements and not rows.is_held(place)
     )
     tied = list(eliminated.keys() - set(matrices.places))
-    rows = MotionRows(
-        matrices.places, held, read_tied_motions(jobs, blocks, matrices, sorted(tied))
-    )
+    rows = replace(rows, bound=read_tied_motions(jobs, blocks, matrices, sorted(tied)))
     outputs = [
         movable_output(output, rows, option)
         for output, option in itertools.zip_longest(candidates, names)

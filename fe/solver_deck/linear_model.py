@@ -12,7 +12,7 @@ from typing import Literal
 
 from fe.runtime.errors import MeshError
 from fe.structure.abaqus import DataLine, KeywordBlock, read_blocks
-from fe.structure.deck_text import real, whole
+from fe.structure.deck_text import fail, real, whole
 from reporting.words import comma_list
 
 from .mesh_of_deck import DeckMesh, read_deck_mesh
@@ -42,6 +42,13 @@ _REFUSED = {
     "USER ELEMENT": "has elements that are compiled into a CalculiX of its author",
 }
 """Keywords without which the deck is another model, with the reason."""
+
+_NONLINEAR_MPCS = {
+    "PLANE": "keeps nodes in one plane, whose direction changes with their motion",
+    "STRAIGHT": "keeps nodes on one line, whose direction changes with their motion",
+    "DIST": "keeps two nodes at a distance, which is quadratic in their motion",
+}
+"""Constraints of *MPC of which CalculiX stores no finite matrix, with the reason."""
 
 _PLASTICITY = (
     "plasticity and creep are left out: the material is elastic, with the modulus of *ELASTIC"
@@ -329,6 +336,16 @@ def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:
                 f"{block.where}: a deck of an elastic structure is expected, but "
                 f"*{block.keyword} {_REFUSED[block.keyword]}."
             )
+        if block.keyword == "MPC":
+            for where, values in block.data:
+                kind = values[0].upper()
+                if kind in _NONLINEAR_MPCS:
+                    fail(
+                        where,
+                        f"*MPC {kind} {_NONLINEAR_MPCS[kind]}, and cannot be linearised; "
+                        "write it as *EQUATION for small motions, or as "
+                        "*RIGID BODY.",
+                    )
     keywords = {block.keyword for block in blocks}
     if "ELASTIC" not in keywords:
         materials = [

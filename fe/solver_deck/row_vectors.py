@@ -94,12 +94,17 @@ class MotionRows:
         """The rows of each motion."""
         return MotionReader(self.places)
 
+    def is_held(self, place: Place) -> bool:
+        """Return whether a motion is held."""
+        node, direction = place
+        return HeldMotion(node, direction) in self.held
+
     def displacement(self, place: Place) -> WeightedRows | None:
         """Return the displacement of a node along an axis; None if it is not known.
 
         A held displacement follows from no row.
         """
-        if HeldMotion(*place) in self.held:
+        if self.is_held(place):
             return WeightedRows(np.empty(0, dtype=np.intp), np.empty(0))
         if place in self.bound:
             return self.bound[place]
@@ -127,7 +132,7 @@ class MotionRows:
         return [
             place
             for place in dict.fromkeys(places)
-            if HeldMotion(*place) not in self.held
+            if not self.is_held(place)
             and self._reader.weighted(place, FORCE_WEIGHTS) is None
             and not (bound and place in self.bound)
         ]
@@ -137,7 +142,7 @@ class MotionRows:
         return [
             place
             for place, moment in load.moments.items()
-            if moment and place not in self.bound and HeldMotion(*place) not in self.held
+            if moment and place not in self.bound and not self.is_held(place)
         ]
 
     def vector(self, load: DeckLoad) -> FloatArray:
@@ -154,7 +159,7 @@ class MotionRows:
         self, vector: FloatArray, weighted: WeightedRows | None, force: float, place: Place
     ) -> None:
         """Add a force on a motion to a vector (n,)."""
-        if weighted is not None and HeldMotion(*place) not in self.held:
+        if weighted is not None and not self.is_held(place):
             np.add.at(vector, weighted.rows, force * weighted.weights)
 
     def _rows_of(self, place: Place) -> WeightedRows | None:

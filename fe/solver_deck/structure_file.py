@@ -157,7 +157,7 @@ def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> O
         motions = output._replace(axes=letter).places()
         unknown = [node for node, axis in motions if rows.displacement((node, axis)) is None]
         unknown_nodes += unknown
-        if not unknown and not all(HeldMotion(*motion) in rows.held for motion in motions):
+        if not unknown and not all(map(rows.is_held, motions)):
             known_axes += letter
     is_whole = known_axes == output.axes or (option is not None and ":" not in option)
     if known_axes and (is_whole or option is None):
@@ -254,7 +254,7 @@ def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: 
     """
     rows = structure.motion_rows
     weight = 1.0 / len(output.nodes)
-    places = [place for place in output.places() if HeldMotion(*place) not in rows.held]
+    places = [place for place in output.places() if not rows.is_held(place)]
     if any(place in rows.bound for place in places):
         mean = np.zeros(len(rows.places))
         for place in places:

@@ -5,7 +5,7 @@ meshio reads such files as well, but neither NSET of *NODE, nor GENERATE over se
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -22,7 +22,11 @@ from .deck_text import FLAT, fail, lines_of, real, whole, words_of
 _COMMENT = re.compile(r"^\s*\*\*.*")
 _INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _TYPES_OF_MESHIO = {"C3D8RH": "C3D8", "C3D10MH": "C3D10", "C3D20RH": "C3D20"}
-"""Types under which meshio writes plain hexahedra and tetrahedra, and their plain types."""
+"""Types under which meshio writes plain hexahedra and tetrahedra, and their plain types.
+
+They have these types only in files of meshio. In others they are what they say.
+"""
+_HEADING_OF_MESHIO = "written by meshio"
 
 _HYBRID_OR_THERMAL_TYPE = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
 """Hybrid elements (H) and those with a temperature (T), with the plain type as the group.
@@ -30,6 +34,7 @@ _HYBRID_OR_THERMAL_TYPE = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
 They have the stiffness of the plain type where the material is compressible.
 """
 
+_HYBRID = re.compile(r"(C3D\d+[A-Z]*)H")
 _VARIANT = re.compile(r"(C3D\d+)[A-Z]+")
 _OTHER_STIFFNESS = {
     "C3D8I": "enhanced by incompatible modes and softer in bending",
@@ -107,7 +112,11 @@ def read_abaqus(path: Path) -> Deck:
     words = words_of("abaqus")
     deck = Deck(path, words)
     coordinates = GLOBAL  # a *SYSTEM holds for the nodes after it
+    types_of_writer: Mapping[str, str] = {}
     for block in read_blocks(path):
+        heading = " ".join(value for line in block.data for value in line.values)
+        if block.keyword == "HEADING" and _HEADING_OF_MESHIO in heading:
+            types_of_writer = _TYPES_OF_MESHIO
         # Only the line of a section is kept, for messages on its set; its data are ignored below.
         if block.keyword.endswith(" SECTION"):
             deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
@@ -124,7 +133,7 @@ def read_abaqus(path: Path) -> Deck:
         if block.keyword == "NODE":
             _add_nodes(deck, block, coordinates)
         elif block.keyword == "ELEMENT":
-            _add_elements(deck, block)
+            _add_elements(deck, block, types_of_writer)
         elif block.keyword == "SYSTEM":
             coordinates = _coordinate_system(block)
         elif block.keyword == "SURFACE":
@@ -232,10 +241,13 @@ def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -
         deck.members("NSET", block.required("NSET")).extend(numbers)
 
 
-def _add_elements(deck: Deck, block: KeywordBlock) -> None:
-    """Add the elements of an *ELEMENT; an element may take several lines."""
+def _add_elements(deck: Deck, block: KeywordBlock, types_of_writer: Mapping[str, str]) -> None:
+    """Add the elements of an *ELEMENT; an element may take several lines.
+
+    The program that wrote the deck may mean plain types by others: `types_of_writer` has them.
+    """
     type_name = block.required("TYPE").upper()
-    plain_type = _plain_type(type_name, block.where)
+    plain_type = types_of_writer.get(type_name) or _plain_type(type_name, block.where)
     if plain_type != type_name:
         deck.remark(f"{block.where}: elements of type {type_name} are built as {plain_type}.")
     element_type = _ELEMENT_TYPES[plain_type]
@@ -277,12 +289,7 @@ def _plain_type(name: str, where: str) -> str:
         If elements of this type cannot be read.
     """
     variant = _HYBRID_OR_THERMAL_TYPE.fullmatch(name)
-    if name in _TYPES_OF_MESHIO:
-        plain_type = _TYPES_OF_MESHIO[name]
-    elif variant is not None:
-        plain_type = variant[1]
-    else:
-        plain_type = name
+    plain_type = name if variant is None else variant[1]
     if plain_type not in _ELEMENT_TYPES:
         _refuse_type(name, where)  # never returns
     return plain_type
@@ -297,7 +304,11 @@ def _refuse_type(name: str, where: str) -> NoReturn:
     variant = _VARIANT.fullmatch(name)
     if variant is None or variant[1] not in _ELEMENT_TYPES:
         fail(where, f"elements of type {short_repr(name)} cannot be read; {readable} can.")
-    difference = f"they are {_OTHER_STIFFNESS.get(name, 'other elements')}, not {variant[1]}"
+    # A hybrid element differs from the plain type as that without H does.
+    hybrid = _HYBRID.fullmatch(name)
+    displacement_type = name if hybrid is None else hybrid[1]
+    stiffness = _OTHER_STIFFNESS.get(displacement_type, "other elements")
+    difference = f"they are {stiffness}, not {variant[1]}"
     remedy = f"write {variant[1]} if that is meant"
     if variant[1] == "C3D8":
         remedy = f"mesh with second-order elements (C3D20, C3D20R or C3D10), or {remedy}"

@@ -16,6 +16,7 @@ _WORDS_FILE = parse_toml(
 )
 
 _LARGEST_NUMBER = 2**53
+_OPEN_QUOTATION = re.compile(r"""(['"])(?!.*\1).*""")
 _MISSING_EXPONENT = re.compile(r"(?<=[\d.])(?=[+-])")
 
 
@@ -82,7 +83,8 @@ def lines_of(
 ) -> Iterator[tuple[str, str]]:
     """Yield the lines of a file; a line that includes another file is replaced by its lines.
 
-    Comments and empty lines are left out.
+    Comments and empty lines are left out. The name of an included file may go on over several lines
+    until its quotation mark closes.
 
     Parameters
     ----------
@@ -100,10 +102,16 @@ def lines_of(
     """
     file = files[-1]
     text = read_text(file, MeshError, what="mesh file", otherwise="latin-1")
+    open_include = ""
     for number, line in enumerate(text.splitlines(), start=1):
         where = f"{file}, line {number}"
         line = comment.sub("", line).rstrip()
+        if open_include:
+            line = open_include + line.strip()
         match = include.fullmatch(line)
+        open_include = line if match and _OPEN_QUOTATION.fullmatch(match[1].strip()) else ""
+        if open_include:
+            continue
         if match:
             included_file = (file.parent / match[1].strip(" '\"")).resolve()
             if included_file in files:
@@ -111,6 +119,8 @@ def lines_of(
             yield from lines_of((*files, included_file), comment, include)
         elif line:
             yield where, line
+    if open_include:
+        fail(str(file), f"the quotation mark in {short_repr(open_include)} does not close.")
 
 
 def whole(where: str, text: str) -> int:

@@ -45,6 +45,8 @@ def read_by_meshio(path: Path) -> Deck:
     MeshError
         If meshio cannot read it, or loses elements of it.
     """
+    if path.suffix.lower() == ".msh":
+        _refuse_options_of_gmsh(path)
     mesh = _mesh_of_meshio(path)
     deck = Deck(path)
     if path.suffix.lower() == ".msh":
@@ -265,6 +267,25 @@ def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
     return outside
 
 
+_PARAMETRIC = (
+    "its nodes have parametric coordinates, which are not read; set Mesh.SaveParametric = 0 in "
+    "Gmsh and save the mesh again."
+)
+
+
+def _refuse_options_of_gmsh(path: Path) -> None:
+    """Refuse a mesh that Gmsh has saved in parts, or with parameters of nodes on surfaces."""
+    content = path.read_bytes()
+    if b"$PartitionedEntities" in content or b"$GhostElements" in content:
+        fail(
+            str(path),
+            "the mesh is partitioned for several processors, and is not read so; delete the "
+            "partitions in Gmsh (Tools, Partition, Delete) and save the mesh again.",
+        )
+    if b"$ParametricNodes" in content:
+        fail(str(path), _PARAMETRIC)
+
+
 def _check_element_lines(path: Path) -> None:
     """Refuse a text file of Gmsh with more lines of elements than it declares.
 
@@ -294,10 +315,11 @@ def _check_element_lines(path: Path) -> None:
 def _mesh_of_meshio(path: Path) -> Mesh:
     """Return the mesh that meshio reads from a file; if it fails, say in one sentence why."""
     printed_text = io.StringIO()
+    reasons_of_formats = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program if it fails.
         with (
-            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stdout(reasons_of_formats),
             contextlib.redirect_stderr(printed_text),
             warnings.catch_warnings(),
         ):
@@ -314,6 +336,8 @@ def _mesh_of_meshio(path: Path) -> Mesh:
                 "some elements are in a physical group and others in none, as Gmsh saves them with "
                 "Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh again.",
             )
+    if "parametric nodes" in reasons_of_formats.getvalue() + reason:
+        fail(str(path), _PARAMETRIC)
     reason = " ".join(reason[:_LONGEST_REASON].split()).rstrip(".")
     raise MeshError(
         f"The mesh file {path} cannot be read as {path.suffix}: {reason}; it is damaged, cut off, "

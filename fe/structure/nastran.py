@@ -34,6 +34,8 @@ _INCLUDE = re.compile(r"\s*INCLUDE\b(.*)", re.IGNORECASE)
 _BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
 _MARKER = re.compile(r"\+(?![\d.])")
 _MOST_NESTED_SYSTEMS = 50
+_MOST_REPLICAS = 1_000_000
+_WHOLE_NUMBER = re.compile(r"[+-]?\d+")
 
 
 class _Card(NamedTuple):
@@ -291,8 +293,75 @@ def _bulk_lines(path: Path) -> list[_Line]:
         head, *fields, end = _fields(where, text.expandtabs(8))
         if head.upper().startswith("ENDDATA"):
             break
-        bulk_lines.append(_Line(where, head, fields, end.lstrip("+*").upper()))
+        line = _Line(where, head, fields, end.lstrip("+*").upper())
+        if head.startswith("="):
+            bulk_lines += _replicated(line, bulk_lines)
+        else:
+            bulk_lines.append(line)
     return bulk_lines
+
+
+def _replicated(line: _Line, lines_above: list[_Line]) -> list[_Line]:
+    """Return the lines that a line with `=` stands for, which repeats the line above.
+
+    A field `=` has the value of the line above, `==` all fields from there on have, and `*(i)` adds
+    i to it. A line `=n` repeats the increments of the line above n times.
+    """
+    count_text = line.head.lstrip("=").strip("()")
+    if not lines_above or (count_text and len(lines_above) < 2):
+        fail(
+            line.where, f"the line {short_repr(line.head)} repeats a line above, but none is there."
+        )
+    previous = lines_above[-1]
+    if not count_text:
+        return [_with_changed_fields(line, previous)]
+    count = whole(line.where, count_text)
+    before = lines_above[-2]
+    replicas = []
+    for _ in range(min(count, _MOST_REPLICAS)):
+        fields = [
+            _incremented(line.where, last, _increment(line.where, first, last))
+            for first, last in zip(before.fields, previous.fields, strict=True)
+        ]
+        before = previous
+        previous = previous._replace(where=line.where, fields=fields)
+        replicas.append(previous)
+    if count > _MOST_REPLICAS:
+        fail(
+            line.where, f"at most {_MOST_REPLICAS:,} repetitions are read, but {count:,} are asked."
+        )
+    return replicas
+
+
+def _with_changed_fields(line: _Line, previous: _Line) -> _Line:
+    """Return a copy of the previous line in which the fields that a line states are changed."""
+    fields = list(previous.fields)
+    for number, text in enumerate(line.fields[: len(fields)]):
+        if text == "==":
+            break
+        if text.startswith("*"):
+            fields[number] = _incremented(line.where, fields[number], text[1:].strip("()"))
+        elif text != "=":
+            fields[number] = text
+    return previous._replace(where=line.where, fields=fields)
+
+
+def _increment(where: str, first: str, last: str) -> str:
+    """Return by how much a field grows from one line to the next; 0 for equal texts."""
+    if first == last:
+        return "0"
+    if _WHOLE_NUMBER.fullmatch(last):
+        return str(whole(where, last) - whole(where, first))
+    return repr(real(where, last) - real(where, first))
+
+
+def _incremented(where: str, text: str, increment: str) -> str:
+    """Return a field with an increment added; a whole number stays one."""
+    if increment == "0":
+        return text
+    if _WHOLE_NUMBER.fullmatch(text):
+        return str(whole(where, text) + whole(where, increment))
+    return repr(real(where, text) + real(where, increment))
 
 
 def _refuse_continuation(line: _Line) -> NoReturn:

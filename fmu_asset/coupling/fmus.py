@@ -26,7 +26,7 @@ from fmu_asset.errors import (
     FmuStateError,
     IterationError,
 )
-from fmu_asset.instances.plan import InitialValues, Instance
+from fmu_asset.instances.plan import REPORT_PERIOD, InitialValues, Instance
 from reporting.words import comma_list
 
 from .outputs import OutputSelection
@@ -113,6 +113,7 @@ class CoupledFmus(InstanceHost):
     """
 
     lost = False
+    report_period = REPORT_PERIOD
 
     def __init__(
         self,

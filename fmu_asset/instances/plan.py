@@ -346,11 +346,14 @@ class Instance(Protocol):
         inputs, the reply all outputs. Integers and Booleans are stored as doubles.
     lost : bool
         Whether the instance can no longer be used.
+    report_period : float
+        Seconds after which a run of many steps reports; at 0 it reports each step.
     """
 
     request: DoubleBlock
     reply: DoubleBlock
     lost: bool
+    report_period: float = REPORT_PERIOD
 
     def __init__(self, plan: Plan) -> None:
         output_count = sum(group.count for group in plan.outputs)
@@ -412,8 +415,9 @@ class Instance(Protocol):
         step = self.step
         sum_of_squares = reply.dot
         now = time.monotonic
+        period = self.report_period
         steps_done = 0
-        next_report = now() + REPORT_PERIOD
+        next_report = now() + period
         try:
             for request_row, reply_row in zip(requests, replies, strict=True):
                 request[:] = request_row
@@ -423,9 +427,9 @@ class Instance(Protocol):
                 # a fast test first: the sum of squares can be infinite for large values, too
                 if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
                     return
-                if now() > next_report:
+                if now() >= next_report:
                     report(steps_done)
-                    next_report = now() + REPORT_PERIOD
+                    next_report = now() + period
         finally:
             report(steps_done)
 

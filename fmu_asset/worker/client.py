@@ -28,6 +28,7 @@ from .protocol import (
     send,
     separated,
 )
+from .refusals import report_descriptor
 from .sandbox import Grants
 
 _MEBIBYTE = 1024**2
@@ -195,7 +196,10 @@ class WorkerInstance(Instance):
         report : callable
             Called with the number of finished steps whenever a part has arrived.
         """
-        self._ask(Question.CALL, "run", self._pickled("run", requests))
+        # While the refusals of the sandbox are counted, each step is a part, so that a crash names
+        # the step itself.
+        period = REPORT_PERIOD if report_descriptor() is None else 0.0
+        self._ask(Question.CALL, "run", self._pickled("run", requests, period))
         reply_bytes = replies.data.cast("B")
         bytes_per_step = replies[0].nbytes
         filled_bytes = 0

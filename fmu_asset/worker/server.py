@@ -250,7 +250,7 @@ class _Server:
         if call.name == "open":
             return b""
         if call.name == "run":
-            (requests,) = call.arguments
+            requests, instance.report_period = call.arguments
             self._run(instance, requests)
             return b""
         if call.name == "take_log":

@@ -340,6 +340,15 @@ def test_a_problem_is_named_and_the_exit_code_says_so(crashing_check):
     assert "Traceback" not in done.stdout + done.stderr
 
 
+@pytest.mark.parametrize("step", [0, 37])
+def test_a_simulation_names_the_step_of_a_crash_and_what_was_refused(foreign_fmu, step):
+    fmu = foreign_fmu("hostile2", "SEGFAULT", f"AFTER={step}")
+    sentence = refused("fmu", "simulate", fmu, "--step-size", "0.01", "--stop-time", "1")
+    assert f"step {step} from t = {0.01 * step:g} s" in sentence
+    assert "SIGSEGV" in sentence
+    assert "The sandbox refused " in sentence
+
+
 def test_a_problem_is_a_verdict_of_the_data(crashing_check):
     record = json.loads(command(*crashing_check, "--json").stdout)
     assert record["passed"] is False

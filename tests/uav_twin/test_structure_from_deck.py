@@ -141,6 +141,11 @@ ELASTIC = "*ELASTIC\n70000., 0.33\n"
             (),
             "gravity needs a direction, but its three components are zero.",
         ),
+        (
+            skin_deck((ELASTIC, f"{ELASTIC}*MPC\nplane,1,2,3,4\n")),
+            (),
+            "*MPC PLANE keeps nodes in one plane, whose direction changes with their motion, and cannot",
+        ),
         (skin_deck(), ("--tolerance", "1e-9"), "the matrices and CalculiX must agree to 1e-09, but the"),
     ],
     ids=[
@@ -154,6 +159,7 @@ ELASTIC = "*ELASTIC\n70000., 0.33\n"
         "held output",
         "unknown axis",
         "gravity without direction",
+        "nonlinear constraint",
         "deviation",
     ],
 )

@@ -173,6 +173,79 @@ def test_a_deck_that_includes_itself_is_refused(tmp_path):
         read_lines(tmp_path / "m.inp", *[include_itself] * 100, *ABAQUS_TETRAHEDRON)
 
 
+@pytest.mark.parametrize("type_name", ["C3D20RH", "C3D20H"])
+def test_a_hybrid_element_is_built_without_pressure(tmp_path, type_name):
+    """C3D20RH is integrated as C3D20R, unless meshio wrote it for C3D20."""
+    mesh = read_lines(tmp_path / "m.inp", *cube_of(type_name))
+    plain = read_lines(tmp_path / "plain.inp", *cube_of(type_name.removesuffix("H")))
+    assert mesh.kind == plain.kind
+    assert mesh.remarks[0].endswith(f"are built as {type_name.removesuffix('H')}.")
+
+
+def test_hexahedra_of_meshio_are_plain(tmp_path):
+    heading = ("*HEADING", "Abaqus DataFile Format", "written by meshio v5.3.5")
+    mesh = read_lines(tmp_path / "m.inp", *heading, *cube_of("C3D20RH"))
+    plain = read_lines(tmp_path / "plain.inp", *cube_of("C3D20"))
+    assert mesh.kind == plain.kind
+
+
+def cube_of(type_name: str) -> list[str]:
+    """Return the lines of a deck with one hexahedron of 20 nodes."""
+    points, cells = box("hexahedron20", (1, 1, 1))
+    nodes = [
+        f"{number}, {x}, {y}, {z}" for number, (x, y, z) in enumerate(points.tolist(), start=1)
+    ]
+    numbers = [str(index + 1) for index in cells[0].tolist()]
+    element = [f"1, {', '.join(numbers[:10])},", ", ".join(numbers[10:])]
+    return ["*NODE", *nodes, f"*ELEMENT, TYPE={type_name}", *element]
+
+
+# ---------------------------------------------------------------- includes and replicas of Nastran
+
+
+def test_the_name_of_an_included_file_goes_on_over_lines(tmp_path):
+    folder = tmp_path / "a_long_name_of_a_folder"
+    folder.mkdir()
+    (folder / "nodes.bdf").write_text("\n".join(NASTRAN_TETRAHEDRON[:4]))
+    include = ("BEGIN BULK", "INCLUDE 'a_long_name", "  _of_a_folder/", "nodes.bdf'")
+    mesh = read_lines(tmp_path / "m.bdf", *include, *NASTRAN_TETRAHEDRON[4:])
+    assert volume_of(mesh) == pytest.approx(1.0 / 6.0)
+
+
+def test_an_open_quotation_mark_is_refused(tmp_path):
+    lines = ("BEGIN BULK", "INCLUDE 'nodes.bdf", *NASTRAN_TETRAHEDRON)
+    with pytest.raises(MeshError, match=r"m\.bdf: the quotation mark in .* does not close"):
+        read_lines(tmp_path / "m.bdf", *lines)
+
+
+def test_fields_are_replicated_with_increments(tmp_path):
+    """Four cubes in a row: nodes and elements are repeated with `=`, `*(i)`, `==` and `=n`."""
+    lines = ["BEGIN BULK"]
+    for corner, (y, z) in enumerate([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]):
+        lines += [f"GRID,{corner + 1},,0.,{y},{z}", "=,*(4),=,*(1.),==", "=(3)"]
+    lines += ["CHEXA,1,1,1,2,3,4,5,6,", "+,7,8"]
+    for element in range(1, 4):
+        numbers = [str(4 * element + corner) for corner in range(1, 9)]
+        lines += [f"CHEXA,{element + 1},1,{','.join(numbers[:6])},", f"+,{','.join(numbers[6:])}"]
+    mesh = read_lines(tmp_path / "m.bdf", *lines)
+    assert len(mesh.points) == 20
+    assert volume_of(mesh) == pytest.approx(4.0)
+
+
+def test_replicas_in_columns_are_read(tmp_path):
+    """A tetrahedron whose node on z repeats the node at the origin."""
+    lines = ["BEGIN BULK", "GRID    1               0.      0.      0."]
+    lines += ["=       *1      =       =       =       *1.", "GRID,3,,1.,0.,0.", "GRID,4,,0.,1.,0."]
+    mesh = read_lines(tmp_path / "m.bdf", *lines, "CTETRA,1,1,1,3,4,2")
+    assert volume_of(mesh) == pytest.approx(1.0 / 6.0)
+
+
+@pytest.mark.parametrize("lines", [["=,*1,=="], ["GRID,1,,0.,0.,0.", "=3"]])
+def test_a_replica_of_nothing_is_refused(tmp_path, lines):
+    with pytest.raises(MeshError, match="repeats a line above, but none is there"):
+        read_lines(tmp_path / "m.bdf", "BEGIN BULK", *lines)
+
+
 # ---------------------------------------------------------------- systems of Nastran
 
 SHIFT = np.array([5.0, 6.0, 7.0])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fe.elements.kinds import KINDS, meshio_with_wedges
+from fe.runtime.errors import MeshError
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.meshio_file import read_by_meshio
@@ -202,6 +203,27 @@ def test_elements_that_stand_twice_without_groups_are_refused(grouped_box, tmp_p
     assert_mesh_refused(
         tmp_path / "m.vtu", r"m\.vtu: 2 elements, such as 13, have the nodes of another"
     )
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        (
+            ["$PartitionedEntities", "2", "0", "0 0 0 0", "$EndPartitionedEntities"],
+            "is partitioned",
+        ),
+        (["$ParametricNodes", "0", "$EndParametricNodes"], "have parametric coordinates"),
+        (
+            ["$Nodes", "1 1 1 1", "2 1 1 1", "1", "0 0 0 0.5 0.5", "$EndNodes"],
+            "have parametric coord",
+        ),
+    ],
+)
+def test_a_mesh_of_gmsh_with_parts_or_parameters_is_refused(tmp_path, lines, sentence):
+    file = tmp_path / "m.msh"
+    file.write_text("\n".join(["$MeshFormat", "4.1 0 8", "$EndMeshFormat", *lines]) + "\n")
+    with pytest.raises(MeshError, match=f"m.msh: .*{sentence}.*save the mesh again"):
+        read_mesh(file, 1.0, "m")
 
 
 # ---------------------------------------------------------------- all elements saved by Gmsh
