@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -104,7 +105,7 @@ def simulate(
     _refuse_options_that_contradict(
         binding, inputs, interpolation, has_experiment_options=has_experiment_options
     )
-    isolated = not in_process
+    open_with_binding = partial(FmiAsset, file, isolated=not in_process, step_timeout=step_timeout)
     # Without a binding: the default experiment of the FMU
     if binding is None:
         experiment = default_experiment(
@@ -113,17 +114,10 @@ def simulate(
             step_size=step_size,
             values=_values_by_name(values or ()),
         )
-
-        def open_asset_of_experiment() -> FmiAsset:
-            return FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
-
-        def run_whole_experiment(asset: FmiAsset) -> "ObservationHistory":
-            return run_experiment(asset, experiment)
-
-        with closing(open_asset_of_experiment()) as asset:
-            history = _history_or_located_crash(
-                asset, open_asset_of_experiment, run_whole_experiment
-            )
+        open_asset = partial(open_with_binding, experiment.binding)
+        with closing(open_asset()) as asset:
+            run = partial(run_experiment, experiment=experiment)
+            history = _history_or_located_crash(asset, open_asset, run)
             _write_and_print_history(asset, history, file, out, plot)
         return
     # With a binding: the inputs over time from a file
@@ -131,22 +125,19 @@ def simulate(
     fmu_binding = _with_interpolation(load_binding(binding), interpolation)
     steps, histories = read_histories(inputs, fmu_binding)
     fmu_binding = ending_with_histories(fmu_binding, steps)
-
-    def open_bound_asset() -> FmiAsset:
-        return FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
-
-    def run_all_histories(asset: FmiAsset) -> "ObservationHistory":
-        return run_histories(asset, steps, histories)
-
-    with closing(open_bound_asset()) as asset:
-        for warning in (
-            unset_inputs_sentence(asset.description, asset.binding, histories),
-            undeclared_units_sentence(asset.description, asset.binding),
-        ):
-            if warning:
-                terminal.say(f"warning: {warning}")
-        history = _history_or_located_crash(asset, open_bound_asset, run_all_histories)
+    open_asset = partial(open_with_binding, fmu_binding)
+    with closing(open_asset()) as asset:
+        _warn(unset_inputs_sentence(asset.description, asset.binding, histories))
+        _warn(undeclared_units_sentence(asset.description, asset.binding))
+        run = partial(run_histories, steps=steps, histories=histories)
+        history = _history_or_located_crash(asset, open_asset, run)
         _write_and_print_history(asset, history, file, out, plot)
+
+
+def _warn(sentence: str) -> None:
+    """Print a warning, unless its sentence is empty."""
+    if sentence:
+        terminal.say(f"warning: {sentence}")
 
 
 def _history_or_located_crash(
@@ -265,9 +256,7 @@ def simulate_system(
             )
     with tempfile.TemporaryDirectory() as folder:
         wiring = join_ssp(read_ssp(file, folder), delay or ())
-        warning = left_out_sentence(wiring, file)
-        if warning:
-            terminal.say(f"warning: {warning}")
+        _warn(left_out_sentence(wiring, file))
         experiment = default_experiment(
             system_description(wiring),
             stop_time=stop_time,
