@@ -40,6 +40,11 @@ _Function = TypeVar("_Function", bound=NumericalFunction)
 # error.
 OPTIONS: dict[str, bool | str] = {"nogil": True, "error_model": "numpy"}
 """Options of numba."""
+# Machine code holds a copy of each function that it calls, unless the call is inlined, and the copy
+# may round reordered sums otherwise than the function by itself. Which of the two is called depends
+# on what the process has compiled or loaded before.
+_SELF_CONTAINED: dict[str, bool | str] = {**OPTIONS, "forceinline": True}
+"""Options of a compiled function whose bits are the same in every process."""
 REORDERED_SUMS = frozenset({"reassoc", "contract", "nsz"})
 """What the compiler may do with sums: add in another order, and round a product and a sum once."""
 
@@ -79,7 +84,9 @@ def compiled(
     """
     if numba is None:
         return _plain_with_note(function)
-    options = dict(OPTIONS, fastmath=set(REORDERED_SUMS)) if reorders_sums else OPTIONS
+    options: dict[str, object] = {**_SELF_CONTAINED}
+    if reorders_sums:
+        options["fastmath"] = set(REORDERED_SUMS)
     sources = (function, *calls, *_compiled_callees(function))
     source_files = [inspect.getfile(source) for source in sources]
     with _cache_named_by_sources(source_files):

@@ -76,11 +76,10 @@ def stored_variables(
     """
     has_failed = np.array([bool(sentence) for sentence in flights.failure])
     has_ended = np.array([bool(sentence) for sentence in flights.ended])
-    # `np.matmul` multiplies (T, S) by (S, F) for each twin, so that the rounding of a row does not
-    # depend on the other twins of the shard. Variance: E[x^2] - E[x]^2.
-    coordinates = knowledge.model.states.coordinates
-    mean = np.matmul(flights.filtered, coordinates)
-    variance = np.matmul(flights.filtered, coordinates**2) - mean**2
+    # Twin by twin, so that the rounding of a row does not depend on the other twins of the shard.
+    states = knowledge.model.states
+    mean = [states.mean(belief) for belief in flights.filtered]
+    standard_deviation = [states.standard_deviation(belief) for belief in flights.filtered]
     fallbacks = fallbacks_of(knowledge, flights)
     notices = _notices(flights)
     values: dict[str, object] = {
@@ -90,7 +89,7 @@ def stored_variables(
         "observed/control_index": flights.control_index,
         "truth/state": flights.state,
         "filtered/mean": mean,
-        "filtered/standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
+        "filtered/standard_deviation": standard_deviation,
         "filtered/log_evidence": flights.log_evidence,
         "notice/none_of_these": flights.unexplained,
         "filtered/last_probability": _last_belief(flights, has_failed),

@@ -642,6 +642,18 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
         assert (flights.control_index[twin, steps:] == -1).all()
 
 
+def test_the_store_has_the_standard_deviation_of_a_belief_that_is_almost_certain(library_file):
+    knowledge, _ = known("growing_damage", library_file)
+    flights = Flights.empty(knowledge, 1)
+    flights.control_index[:] = 0
+    flights.filtered[:] = 0.0
+    flights.filtered[..., -2:] = 1e-14, 1.0 - 1e-14  # the last two states differ in z2 by 0.2
+
+    stored = stored_variables(knowledge, flights, [Member(0, "", 0, {})])
+
+    assert stored["filtered/standard_deviation"][0, :, 1] == pytest.approx(0.2 * np.sqrt(1e-14), rel=1e-6)
+
+
 def test_the_store_has_the_last_belief_of_an_asset_that_ended(softening):
     knowledge, flights = softening.knowledge, softening.flights
     members = [Member(row, "", row, {}) for row in range(6)]
