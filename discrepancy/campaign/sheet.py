@@ -8,10 +8,11 @@ wrong for the others), `csv.Sniffer` for 228.
 import csv
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from pathlib import Path
+from typing import Any
 
 from discrepancy.campaign.cells import (
     LOGICAL,
@@ -365,16 +366,21 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
             "Excel files need openpyxl: pip install 'uav-twin[xlsx]'."
         ) from None
     sheets: dict[str, Rows] = {}
+    blank_cells: dict[str, set[str]] = {}
     try:
         with warnings.catch_warnings(action="ignore"):
             book = load_workbook(path, read_only=True, data_only=True)
             for sheet in book.worksheets:
                 sheet.reset_dimensions()  # those in the file may be wrong
                 rows = []
-                for line, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-                    cells = [_excel_text(cell) for cell in row]
+                blank_cells[sheet.title] = set()
+                for line, row in enumerate(sheet.iter_rows(), start=1):
+                    cells = [_excel_text(cell.value) for cell in row]
                     if any(cells):
                         rows.append((line, cells))
+                    blank_cells[sheet.title].update(
+                        cell.coordinate for cell in row if _has_no_value(cell)
+                    )
                 sheets[sheet.title] = rows
             book.close()
     except Exception as cause:  # openpyxl raises almost any error for damaged files
@@ -389,7 +395,41 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
             f"{path.name} has the sheets {', '.join(filled) or 'none'}: say which as "
             f"{path.name}#SHEET."
         )
-    return sheets[sheet_name or filled[0]]
+    title = sheet_name or filled[0]
+    if blank_cells[title]:
+        _refuse_formulas_among(blank_cells[title], path, title)
+    return sheets[title]
+
+
+def _has_no_value(cell: Any) -> bool:
+    """Return whether a cell that the workbook stores has no value, not even an empty text."""
+    return cell.value is None and cell.data_type != "str" and hasattr(cell, "coordinate")
+
+
+def _refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None:
+    """Refuse a sheet with formulas in cells without a value, as programs that do not compute write.
+
+    Raises
+    ------
+    CampaignFileError
+        If one of the cells holds a formula.
+    """
+    from openpyxl import load_workbook
+
+    formulas = []
+    with warnings.catch_warnings(action="ignore"):
+        book = load_workbook(path, read_only=True)
+        book[title].reset_dimensions()
+        for row in book[title].iter_rows():
+            formulas += [cell.coordinate for cell in row if cell.data_type == "f"]
+        book.close()
+    without_value = [cell for cell in formulas if cell in blank_cells]
+    if without_value:
+        raise CampaignFileError(
+            f"{path.name}, sheet {title}: {len(without_value)} of "
+            f"{counted(len(formulas), 'formula')} {is_or_are(len(without_value))} without a value, "
+            f"first in {without_value[0]}: open the workbook in Excel or LibreOffice and save it."
+        )
 
 
 def _excel_text(cell: object) -> str:

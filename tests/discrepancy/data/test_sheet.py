@@ -5,6 +5,7 @@ import io
 import random
 import re
 import time
+import zipfile
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from datetime import time as clock
@@ -348,6 +349,54 @@ def test_one_of_several_sheets(tmp_path):
         read_sheet(path)
     with refused(CampaignFileError, "say which as"):
         read_sheet(Path(f"{path}#Ruh"))
+
+
+def with_stored_values(path, *values):
+    """Store values of the formulas in C2, C3 and so on, with their types, as Excel does."""
+    with zipfile.ZipFile(path) as book:
+        parts = {name: book.read(name) for name in book.namelist()}
+    sheet = parts["xl/worksheets/sheet1.xml"].decode()
+    for row, (kind, value) in enumerate(values, start=2):
+        sheet = re.sub(
+            rf'<c r="C{row}"><f>(.*?)</f><v\s*/?>(</v>)?',
+            rf'<c r="C{row}" t="{kind}"><f>\1</f><v>{value}</v>',
+            sheet,
+        )
+    parts["xl/worksheets/sheet1.xml"] = sheet.encode()
+    with zipfile.ZipFile(path, "w") as book:
+        for name, part in parts.items():
+            book.writestr(name, part)
+
+
+FORMULAS = [["t [s]", "w [mm]", "v [mm]"], *([row, row + 1, f"=B{row + 2}/20"] for row in range(4))]
+
+
+def test_formulas_without_values_are_refused(tmp_path):
+    with refused(
+        CampaignFileError,
+        "lab.xlsx, sheet Messung: 4 of 4 formulas are without a value, first in C2: open the workbook in "
+        "Excel or LibreOffice and save it.",
+    ):
+        read_sheet(book_of(tmp_path, FORMULAS))
+
+
+@pytest.mark.parametrize("unstored", [("n", ""), ("b", "")])
+def test_formulas_of_which_half_have_no_value_are_refused(tmp_path, unstored):
+    path = book_of(tmp_path, FORMULAS)
+    with_stored_values(path, ("n", "0.05"), ("n", "0.1"), unstored)
+    with refused(CampaignFileError, "2 of 4 formulas are without a value, first in C4"):
+        read_sheet(path)
+
+
+def test_a_formula_whose_value_is_an_empty_text_is_an_empty_cell(tmp_path):
+    path = book_of(tmp_path, FORMULAS)
+    with_stored_values(path, ("n", "0.05"), ("str", ""), ("n", "0.15"), ("n", "0.2"))
+    assert read_sheet(path).numbers("v", ".") == ("0.05", "", "0.15", "0.2")
+
+
+def test_formulas_without_values_on_another_sheet_are_of_no_concern(tmp_path):
+    path = book_of(tmp_path, ROWS, Rechnung=FORMULAS)
+    assert text_of(read_sheet(Path(f"{path}#Messung"))) == ["0 1.234", "0.500000 5"]
 
 
 def test_damaged_workbooks_are_refused_in_one_sentence(tmp_path):
