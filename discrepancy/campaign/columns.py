@@ -349,10 +349,10 @@ def units_of_columns(
     return units
 
 
-def origin_remark(
+def origin_sentence(
     sheet: Sheet, columns: Sequence[LaboratoryColumn], scales: Mapping[str, str]
 ) -> str:
-    """Return the remark on the source file of a table and on the role of each of its columns.
+    """Return the sentence on the source file of a table and on the role of each of its columns.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from discrepancy.campaign.columns import (
     LaboratoryColumn,
     degrees_celsius,
     missing_answers,
-    origin_remark,
+    origin_sentence,
     release_in_si,
     sampling_interval,
     units_of_columns,
@@ -274,7 +274,7 @@ class LaboratoryImport:
     # ---------------------------------------------------------------- the campaign
 
     def campaign(self, name: str) -> Campaign:
-        """Return the campaign in SI, with a remark on the origin of each trial.
+        """Return the campaign in SI, with a sentence on the origin of each trial.
 
         Raises
         ------
@@ -292,10 +292,9 @@ class LaboratoryImport:
             "channel": self._column_tables(are_inputs=False),
             "input": self._column_tables(are_inputs=True),
             "trial": [self._trial_table(file) for file in trial_files],
-            "remarks": [self._origin_remark(sheet) for sheet in self.sheets],
+            "remarks": [self.assumed] if self.assumed else [],
+            "provenance": [self._origin_sentence(sheet) for sheet in self.sheets],
         }
-        if self.assumed:
-            content["remarks"].append(self.assumed)
         if self._noise_file is not None:
             content["noise"] = {"file": self._noise_file}
         if self.reference_temperature is not None:
@@ -430,11 +429,11 @@ class LaboratoryImport:
             columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 
-    def _origin_remark(self, sheet: Sheet) -> str:
-        """Return the remark on the file of a table, its columns, and its clocks."""
+    def _origin_sentence(self, sheet: Sheet) -> str:
+        """Return the sentence on the file of a table, its columns, and its clocks."""
         used_columns = [
             column for column in self.columns if column.sheet is sheet and column.role != LEFT_OUT
         ]
-        origin = origin_remark(sheet, used_columns, self.answers.get("scale", {}))
+        origin = origin_sentence(sheet, used_columns, self.answers.get("scale", {}))
         clock = self.merge_clocks_of(sheet)
         return origin if clock is None else f"{origin} {clock.sentence}."

@@ -139,6 +139,7 @@ def assemble_campaign(
         accept=section.accept,
         events=tuple(complete_events(section.event, trials, CAMPAIGN_FILE)),
         remarks=(*section.remarks, *new_remarks),
+        provenance=section.provenance,
     )
 
 

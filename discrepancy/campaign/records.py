@@ -293,6 +293,9 @@ class Campaign:
         different trials.
     accept : tuple of str
         Faults of the data that the user accepts, in all channels and trials: words of `ACCEPTABLE`.
+    provenance : tuple of str
+        Sentences on the laboratory's files that the campaign was imported from, which no command
+        prints.
     """
 
     name: str
@@ -305,6 +308,7 @@ class Campaign:
     loggers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     events: tuple[Event, ...] = ()
     accept: tuple[str, ...] = ()
+    provenance: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return brief(self, name=self.name, trials=len(self.trials), channels=self.channels)

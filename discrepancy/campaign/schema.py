@@ -250,6 +250,8 @@ class CampaignSection(Section):
     """What happened at known moments."""
     remarks: Annotated[tuple[str, ...], LIST] = ()
     """Sentences for people."""
+    provenance: Annotated[tuple[str, ...], LIST] = ()
+    """Sentences on the files that the campaign was imported from."""
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = pydantic.Field(default_factory=dict)
     """Channels and inputs that share a clock, by the name of their logger; "force" is the force of
     forced trials."""

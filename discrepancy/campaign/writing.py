@@ -289,6 +289,7 @@ def _campaign_text(
         force_unit=file_units.force_unit,
         reference_temperature=campaign.reference_temperature,
         remarks=campaign.remarks,
+        provenance=campaign.provenance,
         parameters=priors,
         noise=noise,
         loggers=dict(campaign.loggers),

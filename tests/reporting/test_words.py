@@ -2,7 +2,7 @@
 
 import pytest
 
-from reporting.words import rows_of_table
+from reporting.words import rows_of_table, with_short_hashes
 
 
 @pytest.mark.parametrize(
@@ -16,3 +16,8 @@ from reporting.words import rows_of_table
 )
 def test_rows_count_from_one_and_a_long_list_is_cut(indices, text):
     assert rows_of_table(indices) == text
+
+
+def test_a_hash_for_people_has_its_first_12_digits():
+    digest = "0123456789abcdef" * 4
+    assert with_short_hashes(f"a.toml (SHA-256 {digest})") == "a.toml (SHA-256 0123456789ab)"

@@ -69,7 +69,7 @@ def test_an_import_says_that_two_clocks_became_one(imported_clocks):
         "has no reading where its own clock has no stamp."
     )
     assert laboratory.clock_sentences == [f"lab.csv: {sentence}"]
-    assert sentence in campaign.remarks[0]
+    assert sentence in campaign.provenance[0]
 
 
 def test_a_stamp_of_another_clock_is_written_as_an_empty_cell(imported_clocks, tmp_path):
