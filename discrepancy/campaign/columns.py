@@ -11,7 +11,13 @@ from discrepancy.campaign.heads import load_or_time_role, time_heads
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.campaign.sampling import undo_rounding
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.units import UNITS, conversion_factor, factor_to_si, quantities_of
+from discrepancy.campaign.units import (
+    UNITS,
+    amount_in_si,
+    conversion_factor,
+    factor_to_si,
+    quantities_of,
+)
 from discrepancy.errors import CampaignFileError
 from reporting.words import counted, is_or_are, listing
 
@@ -211,7 +217,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
         deviation = float(amount_text) / 100.0 * largest / to_si
         # rounded to two digits in the unit of the readings, as the user sees it in that unit
         rounded_deviation = float(f"{deviation:.2g}")
-        return rounded_deviation * to_si
+        return amount_in_si(rounded_deviation, to_si)
     if not unit and column.read_in != "1" and float(amount_text) > 0.0:
         # one number for channels in microstrain and in mm would be right for one of them at most
         raise CampaignFileError(
@@ -219,7 +225,7 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
             f"unit of its readings, but {answer!r} was given."
         )
     try:
-        return float(amount_text) * factor_to_si(column.quantity, unit or column.read_in)
+        return amount_in_si(amount_text, factor_to_si(column.quantity, unit or column.read_in))
     except ValueError as cause:
         raise CampaignFileError(f"--zero of {column.head!r}: {cause}.") from None
 
@@ -314,7 +320,7 @@ def release_in_si(answer: str) -> dict[str, str | float]:
         amount_text, unit = amount.groups()
         for quantity in (Quantity.DISPLACEMENT, Quantity.SIGNAL):
             if quantity in quantities_of(unit):
-                displacement = float(amount_text) * factor_to_si(quantity, unit)
+                displacement = amount_in_si(amount_text, factor_to_si(quantity, unit))
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
     raise CampaignFileError(
         f"--release must be a length or a voltage such as 15.5mm, but {answer!r} was given."

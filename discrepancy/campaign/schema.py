@@ -12,7 +12,7 @@ import pydantic
 
 from discrepancy.campaign import records
 from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Release
-from discrepancy.campaign.units import conversion_factor, factor_to_si
+from discrepancy.campaign.units import amount_in_si, conversion_factor, factor_to_si
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.json_file import JsonRecord
@@ -68,8 +68,9 @@ def _with_scaled_deviations(channel: records.Channel, scale: float) -> records.C
     """Return a channel with its standard deviations multiplied by a scale."""
     noise = channel.noise
     if noise is not None:
-        noise = replace(noise, standard_deviation=scale * noise.standard_deviation)
-    return replace(channel, noise=noise, offset_deviation=scale * channel.offset_deviation)
+        noise = replace(noise, standard_deviation=amount_in_si(noise.standard_deviation, scale))
+    offset_deviation = amount_in_si(channel.offset_deviation, scale)
+    return replace(channel, noise=noise, offset_deviation=offset_deviation)
 
 
 def _channel_in_si(channel: records.Channel) -> records.Channel:
@@ -110,7 +111,7 @@ def _input_in_si(recorded_input: records.RecordedInput) -> records.RecordedInput
     ValueError
         If its column is reserved, or the file states another course than smooth for a motion.
     """
-    deviation = _unit_in_si(recorded_input) * recorded_input.offset_deviation
+    deviation = amount_in_si(recorded_input.offset_deviation, _unit_in_si(recorded_input))
     column = recorded_input.table_column
     if column in INPUT_COLUMNS and column != "force":
         raise ValueError(
@@ -142,7 +143,7 @@ def _release_in_si(release: Release) -> Release:
         unit = "m"
     elif release.unit.endswith("V"):
         unit = "V"
-    displacement = conversion_factor(release.unit, unit) * release.displacement
+    displacement = amount_in_si(release.displacement, conversion_factor(release.unit, unit))
     return replace(release, displacement=displacement, unit=unit)
 
 

@@ -4,6 +4,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from decimal import Decimal
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -142,6 +143,14 @@ def _factor_to_si(quantity: Quantity, unit: str) -> float:
         with suppress(ValueError):
             return conversion_factor(unit, "1")
     return conversion_factor(unit, UNITS[quantity].si)
+
+
+def amount_in_si(amount: str | float, factor: float) -> float:
+    """Return an amount times a factor to SI as one would write it: 85 times 1e-6 is 8.5e-05.
+
+    The product of the two binary numbers would be 8.499999999999999e-05.
+    """
+    return float(Decimal(str(amount)) * Decimal(str(factor)))
 
 
 @cache

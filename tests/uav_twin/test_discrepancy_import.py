@@ -483,6 +483,16 @@ def test_zeros_and_gains_are_as_stated(zero, gain, known):
     assert "assumed" not in printed
 
 
+def test_a_stated_release_and_zero_keep_their_digits():
+    swings("a.csv")
+    said(*IMPORT, "a.csv", "--kind", "ringdown", *PLAIN, "--release", "85µm", "--zero", "x=85 um")
+    campaign = read_campaign("a")
+    assert (campaign.trials[0].release.displacement, campaign.channels["x"].offset_deviation) == (
+        85e-6,
+        85e-6,
+    )
+
+
 def test_holds_begins_and_files_for_proof_are_written():
     swings("a.csv", "b.csv")
     columns = ("--kind", "driven", "--column", "x=x", "--column", "U=input:U", "--quantity", "U=voltage")

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from openpyxl import Workbook
 
+from discrepancy.campaign.columns import release_in_si
 from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.sheet import read_sheet
@@ -460,6 +461,12 @@ def test_loggers_names_of_units_are_known(unit, quantity, in_si):
     assert quantity in quantities_of(unit)
     assert factor_to_si(quantity, unit) == pytest.approx(in_si, rel=1e-12)
     assert conversion_factor("Sec", "s") == 1.0
+
+
+@pytest.mark.parametrize("unit", ["µm", "μm", "um", " um"])  # the micro sign, and the Greek letter
+@pytest.mark.parametrize("amount", range(1, 400, 7))
+def test_a_release_in_micrometres_is_the_number_that_one_would_write(amount, unit):
+    assert release_in_si(f"{amount}{unit}") == {"displacement": float(f"{amount}e-6"), "unit": "m"}
 
 
 @pytest.mark.parametrize(
