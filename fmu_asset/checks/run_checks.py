@@ -8,7 +8,8 @@ import numpy as np
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.client.binding import INPUT_ROLES, Binding
 from fmu_asset.client.bound_variables import InputBinding
-from fmu_asset.client.layout import VariableElements, find_variable
+from fmu_asset.client.layout import VariableElements
+from fmu_asset.client.resolver import BindingResolver
 from fmu_asset.client.saved_state import partial_state_sentence
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.values import Value
@@ -154,7 +155,12 @@ class RunChecks:
 
     def _find_input(self, role: str, name: str, input_binding: InputBinding) -> VariableElements:
         """Return the FMU's variable that an input of the binding names."""
-        return find_variable(self._description, input_binding.variable, f"{role}.{name}", "input")
+        resolver = BindingResolver(self._description, self._binding)
+        variable = input_binding.variable
+        is_start_health = role == "health" and resolver.is_set_at_start(variable)
+        return resolver.find(
+            variable, f"{role}.{name}", "parameter" if is_start_health else "input"
+        )
 
     def _run(self) -> Float:
         """Return the n outputs in each of N steps of a run, (N, n), in a new worker."""

@@ -110,9 +110,16 @@ def _check_use(
     is_start_value = causality == "parameter" and variable.startable
     fits = variable.causality in _CAUSALITIES[causality]
     if not (fits or is_tunable_input or is_start_value):
+        remedy = ""
+        if causality == "input" and (variable.causality == "parameter" or variable.startable):
+            remedy = (
+                ", which is set before the start only: name it in [parameter], or in [health] if "
+                "it is damage; or declare it in the FMU as an input, or as a tunable parameter of "
+                "a co-simulation"
+            )
         raise BindingError(
             f"{label} must be of causality {causality}, but {name!r} is declared as "
-            f"{variable.causality} in {description.label}."
+            f"{variable.causality} in {description.label}{remedy}."
         )
     if not variable.numeric:
         raise BindingError(

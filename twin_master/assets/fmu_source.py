@@ -312,13 +312,19 @@ class FmuSource(AssetSource):
         states = () if scenario.truth.kind == "asset" else scenario.state_names
         given_parameters = (*section.parameters, *section.seeds)
         known_parameters = (*binding.parameter, *self._effect_parameters())
+        owner = "the scenario has the"
+        label = f"the binding {binding.name}"
+        advice = (
+            "bind each state in a table [health.NAME] to an input of the FMU, or to a parameter "
+            "that is set at the start"
+        )
+        check_names(owner, label, [("state", states, binding.health)], advice=advice)
         names_by_sort = (
             ("control input", scenario.control[0].values, binding.control),
-            ("state", states, binding.health),
             ("load", section.load, binding.load),
             ("parameter", given_parameters, known_parameters),
         )
-        check_names("the scenario has the", f"the binding {binding.name}", names_by_sort)
+        check_names(owner, label, names_by_sort)
 
     def _fit_binding(self, binding: Binding) -> Binding:
         """Check the binding against the FMU; return it with the lengths of the FMU's arrays.

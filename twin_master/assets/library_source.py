@@ -177,12 +177,12 @@ class ObservationLibrary:
                 f"{comma_list(self.control_values)}, and the scenario sets {comma_list(values)}: "
                 f"{_ADVICE}"
             )
-        sampled_controls = np.column_stack([self.control_values[key] for key in values])
-        wanted_values = list(values.values())
         # One truth value for each of the U sampled controls.
-        is_same = np.isclose(
-            sampled_controls, wanted_values, rtol=_RELATIVE_TOLERANCE, atol=0.0
-        ).all(axis=1)
+        is_same = np.ones(len(self.controls), dtype=bool)
+        for key, value in values.items():
+            is_same &= np.isclose(
+                self.control_values[key], value, rtol=_RELATIVE_TOLERANCE, atol=0.0
+            )
         if not is_same.any():
             settings = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise MissionInputError(

@@ -189,7 +189,8 @@ def grid_of_fmu(
 ) -> SamplingGrid:
     """Return the grid over the values of an FMU's inputs that a user gives.
 
-    The controls are all combinations of the values of the control inputs.
+    The controls are all combinations of the values of the control inputs; an FMU without control
+    inputs has a single control.
 
     Parameters
     ----------
@@ -233,7 +234,9 @@ def grid_of_fmu(
         parameter=parameter,
         draws=draws,
         states=values_by_role["health"],
-        controls=_combined_controls(values_by_role["control"]),
+        controls=(
+            _combined_controls(values_by_role["control"]) if binding.control else {"none": {}}
+        ),
         load=_single_loads(values_by_role["load"]),
         parameters={name: values[0] for name, values in parameters.items()},
         settling_steps=settling_steps,

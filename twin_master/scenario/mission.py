@@ -80,8 +80,8 @@ class Control(Section):
     """Name of the control."""
     title: str = ""
     """Name of the control in the report; by default the name."""
-    values: Annotated[dict[str, Number], Field(min_length=1)]
-    """Value of each control input of the asset, by the name of the input [SI]."""
+    values: dict[str, Number]
+    """Value of each control input of the asset, by its name; `{}` if there is none [SI]."""
 
 
 class Reference(Section):
