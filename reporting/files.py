@@ -21,7 +21,8 @@ from reporting.operating_system import can_flush, flag_for_flushing, open_descri
 TEMPORARY_SUFFIX = ".partial"
 """Ending of temporary names, which marks the leftovers of a killed process."""
 
-_NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Codes of the operating system for a full disk, a used quota and a too large file."""
 _NO_PERMISSION = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
 _SERVICE = re.compile(r"[a-z][a-z0-9+.-]+:")
 """The beginning of an address; the drives of Windows have one letter."""
@@ -39,7 +40,7 @@ def write_error(error: OSError, path: Path) -> FileNotWrittenError:
     path : Path
         The file that was being written.
     """
-    if error.errno in _NO_SPACE:
+    if error.errno in NO_SPACE:
         return DiskFullError(
             f"No space is left on the disk to write {path}: free some space and repeat; "
             "what was there before is unchanged."

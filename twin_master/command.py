@@ -13,6 +13,7 @@ import typer
 from reporting import terminal
 from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import InvalidChoiceError, ReportingError
+from reporting.files import NO_SPACE
 from reporting.former_options import former_names_as_lines
 from reporting.words import number
 from twin_master.command_options import (
@@ -426,10 +427,26 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
             raise
         sentence = str(error)
         if isinstance(error, OSError):
-            sentence = f"{error.filename or 'a file'}: {error.strerror or error}."
+            sentence = _system_error_sentence(error)
         for line in (sentence, *getattr(error, "__notes__", ())):
             typer.secho(line, fg="red", err=True)
         raise SystemExit(1) from None
+
+
+def _system_error_sentence(error: OSError) -> str:
+    """Return the sentence of an error of the operating system; streams have no file name there."""
+    reason = error.strerror or error
+    if error.filename is not None:
+        return f"{error.filename}: {reason}."
+    if error.errno in NO_SPACE:
+        return (
+            "No space is left on the disk for the output of this command: free some space, or "
+            "send the output elsewhere, and repeat."
+        )
+    return (
+        f"The operating system refused to read or write a file or stream: {reason}; repeat with "
+        "--verbose to see which."
+    )
 
 
 def _errors_of_lower_layers() -> tuple[type[Exception], ...]:

@@ -263,15 +263,19 @@ def simulate_system(
             step_size=step_size,
             values=start_values,
         )
-        with CoupledAsset(
+        open_asset = partial(
+            CoupledAsset,
             wiring,
             _with_interpolation(experiment.binding, interpolation),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,
             parameters=experiment.parameters,
-        ) as asset:
-            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
+        )
+        with closing(open_asset()) as asset:
+            run = partial(run_experiment, experiment=experiment)
+            history = _history_or_located_crash(asset, open_asset, run)
+            _write_and_print_history(asset, history, file, out, plot)
 
 
 def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:

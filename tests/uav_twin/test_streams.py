@@ -88,3 +88,22 @@ def test_json_loses_no_character_in_ascii(tmp_path):
     end = run_in_ascii("structure", "info", structure, "--json", "--quiet")
     assert "m\\u00fchle" in end.stdout
     assert json.loads(end.stdout)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device is always full")
+@pytest.mark.parametrize("words", [("scenarios",), ("--version",), ("schema", "binding")])
+def test_a_full_disk_for_the_output_of_a_command_is_one_sentence(words):
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "uav_twin", *words],
+            cwd=ROOT,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            check=False,
+        )
+    assert ended.returncode == 1
+    assert ended.stderr == (
+        "No space is left on the disk for the output of this command: free some space, or send the "
+        "output elsewhere, and repeat.\n"
+    )

@@ -15,6 +15,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.errors import CouplingError
 from fmu_asset.ssp.check import check_ssp, join_ssp
 from fmu_asset.ssp.reader import read_ssp
+from tests.command_line import refused
 from tests.fmu_asset.making import archive_of, members
 
 SIREN = (
@@ -111,6 +112,17 @@ def test_a_failing_fmu_is_named_as_in_the_file(foreign_fmu, pack_alarm):
 
     assert "component siren: resources/horn.fmu in " in sentence
     assert "uav-twin-fmu-" not in sentence
+
+
+@pytest.mark.parametrize("step", [0, 37])
+def test_a_simulation_names_the_step_of_a_crash_and_what_was_refused(foreign_fmu, pack_alarm, step):
+    system = pack_alarm(foreign_fmu("hostile2", "SEGFAULT", f"AFTER={step}"))
+
+    sentence = refused("ssp", "simulate", system, "--step-size", "0.01", "--stop-time", "1")
+
+    assert f"component siren: resources/horn.fmu in {system}, step {step} from t = " in sentence
+    assert "SIGSEGV" in sentence
+    assert "The sandbox refused " in sentence
 
 
 def test_an_fmu_for_another_platform_is_named_as_in_the_file(ours, pack_alarm, tmp_path):
