@@ -118,8 +118,8 @@ def import_files(
         typer.Option(
             "--release",
             metavar="[FILE=]SIZE",
-            help="Displacement at which the release point was held, such as 15.5mm. May be given "
-            "several times.",
+            help="Displacement at which the release point was held, such as 15.5mm, or the force "
+            "that held it, such as 600N. May be given several times.",
         ),
     ] = None,
     load_place: Annotated[

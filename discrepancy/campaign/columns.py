@@ -310,10 +310,12 @@ def sampling_interval(answer: str) -> float:
 def release_in_si(answer: str) -> dict[str, str | float]:
     """Return the table `release` of a trial from the option `--release`, a displacement with unit.
 
+    For a force, the table has the only key `force` [N].
+
     Raises
     ------
     CampaignFileError
-        If the option is not a length or a voltage.
+        If the option is not a length, a voltage or a force.
     """
     amount = re.fullmatch(rf"\s*({_NUMBER})\s*(\S+)\s*", answer, re.ASCII)
     if amount is not None:
@@ -322,8 +324,11 @@ def release_in_si(answer: str) -> dict[str, str | float]:
             if quantity in quantities_of(unit):
                 displacement = amount_in_si(amount_text, factor_to_si(quantity, unit))
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
+        if Quantity.FORCE in quantities_of(unit):
+            return {"force": amount_in_si(amount_text, factor_to_si(Quantity.FORCE, unit))}
     raise CampaignFileError(
-        f"--release must be a length or a voltage such as 15.5mm, but {answer!r} was given."
+        "--release must be a length, a voltage or a force such as 15.5mm or 600N, but "
+        f"{answer!r} was given."
     )
 
 

@@ -23,6 +23,7 @@ from discrepancy.campaign.columns import (
     sampling_interval,
     units_of_columns,
 )
+from discrepancy.campaign.force_release import table_of_release_by_force
 from discrepancy.campaign.reading import TABLE_ERRORS, assemble_campaign
 from discrepancy.campaign.records import Campaign, Hold, Start, TrialKind
 from discrepancy.campaign.schema import FORMAT, parse_campaign
@@ -238,7 +239,10 @@ class LaboratoryImport:
 
     def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
-        expected_answer = "displacement at which the release point was held, such as 15.5mm"
+        expected_answer = (
+            "displacement at which the release point was held, such as 15.5mm, or the force that "
+            "held it, such as 600N"
+        )
         answer = self._questionnaire.ask("release", file, expected_answer)
         return release_in_si(answer or "1m")
 
@@ -358,15 +362,26 @@ class LaboratoryImport:
                 hold = self.holds[column.head]
                 break
         optional_keys = {
+            "kind": self.kinds[file],
             "release": self.releases.get(file),
             "load_place": load_places.get(file, load_places.get("")),
             "hold": hold,
             "begins": self.begins[file],
             "held_out": self.held_out[file] or None,
         }
+        if self._holding_force(file) is not None:
+            optional_keys |= {
+                "kind": TrialKind.FORCED.value,
+                "release": None,
+                "hold": Hold.ZERO_ORDER.value,
+                "begins": Start.SETTLED.value,
+            }
         stated_keys = {key: value for key, value in optional_keys.items() if value is not None}
-        title = _NOT_TITLE.sub("", file)
-        return {"name": title, "kind": self.kinds[file], "file": file, **stated_keys}
+        return {"name": _NOT_TITLE.sub("", file), "file": file, **stated_keys}
+
+    def _holding_force(self, file: str) -> float | None:
+        """Return the force [N] that held a structure until its release; None if it is not known."""
+        return self.releases.get(file, {}).get("force")
 
     def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
         """Return a table with several columns of times on one clock.
@@ -404,6 +419,8 @@ class LaboratoryImport:
     def _text_table(self, sheet: Sheet) -> TextTable:
         """Return the table of a file in SI, with one column of times.
 
+        A ring-down from a force has the column `force`, too.
+
         Raises
         ------
         CampaignFileError
@@ -419,15 +436,22 @@ class LaboratoryImport:
                 raise CampaignFileError(
                     f"{sheet.name} has more than one column that is {title!r}: leave one out."
                 )
-        if clock is not None:
-            return TextTable(sheet.name, clock.cells, clock.lines, TABLE_ERRORS)
         columns: dict[str, tuple[str, ...]] = {}
+        lines = sheet.lines
         interval = self.intervals[sheet.name]
-        if interval is not None:
+        if clock is not None:
+            columns, lines = dict(clock.cells), clock.lines
+        elif interval is not None:
             columns["time"] = tuple(f"{row * interval:.15g}" for row in range(len(sheet.lines)))
-        for column in used_columns:
-            columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
-        return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
+        if clock is None:
+            for column in used_columns:
+                columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
+        table = TextTable(sheet.name, columns, lines, TABLE_ERRORS)
+        holding_force = self._holding_force(sheet.name)
+        if holding_force is None:
+            return table
+        channels = [column.title for column in used_columns if column.is_channel]
+        return table_of_release_by_force(table, channels, holding_force)
 
     def _origin_sentence(self, sheet: Sheet) -> str:
         """Return the sentence on the file of a table, its columns, and its clocks."""

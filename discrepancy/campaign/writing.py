@@ -344,8 +344,11 @@ def _trial_section(
             rows = np.flatnonzero(~trial.used[:, index]) + 1  # files count rows from 1
             if rows.size:
                 left_out[name] = tuple(rows.tolist())
-    is_driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
-    states_begin = is_driven or trial.begins is not records.Start.SETTLED
+    begins_as_stated = (
+        trial.kind in (records.TrialKind.FORCED, records.TrialKind.DRIVEN)
+        and not trial.begin_assumed
+    )
+    states_begin = begins_as_stated or trial.begins is not records.Start.SETTLED
     keys = {**trial.keys_in_file, "file": file}
     return schema.TrialSection(
         **keys,

@@ -19,6 +19,8 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.model_choice import choose_model
 from discrepancy.sources.examples import example_campaign, plan_from_scales
+from discrepancy.system.response import Conditions
+from fe.runtime.patch import ModelPatch
 from tests import command_line
 from tests.command_line import Terminal, command, refused, said
 
@@ -491,6 +493,64 @@ def test_a_stated_release_and_zero_keep_their_digits():
         85e-6,
         85e-6,
     )
+
+
+CUT_OFF = ("--kind", "ringdown", *COLUMNS[:2], "--release", "600N")
+
+
+def swing_from(first_time: float) -> None:
+    """Write a record of 100 samples of a ring-down."""
+    rows = "".join(f"{first_time + 0.01 * row:.2f},{row % 7}\n" for row in range(100))
+    Path("cut.csv").write_text(f"t [s],Weg [mm]\n{rows}", "utf-8")
+
+
+def response_of_rig(campaign: Campaign) -> np.ndarray:
+    """Return the displacement [m] that the rig has at the readings of the only trial."""
+    model = choose_model(MODEL).model
+    outputs = (("displacement", Quantity.DISPLACEMENT),)
+    conditions = Conditions(model.prior_mean())
+    (trial,) = campaign.trials
+    return model.respond(trial, outputs, ModelPatch(), conditions).values[trial.used[:, 0], 0]
+
+
+@pytest.mark.parametrize("release", ["600N", "0.6kN", "-600 N"])
+def test_a_release_by_a_force_is_one_from_the_deflection_under_it(release):
+    swing_from(0.0)
+    given = ("--kind", "ringdown", *COLUMNS[:2], "--load-place", "tip", *RIG, "--ask-nothing")
+
+    said(*IMPORT, "cut.csv", *given, "--release", release, "--out", "by_force")
+
+    cut = response_of_rig(read_campaign("by_force"))
+    said(*IMPORT, "cut.csv", *given, "--release", f"{cut[0]}m", "--out", "by_displacement")
+    held = response_of_rig(read_campaign("by_displacement"))
+    assert np.sign(cut[0]) == (-1.0 if release.startswith("-") else 1.0)
+    np.testing.assert_allclose(cut, held, rtol=0.0, atol=1e-9 * abs(cut[0]))
+
+
+def test_a_deflection_under_a_release_force_is_that_of_a_static_trial():
+    swing_from(0.0)
+    Path("pull.csv").write_text("F [N],Weg [mm]\n600,1\n", "utf-8")
+    given = (*COLUMNS[:2], "--load-place", "tip", *RIG, "--ask-nothing")
+    said(*IMPORT, "cut.csv", "--kind", "ringdown", *given, "--release", "600N", "--out", "cut")
+    said(*IMPORT, "pull.csv", "--kind", "static", *given, "--out", "pull")
+    cut, pull = response_of_rig(read_campaign("cut")), response_of_rig(read_campaign("pull"))
+    assert cut[0] == pytest.approx(pull[0], rel=1e-12)
+
+
+def test_a_record_that_begins_before_the_force_is_cut_off_shows_when():
+    swing_from(-0.02)
+    said(*IMPORT, "cut.csv", *CUT_OFF, "--out", "cut")
+    (trial,) = read_campaign("cut").trials
+    assert (trial.begins.value, trial.force.tolist()) == ("settled", [600.0, 600.0, *[0.0] * 98])
+
+
+def test_a_record_that_begins_after_the_force_is_cut_off_is_refused():
+    Path("cut.csv").write_text("t [s],Weg [mm]\n5,5\n5.01,4\n5.02,4\n", "utf-8")
+    done = command(
+        *IMPORT, "cut.csv", "--kind", "ringdown", *COLUMNS[:2], "--release", "600N", "--out", "cut"
+    )
+    sentence = "cut.csv: the time begins at 5 s, and a release by a force is at 0: count times from there."
+    assert (done.returncode, done.stderr.strip(), Path("cut").exists()) == (1, sentence, False)
 
 
 def test_holds_begins_and_files_for_proof_are_written():
