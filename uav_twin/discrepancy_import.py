@@ -26,7 +26,9 @@ _FILE_OF_IMPORT = re.compile(r"campaign\.toml|noise\.csv|\d\d+_.*\.csv")
 def import_files(
     files: Annotated[
         list[Path],
-        typer.Argument(show_default=False, help="CSV, FILE.xlsx, FILE.xlsx#SHEET or FILE.mat."),
+        typer.Argument(
+            show_default=False, help="CSV, FILE.xlsx, FILE.xlsx#SHEET, FILE.xlsx#all or FILE.mat."
+        ),
     ],
     *,
     out: Annotated[
@@ -323,11 +325,11 @@ def _understand_files(
         read, so that their mistakes are found first.
     """
     from discrepancy.campaign.importing import LaboratoryImport
-    from discrepancy.campaign.sheet import read_sheet
+    from discrepancy.campaign.sheet import read_sheets
     from discrepancy.model_choice import choose_model
     from discrepancy.system.load_change import choose_load_place
 
-    sheets = [read_sheet(file) for file in files]
+    sheets = [sheet for file in files for sheet in read_sheets(file)]
     imported = LaboratoryImport(sheets, answers)
     if model is None:
         return imported

@@ -377,7 +377,7 @@ class LaboratoryImport:
                 "begins": Start.SETTLED.value,
             }
         stated_keys = {key: value for key, value in optional_keys.items() if value is not None}
-        return {"name": _NOT_TITLE.sub("", file), "file": file, **stated_keys}
+        return {"name": _NOT_TITLE.sub("", file, count=1), "file": file, **stated_keys}
 
     def _holding_force(self, file: str) -> float | None:
         """Return the force [N] that held a structure until its release; None if it is not known."""

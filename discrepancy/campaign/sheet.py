@@ -8,11 +8,11 @@ wrong for the others), `csv.Sniffer` for 228.
 import csv
 import io
 import warnings
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from discrepancy.campaign.cells import (
     LOGICAL,
@@ -50,6 +50,8 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
+ALL_SHEETS = "all"
+"""What stands for all sheets of a workbook in `FILE.xlsx#all`, unless a sheet is called so."""
 LEAST_LOST_VALUE = 1e30
 """Numbers from here on stand for no reading, as 9.9E+37 of instruments does."""
 _MOST_LISTED_LINES = 5
@@ -116,6 +118,34 @@ class Sheet:
         return tuple(numbers)
 
 
+def read_sheets(path: Path) -> list[Sheet]:
+    """Return the table of a file, or those of all sheets of a workbook for `FILE.xlsx#all`.
+
+    Sheets without a number, such as notes, are left out, which the remark of the first table says.
+
+    Raises
+    ------
+    CampaignFileError
+        For the causes of `read_sheet`, or if no sheet has a number.
+    """
+    file = path.with_name(path.name.removesuffix(f"#{ALL_SHEETS}"))
+    if file == path or path.exists() or file.suffix.lower() not in EXCEL:
+        return [read_sheet(path)]
+    workbook = _read_workbook(file)
+    if ALL_SHEETS in workbook:
+        return [_table_of_workbook(path.name, file, ALL_SHEETS, workbook)]
+    sheets = []
+    left_out = ""
+    for title, content in workbook.items():
+        if any(any(map(is_value, cells)) for _, cells in content.rows):
+            sheets.append(_table_of_workbook(f"{file.name}#{title}", file, title, workbook))
+        elif content.rows:
+            left_out += f"; the sheet {title!r} holds no numbers and is left out"
+    if not sheets:
+        raise CampaignFileError(f"{file.name} holds no table: no sheet has a number.")
+    return [replace(sheets[0], remark=f"{sheets[0].remark}{left_out}"), *sheets[1:]]
+
+
 def read_sheet(path: Path) -> Sheet:
     """Return the table in a text file, an Excel workbook or a MATLAB file.
 
@@ -138,9 +168,9 @@ def read_sheet(path: Path) -> Sheet:
     if ending == MATLAB:
         return _without_fill_values(_matlab_sheet(file), "row")
     if ending in EXCEL:
-        rows = _excel_rows(file, sheet_name=path.name.partition("#")[2])
-        sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="row", separator="")
-        return _without_fill_values(sheet, "row")
+        workbook = _read_workbook(file)
+        title = _title_of_sheet(file, path.name.partition("#")[2], workbook)
+        return _table_of_workbook(path.name, file, title, workbook)
     rows, separator = _text_rows(file)
     sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="line", separator=separator)
     return _without_fill_values(sheet, "line")
@@ -344,20 +374,20 @@ def _split_rows(lines: Sequence[str], separator: str, name: str) -> Rows:
     return rows
 
 
-def _excel_rows(path: Path, sheet_name: str) -> Rows:
-    """Return the rows of a sheet of a workbook.
+class _WorkbookSheet(NamedTuple):
+    """The rows of a sheet of a workbook, and the names of cells that are stored without a value."""
 
-    Parameters
-    ----------
-    path : path
-        The path of the workbook.
-    sheet_name : str
-        The name of the sheet; empty for the only one that is not empty.
+    rows: Rows
+    blank_cells: Set[str]
+
+
+def _read_workbook(path: Path) -> dict[str, _WorkbookSheet]:
+    """Return the sheets of a workbook by title.
 
     Raises
     ------
     CampaignFileError
-        If the workbook cannot be read, or does not have that sheet or one sheet only.
+        If the workbook cannot be read.
     """
     try:
         from openpyxl import load_workbook
@@ -365,40 +395,56 @@ def _excel_rows(path: Path, sheet_name: str) -> Rows:
         raise CampaignFileError(
             "Excel files need openpyxl: pip install 'uav-twin[xlsx]'."
         ) from None
-    sheets: dict[str, Rows] = {}
-    blank_cells: dict[str, set[str]] = {}
+    sheets: dict[str, _WorkbookSheet] = {}
     try:
         with warnings.catch_warnings(action="ignore"):
             book = load_workbook(path, read_only=True, data_only=True)
             for sheet in book.worksheets:
                 sheet.reset_dimensions()  # those in the file may be wrong
                 rows = []
-                blank_cells[sheet.title] = set()
+                blank_cells: set[str] = set()
                 for line, row in enumerate(sheet.iter_rows(), start=1):
                     cells = [_excel_text(cell.value) for cell in row]
                     if any(cells):
                         rows.append((line, cells))
-                    blank_cells[sheet.title].update(
-                        cell.coordinate for cell in row if _has_no_value(cell)
-                    )
-                sheets[sheet.title] = rows
+                    blank_cells.update(cell.coordinate for cell in row if _has_no_value(cell))
+                sheets[sheet.title] = _WorkbookSheet(rows, blank_cells)
             book.close()
     except Exception as cause:  # openpyxl raises almost any error for damaged files
         raise CampaignFileError(
             f"{path} cannot be read as an Excel workbook ({one_line(cause)}): save it again, or "
             "save it as CSV."
         ) from cause
-    filled = [title for title, rows in sheets.items() if rows]
-    is_clear = sheet_name in sheets if sheet_name else len(filled) == 1
+    return sheets
+
+
+def _title_of_sheet(file: Path, stated_title: str, workbook: Mapping[str, _WorkbookSheet]) -> str:
+    """Return the title of the sheet that a user names, or of the only one that is not empty.
+
+    Raises
+    ------
+    CampaignFileError
+        If the workbook does not have that sheet, or not one sheet only.
+    """
+    filled = [title for title, sheet in workbook.items() if sheet.rows]
+    is_clear = stated_title in workbook if stated_title else len(filled) == 1
     if not is_clear:
         raise CampaignFileError(
-            f"{path.name} has the sheets {', '.join(filled) or 'none'}: say which as "
-            f"{path.name}#SHEET."
+            f"{file.name} has the sheets {', '.join(filled) or 'none'}: say which as "
+            f"{file.name}#SHEET, or import all as {file.name}#{ALL_SHEETS}."
         )
-    title = sheet_name or filled[0]
-    if blank_cells[title]:
-        _refuse_formulas_among(blank_cells[title], path, title)
-    return sheets[title]
+    return stated_title or filled[0]
+
+
+def _table_of_workbook(
+    name: str, file: Path, title: str, workbook: Mapping[str, _WorkbookSheet]
+) -> Sheet:
+    """Return the table in a sheet of a workbook; refuse formulas without a stored value."""
+    rows, blank_cells = workbook[title]
+    if blank_cells:
+        _refuse_formulas_among(blank_cells, file, title)
+    sheet = _sheet_of_rows(name, file, rows, unit_of_place="row", separator="")
+    return _without_fill_values(sheet, "row")
 
 
 def _has_no_value(cell: Any) -> bool:

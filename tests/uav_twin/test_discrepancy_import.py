@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from openpyxl import Workbook
 
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
@@ -716,6 +717,22 @@ def test_a_load_place_that_the_model_does_not_have_is_refused_at_import():
     assert "the load place is 'mass'" in sentence
     assert "takes forces at tip" in sentence
     assert not Path("lab").exists()
+
+
+def test_each_sheet_of_a_workbook_is_a_trial_of_its_name():
+    book = Workbook()
+    for title in ("Zug", "Schwingung 1.5mm"):
+        sheet = book.create_sheet(title)
+        sheet.append(["t [s]", "x [mm]"])
+        for row in range(40):
+            sheet.append([0.01 * row, row % 7])
+    book.save("lab.xlsx")
+    kinds = ("--kind", "driven", "--kind", "lab.xlsx#Schwingung 1.5mm=ringdown", "--release", "1.5mm")
+    said(*IMPORT, "lab.xlsx#all", *kinds, "--column", "x=x")
+    trials = read_campaign("lab").trials
+    assert [(trial.name, trial.kind.value) for trial in trials] == [
+        ("Zug", "driven"), ("Schwingung 1.5mm", "ringdown"),
+    ]  # fmt: skip
 
 
 def test_replace_writes_the_import_anew():

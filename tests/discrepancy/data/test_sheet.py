@@ -20,7 +20,7 @@ from openpyxl import Workbook
 from discrepancy.campaign.columns import release_in_si
 from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.records import Quantity
-from discrepancy.campaign.sheet import read_sheet
+from discrepancy.campaign.sheet import read_sheet, read_sheets
 from discrepancy.campaign.units import UNITS, conversion_factor, factor_to_si, quantities_of
 from discrepancy.errors import CampaignFileError, DiscrepancyError
 from tests.refusals import Inputs, refused
@@ -350,6 +350,27 @@ def test_one_of_several_sheets(tmp_path):
         read_sheet(path)
     with refused(CampaignFileError, "say which as"):
         read_sheet(Path(f"{path}#Ruh"))
+
+
+def test_all_sheets_of_a_workbook_are_tables_except_those_without_numbers(tmp_path):
+    path = book_of(
+        tmp_path, ROWS, Notizen=[["heute"]], Ruhe=[["Zeit [s]", "Weg [mm]"], [0, 0.5], [1, 0.25]], leer=[]
+    )
+    sheets = read_sheets(Path(f"{path}#all"))
+    assert [sheet.name for sheet in sheets] == ["lab.xlsx#Messung", "lab.xlsx#Ruhe"]
+    assert [text_of(sheet) for sheet in sheets] == [["0 1.234", "0.500000 5"], ["0 0.5", "1 0.25"]]
+    assert sheets[0].remark.endswith("; the sheet 'Notizen' holds no numbers and is left out")
+
+
+def test_a_sheet_may_be_called_all(tmp_path):
+    path = book_of(tmp_path, ROWS, all=[["Zeit [s]", "Weg [mm]"], [0, 0.5], [1, 0.25]])
+    assert [sheet.name for sheet in read_sheets(Path(f"{path}#all"))] == ["lab.xlsx#all"]
+
+
+def test_a_workbook_without_numbers_is_refused_as_one_without_tables(tmp_path):
+    path = book_of(tmp_path, [["heute"]], Notizen=[["morgen"]])
+    with refused(CampaignFileError, "lab.xlsx holds no table: no sheet has a number"):
+        read_sheets(Path(f"{path}#all"))
 
 
 def with_stored_values(path, *values):
