@@ -268,6 +268,8 @@ class Wiring:
         if not connection.source.component and source_info.causality != "input":
             causalities = (source_info.causality, "input")
         requirement = f"a single number is needed as {' or '.join(causalities)}"
+        if self.variable(target).causality == "parameter":
+            requirement += ": give it a value at its component, or make it an input of the FMU"
         return self._single(target, causalities, "the target of this connection", requirement)
 
     def _single(
