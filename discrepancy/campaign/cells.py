@@ -37,7 +37,15 @@ LOGICAL = {"true": "1", "false": "0"}
 
 
 class ExactNumber(str):
-    """A number of a file that stores numbers, as Excel and MATLAB do, with a decimal point."""
+    """A number of a file that stores numbers, as Excel and MATLAB do, with a decimal point.
+
+    Attributes
+    ----------
+    shown_unit : str
+        The unit that Excel shows beside the number, by its number format; empty if there is none.
+    """
+
+    shown_unit = ""
 
 
 def plain_number(cell: str, mark: str) -> str | None:

@@ -51,6 +51,14 @@ def is_unit(text: str) -> bool:
         return False
 
 
+def is_same_unit(first: str, second: str) -> bool:
+    """Return whether two texts mean one unit, as um and µm do."""
+    try:
+        return first == second or conversion_factor(first, second) == 1.0
+    except ValueError:
+        return False
+
+
 def load_or_time_role(unit: str) -> str:
     """Return "time" or "force" for a unit of one of them, else an empty text."""
     try:

@@ -24,6 +24,7 @@ from discrepancy.campaign.cells import (
 )
 from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.matlab_file import read_matlab
+from discrepancy.campaign.number_formats import shown_number, unit_beside_number_formats
 from discrepancy.campaign.table_layout import SEPARATORS, Rows, find_table
 from discrepancy.campaign.wild_readings import is_fill_value, numbers_or_nan, wild_readings
 from discrepancy.errors import CampaignFileError
@@ -266,6 +267,7 @@ def _sheet_of_rows(
         if texts:
             left_out += _remark_on_texts(title, len(filled) - len(texts), len(texts))
         elif filled:
+            unit = unit_beside_number_formats(name, head, unit, filled)
             if all(cell.lower() in LOGICAL for cell in filled):
                 unit = unit or "1"
             heads.append(head)
@@ -404,7 +406,7 @@ def _read_workbook(path: Path) -> dict[str, _WorkbookSheet]:
                 rows = []
                 blank_cells: set[str] = set()
                 for line, row in enumerate(sheet.iter_rows(), start=1):
-                    cells = [_excel_text(cell.value) for cell in row]
+                    cells = [_excel_text(cell) for cell in row]
                     if any(cells):
                         rows.append((line, cells))
                     blank_cells.update(cell.coordinate for cell in row if _has_no_value(cell))
@@ -478,14 +480,15 @@ def _refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> Non
         )
 
 
-def _excel_text(cell: object) -> str:
+def _excel_text(cell: Any) -> str:
     """Return the text of a cell of a workbook; times are written in ISO format."""
-    if cell is None:
+    value = cell.value
+    if value is None:
         return ""
-    if isinstance(cell, timedelta):
-        cell = datetime.min + cell
-    if isinstance(cell, datetime | time):
-        return cell.isoformat()
-    if isinstance(cell, int | float) and not isinstance(cell, bool):
-        return ExactNumber(repr(cell))
-    return str(cell).strip()
+    if isinstance(value, timedelta):
+        value = datetime.min + value
+    if isinstance(value, datetime | time):
+        return value.isoformat()
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return shown_number(value, cell.number_format)
+    return str(value).strip()

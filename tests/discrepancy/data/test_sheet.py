@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from openpyxl import Workbook
+from openpyxl import Workbook, load_workbook
 
 from discrepancy.campaign.columns import release_in_si
 from discrepancy.campaign.importing import LaboratoryImport
@@ -350,6 +350,64 @@ def test_one_of_several_sheets(tmp_path):
         read_sheet(path)
     with refused(CampaignFileError, "say which as"):
         read_sheet(Path(f"{path}#Ruh"))
+
+
+def book_of_formats(folder, head, cells):
+    """Write a workbook with times and a column, of which each cell has a value and a number format."""
+    path = book_of(folder, [["t [s]", head], *([row, value] for row, (value, _) in enumerate(cells))])
+    book = load_workbook(path)
+    for row, (_, number_format) in enumerate(cells, start=2):
+        book.active.cell(row, 2).number_format = number_format
+    book.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("head", "number_format", "unit", "numbers"),
+    [
+        ("w", '0.00" mm"', "mm", ["0.85", "-0.07"]),
+        ("w", r"#,##0.0\ \m\m", "mm", ["0.85", "-0.07"]),
+        ("w", '[Red]0.0" mm";-0.0" mm"', "mm", ["0.85", "-0.07"]),
+        ("w [mm]", '0.00" mm"', "mm", ["0.85", "-0.07"]),
+        ("w [um]", '0.00" µm"', "µm", ["0.85", "-0.07"]),
+        ("w", '0.0,,"MN"', "MN", ["0.00000085", "-0.00000007"]),
+        ("w", "0%", "%", ["85", "-7"]),
+        ("w [%]", "0.00%", "%", ["85", "-7"]),
+        ("w [%]", "0.00", "%", ["0.85", "-0.07"]),
+        ("w [%]", '0.00"%"', "%", ["0.85", "-0.07"]),  # a quoted sign does not multiply
+        ("w [-]", "0.00%", "%", ["85", "-7"]),
+        ("w [mm]", '0.00" rot"', "mm", ["0.85", "-0.07"]),
+        ("w [mm]", "0.00E+00", "mm", ["0.85", "-0.07"]),
+    ],
+)
+def test_a_number_is_taken_as_its_format_shows_it(tmp_path, head, number_format, unit, numbers):
+    sheet = read_sheet(book_of_formats(tmp_path, head, [(0.85, number_format), (-0.07, number_format)]))
+    assert sheet.units[1] == unit
+    assert [float(number) for number in sheet.numbers("w", ".")] == [float(number) for number in numbers]
+
+
+@pytest.mark.parametrize(
+    ("head", "number_format", "numbers"),
+    [("w [mm]", '0.0" mm"', ("0.85", "0.5")), ("w [%]", "0%", ("85", "0.5"))],
+)
+def test_a_number_without_a_format_has_the_unit_of_the_head(tmp_path, head, number_format, numbers):
+    path = book_of_formats(tmp_path, head, [(0.85, number_format), (0.5, "General")])
+    assert read_sheet(path).numbers("w", ".") == numbers
+
+
+@pytest.mark.parametrize(
+    ("head", "formats", "sentence"),
+    [
+        ("w [cm]", ['0.0" mm"', '0.0" mm"'], "the column 'w' has the unit cm, but its cells are shown in mm"),
+        ("w [mm]", ["0%", "0%"], "the column 'w' has the unit mm, but its cells are shown in %"),
+        ("w", ["0%", "0.0"], "the cells of the column 'w' are shown in % and no unit"),
+        ("w", ['0.0" mm"', '0.0" cm"'], "the cells of the column 'w' are shown in cm and mm"),
+    ],
+)
+def test_number_formats_that_contradict_are_refused(tmp_path, head, formats, sentence):
+    path = book_of_formats(tmp_path, head, [(0.85, shown) for shown in formats])
+    with refused(CampaignFileError, f"lab.xlsx: {sentence}"):
+        read_sheet(path)
 
 
 def test_all_sheets_of_a_workbook_are_tables_except_those_without_numbers(tmp_path):
