@@ -9,7 +9,7 @@ import pickle
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,7 +24,7 @@ from reporting.files import (
 )
 from reporting.json_file import read_json
 from reporting.notebook import html_table
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, SilentProgress, note
 from reporting.words import listing
 from twin_master import run_folder
 from twin_master.assets.reduced_model import ReducedModelSource
@@ -50,6 +50,7 @@ from twin_master.mission.parts import (
 )
 from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
+from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
@@ -308,6 +309,8 @@ def prepare_kit(
         policy = parts.policy_for(build_graphical_model(located))
         knowledge = prepare_knowledge(located, source, scenario.mission.seed, policy, parts)
         save_knowledge(folder, knowledge)
+        if not is_real and not reason_flown_one_by_one(scenario, parts):
+            _note_likelihood_of_single_observations(knowledge.sensor_model)
     model = None
     if flies_model(scenario) and not is_real and isinstance(source, ReducedModelSource):
         model = source.prepared_model
@@ -324,6 +327,23 @@ def prepare_kit(
             f"that fly ({error}): define the class or function at the top of a module, or give "
             "its name FILE.py:NAME."
         ) from error
+
+
+def _note_likelihood_of_single_observations(sensor_model: GaussianSensorModel) -> None:
+    """Tell the user how a sensor model that is asked for one twin at a time becomes faster."""
+    if sensor_model.takes_observations_one_by_one:
+        _note_once(
+            f"The sensor model {type(sensor_model).__qualname__} has only `log_likelihood`, which "
+            "is asked for one twin after the other: to be as fast as that of the scenario, "
+            "implement `log_likelihood_sequence(observations, control_index)` in its place, "
+            "(rows, sensors) and (rows,) -> (rows, states)."
+        )
+
+
+@cache
+def _note_once(message: str) -> None:
+    """Show a line once in a process, also if several scenarios give it."""
+    note(message)
 
 
 class Shard(NamedTuple):

@@ -218,7 +218,7 @@ def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
     """Simulate the assets of some twins, and return the flights.
 
     Assets without memory are flown side by side in array operations, unless the twins learn or have
-    a filter that a user has given; other assets are flown one after the other.
+    an estimator that a user has given; other assets are flown one after the other.
     """
     knowledge = kit.knowledge
     scenario = kit.scenario
@@ -240,8 +240,8 @@ def reason_flown_one_by_one(scenario: Scenario, parts: TwinParts) -> str:
     """
     if scenario.learning is not None:
         return "they learn"
-    if parts.replace_filter:
-        return "they have a sensor model or an estimator of your own"
+    if parts.estimator is not None:
+        return "they have an estimator of your own"
     return ""
 
 

@@ -25,7 +25,7 @@ from twin_master.mission.loop import early_end_sentence, fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
 from twin_master.network.estimator import Notice
-from twin_master.network.inference import Filtered, filter_many
+from twin_master.network.inference import Filtered, checked_sequence, filter_many
 from twin_master.network.planner import decision_probability, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, unbelievable_observation
 
@@ -369,11 +369,16 @@ class _Formation:
         Such a twin stops flying, and its error is stored in `flights.failure`.
         """
         knowledge = self._knowledge
-        likelihood = knowledge.sensor_model.log_likelihood_sequence(observed_rows, self._control)
+        (control,), (likelihood,) = checked_sequence(
+            knowledge.model,
+            self._control,
+            knowledge.sensor_model.log_likelihood_sequence(observed_rows, self._control),
+            what="log-likelihood",
+        )
         # The filter takes sequences of steps; each twin has a sequence of one.
         filtered_beliefs, failed_row = filter_many(
             knowledge.model.transition,
-            self._control[:, None],
+            control[:, None],
             likelihood[:, None],
             self._log_belief,
             self._previous_control,
@@ -408,6 +413,8 @@ class _Formation:
             state = self._watch_state
             watch.faults.advance(state, self._previous_control, self._control)
         notices = watch.assimilate(state, checked, filtered_beliefs.filtered, step)
+        if self._watch_state is None:
+            notices = [watch.report_own_likelihood() + of_twin for of_twin in notices]
         if np.any(self._is_flying & ~state.is_finite(LARGEST_CARRIED)):
             raise unbelievable_observation(self._knowledge.scenario.mission.name, step)
         for twin in np.flatnonzero(self._is_flying).tolist():

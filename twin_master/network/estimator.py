@@ -47,6 +47,10 @@ class SensorModel(Protocol):
     It may have a method `worst_residuals(observation, control_index)`. That returns the
     standardised residuals of the sensors that fit worst, by name, for the message about an
     impossible observation.
+
+    Missions and fleets take a `GaussianSensorModel` or a class derived from it. Its vectorised form
+    `log_likelihood_sequence(observations, control_index)`, (T, G) and (T,) -> (T, S), gives the
+    likelihoods of many twins at once; each of the two methods has the other as its default.
     """
 
     def log_likelihood(self, observation: ArrayLike, control_index: int, /) -> Float:

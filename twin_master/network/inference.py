@@ -90,7 +90,7 @@ class Predicted:
         return Predicted(self.predicted, (1.0 - weight) * self.joint + weight * joint_of_control)
 
 
-def _check_sequence(
+def checked_sequence(
     model: GraphicalModel, control_index: ArrayLike, log_rows: ArrayLike, *, what: str
 ) -> tuple[Index, Float]:
     """Return checked controls (1, T) and logarithms (1, T, S), as the compiled loops expect them.
@@ -105,6 +105,11 @@ def _check_sequence(
         A logarithm for each step and state.
     what : str
         The noun of the rows, for the message.
+
+    Raises
+    ------
+    InvalidModelError, InvalidObservationError
+        If shapes do not fit, or a logarithm is NaN or plus infinity.
     """
     control = checked_controls(control_index, len(model.controls))
     check_shape("controls", control.shape, control.size)
@@ -231,7 +236,7 @@ def filter_sequence(
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
-    control, rows = _check_sequence(model, control_index, log_likelihood, what="log-likelihood")
+    control, rows = checked_sequence(model, control_index, log_likelihood, what="log-likelihood")
     log_before, control_before = before or (model.log_prior, _NO_CONTROL)
     filtered_steps, failed = filter_many(
         model.transition, control, rows, log_before, control_before
@@ -258,7 +263,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log belief is NaN or plus infinity.
     """
-    control, rows = _check_sequence(model, control_index, log_filtered, what="log belief")
+    control, rows = checked_sequence(model, control_index, log_filtered, what="log belief")
     return np.asarray(smooth_many(model.transition, control, np.exp(rows), rows)[0])
 
 

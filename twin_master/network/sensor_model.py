@@ -199,12 +199,17 @@ class GaussianSensorModel(QuantityModel):
     @property
     def has_own_likelihood(self) -> bool:
         """Whether a subclass computes the density of an observation in a way of its own."""
-        own = type(self)
-        return (
-            own.log_likelihood is not GaussianSensorModel.log_likelihood
-            or own.log_likelihood_sequence is not GaussianSensorModel.log_likelihood_sequence
-            or own.log_density_of_draws is not GaussianSensorModel.log_density_of_draws
-        )
+        methods = ("log_likelihood", "log_likelihood_sequence", "log_density_of_draws")
+        return any(self._overrides(method) for method in methods)
+
+    @property
+    def takes_observations_one_by_one(self) -> bool:
+        """Whether a subclass has a likelihood of single observations, and none of many at once."""
+        return self._overrides("log_likelihood") and not self._overrides("log_likelihood_sequence")
+
+    def _overrides(self, method: str) -> bool:
+        """Return whether a subclass has a method in the place of that of this class."""
+        return getattr(type(self), method) is not getattr(GaussianSensorModel, method)
 
     @property
     def extra_arguments(self) -> Mapping[str, Any]:
@@ -289,6 +294,8 @@ class GaussianSensorModel(QuantityModel):
     def log_likelihood(self, observation: ArrayLike, control_index: int) -> Float:
         """Return log p(o | D, u) for each state, eq. (30) or (32).
 
+        A subclass with a `log_likelihood_sequence` alone is asked for a sequence of one.
+
         Parameters
         ----------
         observation : (G,) array
@@ -306,6 +313,11 @@ class GaussianSensorModel(QuantityModel):
         InvalidObservationError, InvalidModelError
             If the shape is wrong, if a value is infinite, or if there is no such control.
         """
+        if self._overrides("log_likelihood_sequence") and not self._overrides("log_likelihood"):
+            row = nan_where_masked(observation)[None]
+            control = checked_controls([control_index], self.control_count)
+            (log_density_of_row,) = self.log_likelihood_sequence(row, control)
+            return np.asarray(log_density_of_row)
         values, other_log_density = self.split_observation(observation)
         log_density = self._log_densities(values[None], [control_index], 1).squeeze(axis=(0, 2))
         return np.asarray(log_density + other_log_density)
@@ -313,11 +325,24 @@ class GaussianSensorModel(QuantityModel):
     def log_likelihood_sequence(self, observations: ArrayLike, control_index: ArrayLike) -> Float:
         """Return log p(o_t | D_t, u_t) for a sequence: (T, G) and (T,) -> (T, S).
 
+        The rows may be the steps of one twin or one step of many twins: each is by itself. A
+        subclass with a `log_likelihood` alone is asked for one row after the other.
+
         Raises
         ------
         InvalidObservationError, InvalidModelError
             As `log_likelihood`.
         """
+        if self.takes_observations_one_by_one:
+            rows = nan_where_masked(observations)
+            controls = checked_controls(control_index, self.control_count)
+            check_shape("controls", controls.shape, len(rows))
+            log_densities_of_rows = np.empty((len(rows), self.state_count))
+            for number, control in enumerate(controls.tolist()):
+                log_density_of_row = np.asarray(self.log_likelihood(rows[number], control))
+                check_shape("log-likelihood", log_density_of_row.shape, self.state_count)
+                log_densities_of_rows[number] = log_density_of_row
+            return log_densities_of_rows
         values, other_log_density = self.split_observation(observations)
         log_density = self._log_densities(values, control_index, 1).squeeze(axis=-1)
         return np.asarray(log_density + other_log_density)

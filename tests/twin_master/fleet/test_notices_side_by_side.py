@@ -1,19 +1,21 @@
 """Twins with notices that fly side by side give the notices and beliefs that each gives alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tests.twin_master.runs import of_library
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
-from twin_master.errors import InvalidObservationError
+from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.learning.monitor import gauge_watch_of
 from twin_master.mission import side_by_side
+from twin_master.mission.parts import TwinParts
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.steps import Truth
+from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.tables import Noticing, SensorFault
 
@@ -135,3 +137,53 @@ def test_an_infinite_value_is_refused_side_by_side_so_that_its_twin_fails_alone(
     with pytest.raises(InvalidObservationError, match="infinite"):
         fleet.fly_together()
     assert [twin for twin, failure in enumerate(fleet.fly_alone().failure) if failure] == [1]
+
+
+class Sharp(GaussianSensorModel):
+    """A likelihood of single observations."""
+
+    def log_likelihood(self, observation: ArrayLike, control_index: int) -> NDArray[np.float64]:
+        return 2.0 * super().log_likelihood(observation, control_index)
+
+
+class SharpTogether(GaussianSensorModel):
+    """The same likelihood, of many observations at once."""
+
+    def log_likelihood_sequence(
+        self, observations: ArrayLike, control_index: ArrayLike
+    ) -> NDArray[np.float64]:
+        return 2.0 * super().log_likelihood_sequence(observations, control_index)
+
+
+class Misshapen(GaussianSensorModel):
+    """Likelihoods of fewer states than there are."""
+
+    def log_likelihood_sequence(
+        self, observations: ArrayLike, control_index: ArrayLike
+    ) -> NDArray[np.float64]:
+        return super().log_likelihood_sequence(observations, control_index)[:, 1:]
+
+
+def with_sensor_model(fleet: WatchedFleet, model: type[GaussianSensorModel]) -> WatchedFleet:
+    scenario_model = fleet.knowledge.sensor_model
+    given = model(scenario_model.value_per_draw, scenario_model.standard_deviation)
+    return replace(fleet, knowledge=replace(fleet.knowledge, parts=TwinParts(sensor_model=given)))
+
+
+@pytest.mark.parametrize("model", [Sharp, SharpTogether])
+def test_twins_with_a_sensor_model_of_ones_own_fly_the_same_side_by_side(library_file, model):
+    fleet = watched_fleet("level_turns", library_file)
+    together = with_sensor_model(fleet, model).fly_together()
+
+    alone = with_sensor_model(fleet, model).fly_alone()
+    by_row = with_sensor_model(fleet, Sharp).fly_alone()
+    np.testing.assert_allclose(together.filtered, alone.filtered, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(together.filtered, by_row.filtered, rtol=1e-12, atol=1e-12)
+    assert together.notices == alone.notices
+    assert [notices[0][1].kind for notices in together.notices] == ["gaussian"] * len(fleet.truths)
+
+
+def test_a_sensor_model_with_likelihoods_of_fewer_states_is_refused(library_file):
+    fleet = with_sensor_model(watched_fleet("level_turns", library_file), Misshapen)
+    with pytest.raises(InvalidModelError, match="log-likelihood of shape"):
+        fleet.fly_together()

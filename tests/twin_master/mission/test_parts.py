@@ -235,6 +235,19 @@ def test_a_run_with_the_likelihood_of_the_alarms_says_nothing_of_it(library_file
     assert GAUSSIAN_ALARMS not in said("run", *words, "--no-report", "--out", tmp_path / "plain")
 
 
+@pytest.mark.parametrize(("name", "notes"), [("sharp", 1), ("plain", 0)])
+def test_an_ensemble_says_once_how_a_sensor_model_becomes_fast(
+    library_file, sharp_file, tmp_path, name, notes
+):
+    words = ["run", "level_turns", "--strain-library", library_file, "--seeds", "0:2", "--workers", 0]
+    words += ["--no-report", "--sensor-model", f"{sharp_file}:{name}", "--out", tmp_path / name]
+    flown = command(*words)
+    assert flown.returncode == 0, flown.stderr
+    assert flown.stderr.count("Sharp has only `log_likelihood`") == notes
+    assert flown.stderr.count("implement `log_likelihood_sequence(observations, control_index)`") == notes
+    assert "one after the other because" not in flown.stderr
+
+
 def test_an_ensemble_flies_side_by_side_with_and_without_notices(library_file, tmp_path):
     words = ["run", "level_turns", "--strain-library", library_file, "--seeds", "0:2", "--workers", 0]
     words.append("--no-report")

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
+from scipy.stats import t as student_t
 
 from benchmarks.studies.planning import PROBLEMS, tiger
 from twin_master.errors import InvalidModelError, InvalidObservationError, PlanningError
+from twin_master.mission.parts import object_by_name
 from twin_master.network import simulated_missions
 from twin_master.network.belief_planning import plan_on_belief
 from twin_master.network.decision_problem import DecisionProblem
@@ -25,6 +28,7 @@ from twin_master.network.transition import TransitionModel
 
 SEEDS = st.integers(0, 2**32 - 1)
 DRAWS, STATES, CONTROLS, SENSORS = 5, 4, 2, 6
+EXAMPLE = Path(__file__).parents[3] / "docs/how_to/add/example_plug_in/bar_plug_in/inference.py"
 
 
 def random_sensors(seed, spread=1.0):
@@ -55,6 +59,95 @@ def test_a_control_between_two_controls_is_refused():
 
     with pytest.raises(InvalidModelError, match=r"whole numbers as control indices, got 0\.5"):
         GaussianSensorModel(values, deviation).log_likelihood(observation, 0.5)
+
+
+class StudentByRow(GaussianSensorModel):
+    """A Student-t model as SciPy has it, of one observation at a time."""
+
+    def log_likelihood(self, observation, control_index):
+        is_seen = ~np.isnan(observation)
+        predicted = self.value_per_draw[:, :, control_index, is_seen]
+        deviation = self.total_standard_deviation[:, control_index, is_seen]
+        log_density = student_t.logpdf(observation[is_seen], df=4, loc=predicted, scale=deviation)
+        return logsumexp(log_density.sum(axis=-1), b=self.draw_weight[:, None], axis=0)
+
+
+StudentOfPage = object_by_name("sensor_model", f"{EXAMPLE}:StudentSensorModel")
+"""The documented example, of many observations at once."""
+
+
+@dataclass
+class StudentCase:
+    """Both forms of a Student-t model, and rows of readings of which some are lost."""
+
+    by_row: StudentByRow
+    vectorised: GaussianSensorModel
+    readings: np.ndarray
+    control: np.ndarray
+
+
+@st.composite
+def student_cases(draw) -> StudentCase:
+    rng, values, weight, deviation, _ = random_sensors(draw(SEEDS), draw(st.sampled_from([1.0, 50.0])))
+    rows = draw(st.integers(1, 6))
+    readings = rng.normal(size=(rows, SENSORS)) * 3.0
+    readings[rng.random((rows, SENSORS)) < draw(st.sampled_from([0.0, 0.4, 1.0]))] = np.nan
+    interval = rng.normal(size=(STATES, CONTROLS, SENSORS, 1)) * draw(st.sampled_from([0.0, 1.0]))
+    models = [
+        model(values, deviation, draw_weight=weight, interval=interval)
+        for model in (StudentByRow, StudentOfPage)
+    ]
+    return StudentCase(*models, readings, rng.integers(0, CONTROLS, rows))
+
+
+@given(case=student_cases())
+def test_a_vectorised_likelihood_is_that_of_its_rows(case):
+    together = case.vectorised.log_likelihood_sequence(case.readings, case.control)
+
+    one_by_one = case.by_row.log_likelihood_sequence(case.readings, case.control)
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-12, atol=1e-12)
+
+
+@given(case=student_cases())
+def test_a_single_observation_asks_a_vectorised_likelihood(case):
+    last_row = case.vectorised.log_likelihood(case.readings[-1], int(case.control[-1]))
+
+    expected = case.by_row.log_likelihood(case.readings[-1], int(case.control[-1]))
+    np.testing.assert_allclose(last_row, expected, rtol=1e-12, atol=1e-12)
+
+
+class Doubled(GaussianSensorModel):
+    """Both forms of a likelihood, each made of that of the Gaussian model."""
+
+    def log_likelihood(self, observation, control_index):
+        return 2.0 * super().log_likelihood(observation, control_index)
+
+    def log_likelihood_sequence(self, observations, control_index):
+        return 2.0 * super().log_likelihood_sequence(observations, control_index)
+
+
+def test_a_model_with_both_forms_of_a_likelihood_builds_on_the_gaussian_ones():
+    _, values, _, deviation, observation = random_sensors(0)
+    doubled = Doubled(values, deviation)
+
+    forms = [doubled.log_likelihood(observation, 1), doubled.log_likelihood_sequence([observation], [1])[0]]
+
+    gaussian = GaussianSensorModel(values, deviation).log_likelihood(observation, 1)
+    np.testing.assert_array_equal(forms, [2.0 * gaussian] * 2)
+
+
+class OfOneState(GaussianSensorModel):
+    """A likelihood that forgets all states but the first."""
+
+    def log_likelihood(self, observation, control_index):
+        return super().log_likelihood(observation, control_index)[:1]
+
+
+def test_a_likelihood_of_other_states_is_refused_in_many_rows():
+    _, values, _, deviation, observation = random_sensors(0)
+
+    with pytest.raises(InvalidModelError, match=rf"log-likelihood of shape \({STATES},\)"):
+        OfOneState(values, deviation).log_likelihood_sequence([observation], [0])
 
 
 @given(

@@ -10,15 +10,19 @@ import uav_twin
 class StudentSensorModel(uav_twin.GaussianSensorModel):
     """Errors of readings that follow a Student-t distribution with four degrees of freedom."""
 
-    def log_likelihood(self, observation, control_index):
-        """Return log p(o | D, u) for each state (S,)."""
-        readings = self.check_observation(observation)
-        seen = ~np.isnan(readings)
-        predicted = self.value_per_draw[:, :, control_index, seen]
-        deviation = self.total_standard_deviation[:, control_index, seen]
-        log_densities = t.logpdf(readings[seen], df=4, loc=predicted, scale=deviation)
-        weights = np.log(self.draw_weight)[:, None]
-        return logsumexp(log_densities.sum(axis=-1) + weights, axis=0)
+    def log_likelihood_sequence(self, observations, control_index):
+        """Return log p(o | D, u) of each row for each state: (T, G), (T,) -> (T, S)."""
+        readings = self.check_observation(observations)[:, None]  # (rows, 1, sensors)
+        # the deviations under the control of each row, (rows, states, sensors)
+        deviation = self.total_standard_deviation.swapaxes(0, 1)[control_index]
+        log_factor = t.logpdf(0.0, df=4) - np.log(deviation)
+        log_densities = []
+        for values in self.value_per_draw:  # those of a draw of the calibration
+            predicted = values.swapaxes(0, 1)[control_index]
+            residual = (readings - predicted) / deviation
+            log_density = log_factor - 2.5 * np.log1p(residual**2 / 4)
+            log_densities.append(np.nansum(log_density, axis=-1))  # a lost sensor is NaN
+        return logsumexp(log_densities, b=self.draw_weight[:, None, None], axis=0)
 
 
 def make_student(twin):
