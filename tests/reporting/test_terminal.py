@@ -151,7 +151,7 @@ def test_a_stage_that_reports_nothing_shows_its_last_detail_again(monkeypatch):
 
     with RichProgress(Console(file=stream, width=80)).stage("Searching") as stage:
         stage.advance(0, detail)
-        limit = time.monotonic() + 60.0
+        limit = time.monotonic() + 600.0
         while stream.getvalue().count(detail) < 2 and time.monotonic() < limit:
             time.sleep(0.01)
 

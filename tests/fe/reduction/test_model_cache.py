@@ -6,10 +6,11 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Timer
+from threading import Thread
 from typing import Any
 
 import numba
@@ -220,6 +221,10 @@ def test_a_real_build_is_reproducible_in_any_number_of_threads(
 # ---------------------------------------------------------------- several builders
 
 
+HANGS = 600.0
+"""After so long [s] another process hangs."""
+
+
 def build_here(path: Path) -> str:
     return built_once(path, path.read_text, lambda: "ours", path.write_text)
 
@@ -229,7 +234,7 @@ def build_elsewhere(path: Path, began: Any, finish: Any) -> None:
 
     def build() -> str:
         began.set()
-        finish.wait(60.0)
+        finish.wait(HANGS)
         return "theirs"
 
     built_once(path, path.read_text, build, path.write_text)
@@ -252,14 +257,29 @@ def other_builder(tmp_path):
     finish = context.Event()
     process = context.Process(target=build_elsewhere, args=(path, began, finish), daemon=True)
     process.start()
-    assert began.wait(60.0)
-    yield OtherBuilder(path, process, finish)
-    process.join(60.0)
+    try:
+        assert began.wait(HANGS)
+        yield OtherBuilder(path, process, finish)
+    finally:
+        process.kill()
+        process.join()
+
+
+def act_once_waiting(caplog: pytest.LogCaptureFixture, act: Callable[[], None]) -> None:
+    """Act when this process has said that it waits."""
+
+    def wait_and_act() -> None:
+        limit = time.monotonic() + HANGS
+        while not caplog.messages and time.monotonic() < limit:
+            time.sleep(0.01)
+        act()
+
+    Thread(target=wait_and_act, daemon=True).start()
 
 
 def test_a_wait_is_said_and_ends_with_what_the_other_made(other_builder, caplog):
     path = other_builder.path
-    Timer(0.3, other_builder.finish.set).start()
+    act_once_waiting(caplog, other_builder.finish.set)
 
     assert build_here(path) == "theirs"
 
@@ -271,7 +291,7 @@ def test_a_wait_is_said_and_ends_with_what_the_other_made(other_builder, caplog)
 
 def test_a_wait_for_a_process_that_was_killed_ends_with_a_build_here(other_builder, caplog):
     path = other_builder.path
-    Timer(0.3, other_builder.process.kill).start()
+    act_once_waiting(caplog, other_builder.process.kill)
 
     assert build_here(path) == "ours"
 

@@ -28,7 +28,9 @@ from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_pytho
 MISBEHAVIOURS = tables(__file__, "misbehaviours")
 REPLAYED = changed(HOSTILE, header={"state": "replay"})
 FREE = changed(HOSTILE, limits={"sandbox": False})
-LIMITS = {"step_timeout": 30.0, "load_timeout": 30.0, "memory_limit": 400.0}
+HANGS = 600.0
+"""After so long [s] a test hangs."""
+LIMITS = {"step_timeout": HANGS, "load_timeout": HANGS, "memory_limit": 400.0}
 NEVER_ANSWERED = 5.0
 """Limit [s] of FMUs that never answer; a loaded machine, too, makes a sound step in less."""
 Hostile = Callable[..., FmiAsset]
@@ -69,7 +71,7 @@ def processes(of: Path) -> list[str]:
     return found
 
 
-def wait_until(done: Callable[[], Any], limit: float = 120.0) -> None:
+def wait_until(done: Callable[[], Any], limit: float = HANGS) -> None:
     """Wait: who is killed does not die in the same moment."""
     deadline = time.monotonic() + limit
     while not done():
@@ -77,7 +79,7 @@ def wait_until(done: Callable[[], Any], limit: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-def await_nothing(scratch: Path, limit: float = 120.0) -> None:
+def await_nothing(scratch: Path, limit: float = HANGS) -> None:
     """Wait until nothing is left behind, neither processes nor files."""
     wait_until(lambda: not processes(scratch) and not list(scratch.iterdir()), limit)
 
@@ -125,7 +127,7 @@ def test_a_slow_leak_is_noticed_between_short_steps(hostile) -> None:
 
 @cases("start")
 def test_a_start_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
-    asset = hostile(what, load_timeout=NEVER_ANSWERED if kind is errors.FmuTimeoutError else 30.0)
+    asset = hostile(what, load_timeout=NEVER_ANSWERED if kind is errors.FmuTimeoutError else HANGS)
     for _ in range(2):
         with pytest.raises(kind, match=sentence):
             asset.reset()

@@ -17,6 +17,7 @@ from distributed import Client
 
 from reporting.progress import Progress, Stage
 from tests.twin_master.runs import journal
+from tests.twin_master.watch.conftest import HANGS, wait_until
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
 from twin_master.fleet.engine import Engine
@@ -73,6 +74,7 @@ def ended_by(run: Callable[[], object]) -> int:
     """Run a function in a process of its own, and return how it ended."""
     child = os.fork()
     if not child:
+        signal.alarm(HANGS)  # it ends by itself if it hangs
         try:
             run()
         finally:
@@ -179,11 +181,10 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, psutil.Process]]:
 
 def address_with_worker(port_file: Path) -> str:
     """Wait until a scheduler has a worker, and return its address."""
-    while not port_file.is_file():
-        time.sleep(0.05)
+    wait_until(port_file.is_file)
     address: str = json.loads(port_file.read_text(encoding="utf-8"))["address"]
-    with Client(address, timeout=60) as client:
-        client.wait_for_workers(1, timeout=60)
+    with Client(address, timeout=HANGS) as client:
+        client.wait_for_workers(1, timeout=HANGS)
     return address
 
 

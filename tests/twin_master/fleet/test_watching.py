@@ -30,7 +30,7 @@ from tests.twin_master.fleet.recordings import (
     write_fleet,
 )
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until
+from tests.twin_master.watch.conftest import HANGS, Mosquitto, mosquitto, served, wait_until
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.plan import load_fleet
@@ -529,7 +529,7 @@ def port_of_page(lost_folder: Path) -> Iterator[int]:
     serving = Thread(target=serve_fleet, args=arguments)
     serving.start()
     try:
-        yield int(address.get(timeout=300).rstrip("/").rpartition(":")[2])
+        yield int(address.get(timeout=HANGS).rstrip("/").rpartition(":")[2])
     finally:
         ended.set()
         serving.join()
@@ -643,7 +643,11 @@ class FollowedLogs:
             wait_until(lambda: self.last_steps() == [STEPS] * WIDE)
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait()
+            try:
+                process.wait(HANGS)
+            finally:
+                process.kill()
+                process.wait()
         self.said = messages.read_text()
 
     def last_steps(self) -> list[int]:

@@ -37,6 +37,9 @@ from twin_master.watch.intake import Counts
 from twin_master.watch.opening import begin_watch
 from twin_master.watch.result import store_watch
 
+HANGS = 600
+"""After so long [s] something hangs; nothing here takes a second on a machine that is not busy."""
+
 
 def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
     lines = ["step,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
@@ -91,6 +94,7 @@ def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
     """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
     journal, child = watch.folder / JOURNAL_NAME, os.fork()
     if not child:
+        signal.alarm(HANGS)  # it ends by itself if it hangs
         try:
             run()
             os._exit(0)
@@ -115,7 +119,7 @@ def viewed(folder: Path) -> Flight:
 
 
 def wait_until(found: Callable[[], object]) -> None:
-    limit = time.monotonic() + 300.0  # it hangs: nothing here takes a second
+    limit = time.monotonic() + HANGS
     while not found():
         assert time.monotonic() < limit
         time.sleep(0.02)
@@ -123,7 +127,7 @@ def wait_until(found: Callable[[], object]) -> None:
 
 def served(port: int, path: str = "/", host: str = "localhost") -> tuple[int, str]:
     """Return what a page of this machine answers to who calls it by a name."""
-    connection = HTTPConnection("127.0.0.1", port, timeout=20)
+    connection = HTTPConnection("127.0.0.1", port, timeout=HANGS)
     connection.request("GET", path, headers={"Host": host})
     with closing(connection), connection.getresponse() as answer:
         return answer.status, answer.read().decode()
@@ -140,8 +144,10 @@ def mosquitto(folder: Path, *, tls: bool = False) -> Iterator["Mosquitto"]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(PASSWORD_VARIABLE, PASSWORD)
         broker = Mosquitto(folder, tls=tls)
-        yield broker
-        broker.stop()
+        try:
+            yield broker
+        finally:
+            broker.stop()
 
 
 class Mosquitto:
@@ -176,16 +182,29 @@ class Mosquitto:
         config = self.folder / "mosquitto.conf"
         config.write_text("\n".join([*self.lines, *self.further, ""]))
         self.process = subprocess.Popen(["mosquitto", "-c", str(config)], stderr=subprocess.DEVNULL)
-        for _ in range(400):
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
-                return
-            except OSError:
-                time.sleep(0.02)
+        try:
+            wait_until(self.answers)
+        except AssertionError:
+            self.process.kill()
+            self.process.wait()
+            raise
+
+    def answers(self) -> bool:
+        """Return whether the broker takes connections; it must not have ended."""
+        assert self.process.poll() is None
+        try:
+            socket.create_connection(("127.0.0.1", self.port), HANGS).close()
+        except OSError:
+            return False
+        return True
 
     def stop(self) -> None:
         self.process.terminate()
-        self.process.wait(20)
+        try:
+            self.process.wait(HANGS)
+        finally:
+            self.process.kill()
+            self.process.wait()
 
     def again(self) -> None:
         self.stop()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.refusals import Inputs
 from tests.twin_master.runs import belief_in_journal, journal
-from tests.twin_master.watch.conftest import begun, ran
+from tests.twin_master.watch.conftest import HANGS, begun, ran
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import feed_of_lines, feed_of_mappings, file_feed
 from twin_master.watch.folder import Watch
@@ -206,10 +206,14 @@ with open({str(path)!r}, "a", encoding="utf-8") as file:
 """
     process = subprocess.Popen([sys.executable, "-c", writer], stdin=subprocess.PIPE, text=True)
     assert process.stdin is not None
-    with process.stdin:
-        process.stdin.write("\n".join(published.lines()) + "\n")
-    ran(timed_watch, feed, steps)
-    assert process.wait(60) == 0
+    try:
+        with process.stdin:
+            process.stdin.write("\n".join(published.lines()) + "\n")
+        ran(timed_watch, feed, steps)
+        assert process.wait(HANGS) == 0
+    finally:
+        process.kill()
+        process.wait()
     check_mission(timed_watch, mission)
 
 

@@ -17,6 +17,7 @@ import uav_twin
 from tests.command_line import command, said, seen
 from tests.twin_master.runs import edited, journal
 from tests.twin_master.watch.conftest import (
+    HANGS,
     journalled,
     last_line,
 )
@@ -41,14 +42,17 @@ def abandoned_watch(
     words = ["watch", str(scenario.path), "--no-report", "--out", str(folder)]
     pipe = subprocess.PIPE
     with subprocess.Popen([*program, *words], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
-        process.stdin.write("".join(lines[:2]))
-        process.stdin.flush()
-        decision = json.loads(process.stdout.readline())
-        process.stdout.close()
-        process.stdin.write("".join(lines[2:]))
-        process.stdin.flush()
-        code = process.wait(300)
-        complaint = process.stderr.read()
+        try:
+            process.stdin.write("".join(lines[:2]))
+            process.stdin.flush()
+            decision = json.loads(process.stdout.readline())
+            process.stdout.close()
+            process.stdin.write("".join(lines[2:]))
+            process.stdin.flush()
+            code = process.wait(HANGS)
+            complaint = process.stderr.read()
+        finally:
+            process.kill()
     return folder, decision, code, complaint
 
 
