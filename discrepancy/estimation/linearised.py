@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import expm
 
 from discrepancy.campaign.records import FloatArray, IntArray
 from discrepancy.missing_force.filtered import ForceFilter, Process
-from discrepancy.missing_force.kalman import discretise
+from discrepancy.missing_force.kalman import discretise, respond_to_inputs
 from discrepancy.missing_force.trial import PortedTrial
 
 from .kernel import filter_record, smooth_record, substep_matrices_with_laws
@@ -195,7 +194,9 @@ class LinearisedTrial:
         free_transition, free_noise = discretise(
             state_space.generator, state_space.intensity, substep_lengths
         )
-        by_input_at_begin, by_input_at_end = input_matrices(state_space.generator, substep_lengths)
+        _, by_input_at_begin, by_input_at_end = respond_to_inputs(
+            state_space.generator, substep_lengths
+        )
         drifts = self._drift_by_system_parameters(
             by_input_at_begin, by_input_at_end, interval_of_sample
         )
@@ -544,33 +545,3 @@ def _change_over_substeps(
     if len(by_input) == 1:  # nearly all records: no matrix needs to be copied for each substep
         return np.asarray(rates @ by_input[0].T)
     return np.asarray(np.einsum("jab,jb->ja", by_input[interval_of_substep], rates))
-
-
-def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how much a unit input, added to the rate of a state, changes the state over a step.
-
-    The input is linear over the step. The matrices follow from one exponential of the system with
-    the input and its rate as further states (Van Loan 1978, IEEE Transactions on Automatic Control
-    23, 395-404).
-
-    Parameters
-    ----------
-    generator : (n, n) array
-        The rate matrix of the state [1/s].
-    lengths : (K,) array
-        The lengths of the steps [s].
-
-    Returns
-    -------
-    by_begin, by_end : (K, n, n) array
-        The changes for an input of one at the start of the step, falling to zero, and for an input
-        of one at its end, rising from zero.
-    """
-    n = len(generator)
-    blocks = np.zeros((len(lengths), 3 * n, 3 * n))
-    blocks[:, :n, :n] = generator * lengths[:, None, None]
-    blocks[:, :n, n : 2 * n] = np.eye(n) * lengths[:, None, None]
-    blocks[:, n : 2 * n, 2 * n :] = np.eye(n)
-    exponential = expm(blocks)[:, :n]
-    by_constant_input, by_rising_input = exponential[:, :, n : 2 * n], exponential[:, :, 2 * n :]
-    return by_constant_input - by_rising_input, by_rising_input

@@ -82,6 +82,64 @@ def discretise(
     return transitions, noises
 
 
+@compiled
+def respond_to_inputs(
+    generator: FloatArray, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return transitions of steps, and how much a unit input at either end changes the state.
+
+    The input is added to the rate of the state, and is linear over the step (first-order hold). As
+    in `discretise` a series is summed for a small part of a step, which is then doubled: over two
+    parts, an input that rises from zero to one rises to a half in each.
+
+    Parameters
+    ----------
+    generator : (n, n) array
+        The rate matrix A [1/s].
+    lengths : (J,) array
+        The lengths of the steps [s].
+
+    Returns
+    -------
+    transitions : (J, n, n) array
+        The transitions of the state.
+    by_begin, by_end : (J, n, n) array
+        The changes for an input of one at the start of the step, falling to zero, and for an input
+        of one at its end, rising from zero.
+    """
+    n = len(generator)
+    norm = np.max(np.sum(np.abs(generator), axis=1)) if n else 0.0
+    transitions = np.empty((len(lengths), n, n))
+    by_begin = np.empty((len(lengths), n, n))
+    by_end = np.empty((len(lengths), n, n))
+    for k in range(len(lengths)):
+        doublings = 0
+        part_length = lengths[k]
+        while norm * part_length > SERIES_NORM:
+            doublings += 1
+            part_length = 0.5 * part_length
+        # the terms (A h)^j h / (j + 1)! and (A h)^j h / (j + 2)! of the integrals of exp(A s)
+        term = np.eye(n)
+        transition = np.eye(n)
+        by_constant = np.eye(n)
+        by_rise = 0.5 * np.eye(n)
+        for order in range(1, SERIES_TERMS):
+            term = (generator @ term) * (part_length / order)
+            transition = transition + term
+            by_constant = by_constant + term / (order + 1)
+            by_rise = by_rise + term / ((order + 1) * (order + 2))
+        by_constant = by_constant * part_length
+        by_rise = by_rise * part_length
+        for _ in range(doublings):
+            by_rise = 0.5 * (transition @ by_rise + by_constant + by_rise)
+            by_constant = transition @ by_constant + by_constant
+            transition = transition @ transition
+        transitions[k] = transition
+        by_begin[k] = by_constant - by_rise
+        by_end[k] = by_rise
+    return transitions, by_begin, by_end
+
+
 @callable_when_compiled
 def update_covariance(covariance: FloatArray, row: FloatArray, gain: FloatArray) -> float:
     """Update a covariance (n, n) in place by one reading, and return the innovation's variance.

@@ -18,13 +18,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.time_history import subdivide
 
-from .kalman import state_under_inputs
+from .kalman import respond_to_inputs, state_under_inputs
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """The forces by port of a trial in which no force acts: an empty mapping."""
@@ -257,28 +256,9 @@ class PortedTrial:
 
     @cached_property
     def substep_matrices(self) -> SubstepMatrices:
-        """The matrices that advance the state over a substep (first-order hold).
-
-        The state is extended by the input and by the rate of the input. One matrix exponential of
-        this larger system contains the transition and the response to both (Van Loan 1978, IEEE
-        Transactions on Automatic Control 23, 395-404).
-        """
-        n = len(self.system.generator)
-        lengths = self.intervals.lengths[:, None, None] / self.substeps
-        blocks = np.zeros((len(lengths), 3 * n, 3 * n))
-        state, input_, input_rate = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
-        blocks[:, state, state] = self.system.generator * lengths
-        blocks[:, state, input_] = np.eye(n) * lengths
-        # time runs from 0 to 1 over the substep: a rate of one is a rise of the input by one
-        blocks[:, input_, input_rate] = np.eye(n)
-        exponential = expm(blocks)
-        transition = np.ascontiguousarray(exponential[:, state, state])
-        by_constant_input = np.ascontiguousarray(exponential[:, state, input_])
-        by_rising_input = np.ascontiguousarray(exponential[:, state, input_rate])
-        # The weight of the input at the end of the substep is the response to a ramp from 0 to 1.
-        # The weight of the input at its start is the response to a ramp from 1 to 0, which is a
-        # constant minus a rising one.
-        return SubstepMatrices(transition, by_constant_input - by_rising_input, by_rising_input)
+        """The matrices that advance the state over a substep (first-order hold)."""
+        substep_lengths = self.intervals.lengths / self.substeps
+        return SubstepMatrices(*respond_to_inputs(self.system.generator, substep_lengths))
 
     @cached_property
     def fine_time(self) -> FloatArray:
