@@ -84,7 +84,7 @@ def compiled(
     """
     if numba is None:
         return _plain_with_note(function)
-    options: dict[str, object] = {**_SELF_CONTAINED}
+    options: dict[str, object] = {**(_SELF_CONTAINED if reorders_sums else OPTIONS)}
     if reorders_sums:
         options["fastmath"] = set(REORDERED_SUMS)
     sources = (function, *calls, *_compiled_callees(function))

@@ -125,7 +125,7 @@ class Channel(InTables):
         Its noise; without it, the size of the residuals of a fit cannot be judged.
     gain_deviation : float
         Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
-        unknown scale (one of them is then the scale of the release amplitudes).
+        unknown scale (the scale of the release amplitudes, if only these show it).
     offset_deviation : float
         Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free zero.
     station : float or None

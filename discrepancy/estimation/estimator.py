@@ -305,10 +305,14 @@ class MotionEstimator(GaussNewton):
         log_evidence : float
             Their log evidence [nat].
         """
+        shortest_time, longest_time = self.correlation_time_range
         for port, quantity in product(tuple(processes), ("standard_deviation", "correlation_time")):
             # the first of a larger and a smaller value that is more probable is kept
             for ratio in (factor, 1.0 / factor):
                 value = ratio * getattr(processes[port], quantity)
+                # a force that stays the same throughout the records is a constant, not a process
+                if quantity == "correlation_time" and not shortest_time <= value <= longest_time:
+                    continue
                 changed_processes = processes | {
                     port: replace(processes[port], **{quantity: value})
                 }

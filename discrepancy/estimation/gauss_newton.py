@@ -8,6 +8,7 @@ Laplace's approximation.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
 from typing import Protocol
 
@@ -22,7 +23,7 @@ from discrepancy.missing_force.filtered import (
     integrate_out_last,
 )
 from discrepancy.missing_force.process_search import prior_log_density
-from discrepancy.missing_force.trial import PortedTrial
+from discrepancy.missing_force.trial import PortedTrial, correlation_time_range
 
 from .laws import LawForce
 from .linearised import LinearisedTrial, SmoothedTrial
@@ -552,6 +553,11 @@ class GaussNewton:
                 error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
                 largest_ratio = max(largest_ratio, error / largest_deviation)
         return largest_ratio
+
+    @cached_property
+    def correlation_time_range(self) -> tuple[float, float]:
+        """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
+        return correlation_time_range(self.trials)
 
     def _log_prior(self, processes: Mapping[int, Process]) -> float:
         """Return the logarithm of the prior of missing forces [nat], up to a constant."""

@@ -274,7 +274,7 @@ def shared_unknowns(
             continue
         estimate = gain_estimates.get(name, 1.0) - 1.0
         has_unknown_scale = isinf(channel.gain_deviation)
-        if has_unknown_scale and channel.quantity is Quantity.SIGNAL and not fixed_gain:
+        if has_unknown_scale and not fixed_gain and _is_scale_of_releases(campaign, name, trials):
             # amplitudes of releases and an unknown gain cannot both be fitted: fix the first gain
             fixed_gain[name] = estimate
             continue
@@ -297,6 +297,23 @@ def shared_unknowns(
         gain_channels=tuple(gain_channels),
         fixed_gain=fixed_gain,
     )
+
+
+def _is_scale_of_releases(campaign: Campaign, name: str, trials: tuple[Trial, ...]) -> bool:
+    """Return whether nothing but the unknown amplitudes of releases sets the scale of a signal.
+
+    A recorded load sets the scale of the readings, and so does a channel of known gain beside it.
+    """
+    if campaign.channels[name].quantity is not Quantity.SIGNAL:
+        return False
+    trials_of_channel = [trial for trial in trials if name in trial.channels]
+    has_known_gain = any(
+        not isinf(campaign.channels[other].gain_deviation)
+        for trial in trials_of_channel
+        for other in trial.channels
+    )
+    are_releases = all(trial.kind is TrialKind.RINGDOWN for trial in trials_of_channel)
+    return are_releases and not has_known_gain
 
 
 def local_unknowns(

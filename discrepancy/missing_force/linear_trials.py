@@ -23,7 +23,7 @@ from .filtered import (
     sum_regressions,
 )
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
-from .trial import PortedTrial, TrialColumn
+from .trial import PortedTrial, TrialColumn, correlation_time_range
 
 INFORMING_SAMPLES = 200
 """Number of later samples after which further ones hardly improve a smoothed state."""
@@ -271,9 +271,7 @@ class LinearTrials:
     @cached_property
     def correlation_time_range(self) -> tuple[float, float]:
         """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
-        intervals = [float(np.median(np.diff(trial.time))) for trial in self.trials]
-        durations = [float(trial.time[-1] - trial.time[0]) for trial in self.trials]
-        return min(intervals), max(durations)
+        return correlation_time_range(self.trials)
 
     def log_evidence_with_prior(self, median_processes: Processes, processes: Processes) -> float:
         """Return the log of evidence times prior of missing forces [nat].

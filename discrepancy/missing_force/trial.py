@@ -456,3 +456,10 @@ class PortedTrial:
     def divide_by_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns (..., N, C) over the noise deviation; 0 if a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
+
+
+def correlation_time_range(trials: Sequence[PortedTrial]) -> tuple[float, float]:
+    """Return the bounds of a correlation time [s]: shortest sampling interval, longest record."""
+    intervals = [float(np.median(np.diff(trial.time))) for trial in trials]
+    durations = [float(trial.time[-1] - trial.time[0]) for trial in trials]
+    return min(intervals), max(durations)

@@ -16,8 +16,8 @@ LEAST_PARTICIPATION = 0.03
 """Least participation of a mode at the release point, relative to the largest of all modes. A mode
 below it is treated as if it had this participation, since its amplitude is divided by it."""
 LEAST_SPEED = 1e-2
-"""A drive begins at rest if its first speed is below this fraction of its largest speed: the slope
-of the spline at its end is not more accurate."""
+"""A drive whose displacement is recorded begins at rest if its first speed is below this fraction
+of its largest speed: the slope of the spline at its end is not more accurate."""
 
 
 class ReleasedState(NamedTuple):
@@ -66,9 +66,13 @@ def state_at_first_stamp(
         largest_speeds = [
             np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
         ]
-        # an exact zero, since dry friction acts at any other speed
+        # an exact zero, since dry friction acts at any other speed; a recorded speed is exact
         is_at_rest = np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)
-        drive_speeds[is_at_rest & ~system.prescribes_state] = 0.0
+        has_recorded_displacement = np.array(
+            [motion.motion_order == 0 for motion in motions], dtype=np.bool_
+        )
+        is_slope = has_recorded_displacement & ~system.prescribes_state
+        drive_speeds[is_at_rest & is_slope] = 0.0
     # equilibrium under the first loads and the first positions of the drives
     if excitation.begins is Start.SETTLED:
         load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))

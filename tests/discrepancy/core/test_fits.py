@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from discrepancy.campaign.records import NoiseRecord
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
@@ -18,6 +18,7 @@ from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.fits.normal_equations import cholesky_factor
 from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.trial_data import shared_unknowns
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
@@ -331,3 +332,30 @@ def test_a_search_tells_what_could_not_be_fitted(verdict_beside_an_explosive_eff
     assert not_fitted.identifier == "explosive"
     assert not_fitted.reason.startswith("could not be fitted: ")
     assert not_fitted.reason.endswith("is not a finite number at every time.")
+
+
+GAIN = 137.0
+"""Gain of the only sensor, which is not stated [V/m]."""
+
+
+def layout_of_a_free_gain(kind):
+    """Return the layout of the shared unknowns of one trial of a signal of unknown scale."""
+    trials = (Trial.plain("the trial", kind, ("y1",), 0.01 * np.arange(50.0)),)
+    channel = Channel("y1", Quantity.SIGNAL, "y1", kit.NOISE, inf, 0.0)
+    campaign = Campaign("rig", {"y1": channel}, trials, None, {}, "")
+    return shared_unknowns(campaign, kit.ClosedForm(), trials, {"y1": GAIN})
+
+
+def test_a_free_gain_is_an_unknown_where_a_recorded_force_sets_the_scale():
+    layout = layout_of_a_free_gain(TrialKind.DRIVEN)
+
+    assert layout.gain_channels == ("y1",)
+    assert layout.fixed_gain == {}
+    assert layout.precision[-1] == 0.0
+
+
+def test_a_free_gain_is_fixed_where_only_releases_of_unknown_amplitude_show_it():
+    layout = layout_of_a_free_gain(TrialKind.RINGDOWN)
+
+    assert layout.fixed_gain == {"y1": GAIN - 1.0}
+    assert layout.gain_channels == ()

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
-from discrepancy.estimation.linearised import input_matrices
+from discrepancy.missing_force.kalman import respond_to_inputs
 
 PARTS, SAMPLES, STATES, CHANNELS, WIDTH = 2, 6, 3, 2, 3
 STAMPS = PARTS * (SAMPLES - 1) + 1
@@ -84,7 +84,7 @@ def test_a_linear_law_in_the_steps_is_of_second_order_in_their_length():
     errors = []
     for count in (8, 16):
         length = np.array([1.0 / count])
-        begin, end = input_matrices(generator, length)
+        _, begin, end = respond_to_inputs(generator, length)
         transition, _ = substep_matrices_with_laws(
             count,
             np.zeros(2, dtype=np.int64),
@@ -106,7 +106,7 @@ def test_a_stiff_law_reverses_no_motion_within_a_substep():
     generator[0, 1] = 1.0
     direction = np.array([[0.0], [-1.0]])
     length = np.array([1.0])
-    begin, end = input_matrices(generator, length)
+    _, begin, end = respond_to_inputs(generator, length)
     for damping, fastest in ((0.5, 0.7), (30.0, 0.05)):
         transition, _ = substep_matrices_with_laws(
             1,
@@ -120,3 +120,25 @@ def test_a_stiff_law_reverses_no_motion_within_a_substep():
             np.zeros((1, 2, 1)),
         )
         assert 0.0 <= transition[0, 1, 1] < fastest
+
+
+@pytest.mark.parametrize("states", [1, 3, 8])
+def test_responses_to_inputs_are_those_of_a_matrix_exponential(states):
+    """Van Loan's exponential of the system with the input and its rate as further states."""
+    generator = 30.0 * np.random.default_rng(states).standard_normal((states, states)) - 20.0 * np.eye(states)
+    length = 0.13
+    blocks = np.zeros((3 * states, 3 * states))
+    blocks[:states, :states] = generator * length
+    blocks[:states, states : 2 * states] = np.eye(states) * length
+    blocks[states : 2 * states, 2 * states :] = np.eye(states)
+    exponential = expm(blocks)[:states]
+    constant, rising = exponential[:, states : 2 * states], exponential[:, 2 * states :]
+
+    transition, begin, end = respond_to_inputs(generator, np.array([length]))
+
+    for computed, expected in (
+        (transition, exponential[:, :states]),
+        (begin, constant - rising),
+        (end, rising),
+    ):
+        np.testing.assert_allclose(computed[0], expected, atol=1e-11 * np.abs(expected).max())
