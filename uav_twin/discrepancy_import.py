@@ -144,6 +144,17 @@ def import_files(
             ),
         ),
     ] = None,
+    date_order: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--date-order",
+            metavar="[FILE=]FIRST",
+            help=(
+                "What comes first in dates, day or month, if 3/4/2026 can mean two days. May be "
+                "given several times."
+            ),
+        ),
+    ] = None,
     interval: Annotated[
         list[str] | None,
         typer.Option(
@@ -220,6 +231,7 @@ def import_files(
         "release": release,
         "load-place": load_place,
         "decimal": decimal,
+        "date-order": date_order,
         "interval": interval,
         "begins": begins,
         "held-out": [_held_out_answer(text) for text in held_out or ()],

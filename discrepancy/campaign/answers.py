@@ -10,7 +10,16 @@ Answers = Mapping[str, Mapping[str, str]]
 
 OF_COLUMNS = ("column", "unit", "quantity", "scale", "zero", "gain", "hold")
 """Options that are about columns."""
-OF_FILES = ("kind", "release", "load-place", "decimal", "interval", "begins", "held-out")
+OF_FILES = (
+    "kind",
+    "release",
+    "load-place",
+    "decimal",
+    "date-order",
+    "interval",
+    "begins",
+    "held-out",
+)
 """Options that are about files or, under an empty name, all of them."""
 OF_ALL_COLUMNS = ("zero", "gain", "hold")
 """Options about columns that may, under an empty name, be about all of them."""

@@ -8,6 +8,7 @@ from typing import Any
 from discrepancy.campaign.answers import OF_COLUMNS as OF_COLUMNS
 from discrepancy.campaign.answers import OF_FILES as OF_FILES
 from discrepancy.campaign.answers import Answers, Questionnaire, check_subjects
+from discrepancy.campaign.clock_cells import DAY_FIRST, MONTH_FIRST
 from discrepancy.campaign.clock_columns import find_clocks
 from discrepancy.campaign.clocks import MergedTable, merge_clocks
 from discrepancy.campaign.column_roles import ColumnReader, OutputQuantity
@@ -71,7 +72,7 @@ class LaboratoryImport:
         quantity_of: OutputQuantity | None = None,
         outputs: Sequence[str] = (),
     ) -> None:
-        self.sheets = sheets
+        self._sheets_as_read = sheets
         self.answers = answers
         self._quantity_of = quantity_of
         self._outputs = outputs
@@ -88,6 +89,7 @@ class LaboratoryImport:
 
         self.kinds = {name: self._kind_of_file(name) for name in names}
         self._noise_file = self._only_noise_file()
+        sheets = self.sheets = [self._sheet_with_clear_dates(sheet) for sheet in sheets]
         self.decimals = {sheet.name: self._decimal_mark(sheet) for sheet in sheets}
         reader = ColumnReader(self._questionnaire, self.kinds, quantity_of, outputs)
         self.columns: list[LaboratoryColumn] = []
@@ -150,7 +152,7 @@ class LaboratoryImport:
         """
         of_option = {**self.answers.get(option, {}), subject: answer}
         answers = {**self.answers, option: of_option}
-        return LaboratoryImport(self.sheets, answers, self._quantity_of, self._outputs)
+        return LaboratoryImport(self._sheets_as_read, answers, self._quantity_of, self._outputs)
 
     # ---------------------------------------------------------------- files
 
@@ -166,6 +168,16 @@ class LaboratoryImport:
                 f"Noise is read from one file, but {listing(files)} were given: give one of them."
             )
         return files[0] if files else None
+
+    def _sheet_with_clear_dates(self, sheet: Sheet) -> Sheet:
+        """Return a table with the day or the month first; ask if its dates can be read as both."""
+        if sheet.month_first is None:
+            return sheet
+        expected_answer = f"day or month, whichever comes first in {sheet.unclear_date}"
+        answer = self._questionnaire.ask(
+            "date-order", sheet.name, expected_answer, (DAY_FIRST, MONTH_FIRST)
+        )
+        return sheet.month_first if answer == MONTH_FIRST else sheet
 
     def _decimal_mark(self, sheet: Sheet) -> str:
         """Return the decimal mark of a file; ask if its numbers can be read in two ways."""

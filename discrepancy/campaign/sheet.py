@@ -7,12 +7,11 @@ wrong for the others), `csv.Sniffer` for 228.
 
 import csv
 import io
-import warnings
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, time, timedelta
+from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from discrepancy.campaign.cells import (
     LOGICAL,
@@ -20,13 +19,26 @@ from discrepancy.campaign.cells import (
     decimal_mark,
     is_value,
     plain_number,
+)
+from discrepancy.campaign.clock_cells import (
+    is_column_of_dates,
+    is_unclear_date,
+    join_dates_with_times,
+    possible_date_orders,
     seconds_of_clock_times,
 )
 from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.matlab_file import read_matlab
-from discrepancy.campaign.number_formats import shown_number, unit_beside_number_formats
-from discrepancy.campaign.table_layout import SEPARATORS, Rows, find_table
+from discrepancy.campaign.number_formats import unit_beside_number_formats
+from discrepancy.campaign.table_layout import SEPARATORS, Rows, TableLayout, find_table
 from discrepancy.campaign.wild_readings import is_fill_value, numbers_or_nan, wild_readings
+from discrepancy.campaign.workbook import (
+    ALL_SHEETS,
+    WorkbookSheet,
+    read_workbook,
+    refuse_formulas_among,
+    title_of_sheet,
+)
 from discrepancy.errors import CampaignFileError
 from reporting.files import hash_file
 from reporting.text_file import read_text
@@ -51,8 +63,6 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
-ALL_SHEETS = "all"
-"""What stands for all sheets of a workbook in `FILE.xlsx#all`, unless a sheet is called so."""
 LEAST_LOST_VALUE = 1e30
 """Numbers from here on stand for no reading, as 9.9E+37 of instruments does."""
 _MOST_LISTED_LINES = 5
@@ -84,6 +94,10 @@ class Sheet:
         A number that can be read in two ways, and its line; empty if there is none.
     remark : str
         How the table was found: its lines, the separator of cells, and what was left out.
+    unclear_date : str
+        A date that can be read in two ways, and its line; empty if that makes no difference.
+    month_first : Sheet or None
+        The same table if the month comes first in its dates; None unless there is an unclear date.
     """
 
     name: str
@@ -95,6 +109,8 @@ class Sheet:
     decimal: str | None
     unclear: str
     remark: str
+    unclear_date: str = ""
+    month_first: "Sheet | None" = None
 
     def numbers(self, head: str, decimal: str) -> tuple[str, ...]:
         """Return the cells of a column with a decimal point and without grouped digits.
@@ -132,7 +148,7 @@ def read_sheets(path: Path) -> list[Sheet]:
     file = path.with_name(path.name.removesuffix(f"#{ALL_SHEETS}"))
     if file == path or path.exists() or file.suffix.lower() not in EXCEL:
         return [read_sheet(path)]
-    workbook = _read_workbook(file)
+    workbook = read_workbook(file)
     if ALL_SHEETS in workbook:
         return [_table_of_workbook(path.name, file, ALL_SHEETS, workbook)]
     sheets = []
@@ -169,12 +185,23 @@ def read_sheet(path: Path) -> Sheet:
     if ending == MATLAB:
         return _without_fill_values(_matlab_sheet(file), "row")
     if ending in EXCEL:
-        workbook = _read_workbook(file)
-        title = _title_of_sheet(file, path.name.partition("#")[2], workbook)
+        workbook = read_workbook(file)
+        title = title_of_sheet(file, path.name.partition("#")[2], workbook)
         return _table_of_workbook(path.name, file, title, workbook)
     rows, separator = _text_rows(file)
     sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="line", separator=separator)
     return _without_fill_values(sheet, "line")
+
+
+def _table_of_workbook(
+    name: str, file: Path, title: str, workbook: Mapping[str, WorkbookSheet]
+) -> Sheet:
+    """Return the table in a sheet of a workbook; refuse formulas without a stored value."""
+    rows, blank_cells = workbook[title]
+    if blank_cells:
+        refuse_formulas_among(blank_cells, file, title)
+    sheet = _sheet_of_rows(name, file, rows, unit_of_place="row", separator="")
+    return _without_fill_values(sheet, "row")
 
 
 def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
@@ -184,6 +211,9 @@ def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
     """
     if sheet.decimal is None:
         return sheet
+    if sheet.month_first is not None:
+        month_first = _without_fill_values(sheet.month_first, unit_of_place)
+        sheet = replace(sheet, month_first=month_first)
     columns = []
     remark = sheet.remark
     for head, cells in zip(sheet.heads, sheet.columns, strict=True):
@@ -243,13 +273,42 @@ def _sheet_of_rows(
     """
     place = f"{name}, {unit_of_place}"
     layout = find_table(rows, name, place)
-    lines = tuple(line for line, _ in layout.body)
-    cells_of_columns = []
+    lines = [line for line, _ in layout.body]
+    columns = []
     for index in range(len(layout.head)):
-        cells_of_columns.append(tuple(_cell(row, index) for _, row in layout.body))
-    seconds_of_columns = seconds_of_clock_times(
-        cells_of_columns, [f"{place} {line}" for line in lines]
+        columns.append(tuple(_cell(row, index) for _, row in layout.body))
+    sheets = [
+        _sheet_of_columns(name, file, layout, columns, unit_of_place, separator, date_order=order)
+        for order in possible_date_orders(columns)
+    ]
+    if all(sheet.columns == sheets[0].columns for sheet in sheets):
+        return sheets[0]  # differences of times are the same in both orders
+    day_first, month_first = sheets
+    unclear_date = next(
+        f"{cell!r} in {unit_of_place} {line}"
+        for cells in columns
+        for line, cell in zip(lines, cells, strict=True)
+        if is_unclear_date(cell)
     )
+    return replace(day_first, unclear_date=unclear_date, month_first=month_first)
+
+
+def _sheet_of_columns(
+    name: str,
+    file: Path,
+    layout: TableLayout,
+    columns_of_file: Sequence[tuple[str, ...]],
+    unit_of_place: str,
+    separator: str,
+    *,
+    date_order: str,
+) -> Sheet:
+    """Return the table of a layout's columns, whose dates have the day or the month first."""
+    place = f"{name}, {unit_of_place}"
+    lines = tuple(line for line, _ in layout.body)
+    places = [f"{place} {line}" for line in lines]
+    cells_of_columns, times_of_dates = join_dates_with_times(columns_of_file, layout.head, places)
+    seconds_of_columns = seconds_of_clock_times(cells_of_columns, layout.head, places, date_order)
 
     # columns of numbers or times; columns with texts are left out with a remark, empty ones without
     heads: list[str] = []
@@ -259,9 +318,18 @@ def _sheet_of_rows(
     for index, title in enumerate(layout.head):
         head, unit = split_head(title or f"column {index + 1}", layout.units[index])
         cells = cells_of_columns[index]
+        if index in times_of_dates:
+            left_out += f"; {title!r} has the dates of {layout.head[times_of_dates[index]]!r}"
+            continue
         if index in seconds_of_columns:
+            seconds = seconds_of_columns[index]
+            if is_column_of_dates(cells) and not (
+                len(seconds_of_columns) == 1 and _increases(seconds)
+            ):
+                left_out += f"; the column {title!r} holds dates without times and is left out"
+                continue
             unit = "s"
-            cells = seconds_of_columns[index]
+            cells = tuple(ExactNumber(cell) if cell else "" for cell in seconds)
         filled = [cell for cell in cells if cell]
         texts = [cell for cell in filled if not is_value(cell)]
         if texts:
@@ -288,6 +356,13 @@ def _sheet_of_rows(
         decimal=decimal,
         unclear=unclear,
         remark=f"{first_to_last}{between_cells}{left_out}{layout.remark}",
+    )
+
+
+def _increases(cells: Sequence[str]) -> bool:
+    """Return whether the filled cells of a column are decimal numbers that increase strictly."""
+    return all(
+        before < after for before, after in pairwise(Decimal(cell) for cell in cells if cell)
     )
 
 
@@ -374,121 +449,3 @@ def _split_rows(lines: Sequence[str], separator: str, name: str) -> Rows:
     except csv.Error as cause:
         raise CampaignFileError(f"{name}, line {reader.line_num}: {one_line(cause)}.") from cause
     return rows
-
-
-class _WorkbookSheet(NamedTuple):
-    """The rows of a sheet of a workbook, and the names of cells that are stored without a value."""
-
-    rows: Rows
-    blank_cells: Set[str]
-
-
-def _read_workbook(path: Path) -> dict[str, _WorkbookSheet]:
-    """Return the sheets of a workbook by title.
-
-    Raises
-    ------
-    CampaignFileError
-        If the workbook cannot be read.
-    """
-    try:
-        from openpyxl import load_workbook
-    except ImportError:
-        raise CampaignFileError(
-            "Excel files need openpyxl: pip install 'uav-twin[xlsx]'."
-        ) from None
-    sheets: dict[str, _WorkbookSheet] = {}
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            book = load_workbook(path, read_only=True, data_only=True)
-            for sheet in book.worksheets:
-                sheet.reset_dimensions()  # those in the file may be wrong
-                rows = []
-                blank_cells: set[str] = set()
-                for line, row in enumerate(sheet.iter_rows(), start=1):
-                    cells = [_excel_text(cell) for cell in row]
-                    if any(cells):
-                        rows.append((line, cells))
-                    blank_cells.update(cell.coordinate for cell in row if _has_no_value(cell))
-                sheets[sheet.title] = _WorkbookSheet(rows, blank_cells)
-            book.close()
-    except Exception as cause:  # openpyxl raises almost any error for damaged files
-        raise CampaignFileError(
-            f"{path} cannot be read as an Excel workbook ({one_line(cause)}): save it again, or "
-            "save it as CSV."
-        ) from cause
-    return sheets
-
-
-def _title_of_sheet(file: Path, stated_title: str, workbook: Mapping[str, _WorkbookSheet]) -> str:
-    """Return the title of the sheet that a user names, or of the only one that is not empty.
-
-    Raises
-    ------
-    CampaignFileError
-        If the workbook does not have that sheet, or not one sheet only.
-    """
-    filled = [title for title, sheet in workbook.items() if sheet.rows]
-    is_clear = stated_title in workbook if stated_title else len(filled) == 1
-    if not is_clear:
-        raise CampaignFileError(
-            f"{file.name} has the sheets {', '.join(filled) or 'none'}: say which as "
-            f"{file.name}#SHEET, or import all as {file.name}#{ALL_SHEETS}."
-        )
-    return stated_title or filled[0]
-
-
-def _table_of_workbook(
-    name: str, file: Path, title: str, workbook: Mapping[str, _WorkbookSheet]
-) -> Sheet:
-    """Return the table in a sheet of a workbook; refuse formulas without a stored value."""
-    rows, blank_cells = workbook[title]
-    if blank_cells:
-        _refuse_formulas_among(blank_cells, file, title)
-    sheet = _sheet_of_rows(name, file, rows, unit_of_place="row", separator="")
-    return _without_fill_values(sheet, "row")
-
-
-def _has_no_value(cell: Any) -> bool:
-    """Return whether a cell that the workbook stores has no value, not even an empty text."""
-    return cell.value is None and cell.data_type != "str" and hasattr(cell, "coordinate")
-
-
-def _refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None:
-    """Refuse a sheet with formulas in cells without a value, as programs that do not compute write.
-
-    Raises
-    ------
-    CampaignFileError
-        If one of the cells holds a formula.
-    """
-    from openpyxl import load_workbook
-
-    formulas = []
-    with warnings.catch_warnings(action="ignore"):
-        book = load_workbook(path, read_only=True)
-        book[title].reset_dimensions()
-        for row in book[title].iter_rows():
-            formulas += [cell.coordinate for cell in row if cell.data_type == "f"]
-        book.close()
-    without_value = [cell for cell in formulas if cell in blank_cells]
-    if without_value:
-        raise CampaignFileError(
-            f"{path.name}, sheet {title}: {len(without_value)} of "
-            f"{counted(len(formulas), 'formula')} {is_or_are(len(without_value))} without a value, "
-            f"first in {without_value[0]}: open the workbook in Excel or LibreOffice and save it."
-        )
-
-
-def _excel_text(cell: Any) -> str:
-    """Return the text of a cell of a workbook; times are written in ISO format."""
-    value = cell.value
-    if value is None:
-        return ""
-    if isinstance(value, timedelta):
-        value = datetime.min + value
-    if isinstance(value, datetime | time):
-        return value.isoformat()
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return shown_number(value, cell.number_format)
-    return str(value).strip()

@@ -4,7 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from discrepancy.campaign.cells import CLOCK, is_value
+from discrepancy.campaign.cells import is_value
+from discrepancy.campaign.clock_cells import is_time
 from discrepancy.campaign.heads import is_unit, plain_unit, split_head, time_heads
 from discrepancy.errors import CampaignFileError
 from reporting.toml_file import short_repr
@@ -42,7 +43,7 @@ def _hold_several_numbers(title: str, cells: Sequence[str]) -> bool:
     The blank between the date and the time of a clock separates no numbers.
     """
     for cell in cells:
-        if " " in cell and not CLOCK.fullmatch(cell):
+        if " " in cell and not is_time(cell):
             return True
     text = " ".join(cells)
     return any(separator in title and separator in text for separator in SEPARATORS)

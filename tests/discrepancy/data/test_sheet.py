@@ -61,6 +61,19 @@ def test_odd_files_are_read_as_they_are_meant(tmp_path, name):
         (["11:59:58 PM", "12:00:01 AM"], ["0", "3"]),
         (["23:59:58", "00:00:01"], ["0", "3"]),
         (["10:00:05", "10:00:01"], ["0", "-4"]),  # out of order, and no midnight
+        (["2026-02-01 10:00:00 UTC", "2026-02-01 10:00:01 UTC"], ["0", "1"]),
+        (["2026-02-01 10:00:00+01", "2026-02-01 09:00:01 GMT"], ["0", "1"]),
+        (["20260331T100000Z", "20260331T100001.5Z"], ["0", "1.5"]),
+        (["31-MAR-2026 10:00:00", "1-Apr-2026 10:00:00"], ["0", "86400"]),
+        (["31-OCT-2026 10:00", "1-NOV-2026 10:00"], ["0", "86400"]),
+        (["31 March 2026 10:00:00", "1 April 2026 10:00:00"], ["0", "86400"]),
+        (["3/31/2026 10:00:00", "4/1/2026 10:00:00"], ["0", "86400"]),  # the first tells the month
+        (["3/4/2026 10:00:00", "3/4/2026 10:00:01"], ["0", "1"]),  # no matter which is the month
+        (["2026/3/31 23:59:59", "2026/3/31 24:00:00"], ["0", "1"]),
+        (["23:59:58", "24:00:00", "00:00:01"], ["0", "2", "3"]),
+        (["99:59:59", "100:00:00"], ["0", "1"]),
+        (["59:58.5", "00:00.0", "00:01.5"], ["0.0", "1.5", "3.0"]),
+        (["2026-03-31", "2026-04-01"], ["0", "86400"]),
     ],
 )
 def test_stamps_with_zones_halves_of_the_day_and_midnight_are_times(tmp_path, stamps, seconds):
@@ -68,6 +81,40 @@ def test_stamps_with_zones_halves_of_the_day_and_midnight_are_times(tmp_path, st
     sheet = sheet_of(tmp_path, f"stamp,w [mm]\n{rows}".encode())
     assert (sheet.heads, sheet.units) == (("stamp", "w"), ("s", "mm"))
     assert [*sheet.numbers("stamp", ".")] == seconds
+
+
+@pytest.mark.parametrize("layout", ["%Y-%m-%d", "%d.%m.%Y", "%d-%b-%Y", "%Y/%m/%d"])
+def test_dates_and_times_in_two_columns_are_one_time(tmp_path, layout):
+    stamps = [datetime(2026, 3, 30, 22) + timedelta(hours=24, minutes=7) * row for row in range(12)]
+    rows = "".join(f"{stamp:{layout},%H:%M:%S},{row}.5\n" for row, stamp in enumerate(stamps))
+    sheet = sheet_of(tmp_path, f"Date,Time,w [mm]\n{rows}".encode())
+    assert sheet.heads == ("Time", "w")
+    seconds = np.array([float(cell) for cell in sheet.numbers("Time", ".")])
+    np.testing.assert_array_equal(seconds, 86_820.0 * np.arange(12))
+
+
+def test_two_columns_of_dates_belong_to_the_times_in_their_order(tmp_path):
+    rows = b"2026-03-31,10:00:00,1,2026-04-01,10:00:00,2\n2026-03-31,10:00:01,1,2026-04-01,10:00:03,2\n"
+    sheet = sheet_of(tmp_path, b"d1,t1,w1 [mm],d2,t2,w2 [mm]\n" + rows)
+    assert [sheet.numbers(head, ".") for head in ("t1", "t2")] == [("0", "1"), ("86400", "86403")]
+
+
+def test_dates_of_one_day_without_times_are_left_out(tmp_path):
+    sheet = sheet_of(tmp_path, b"d,t [s],w [mm]\n2026-03-31,0.5,1\n2026-03-31,1.5,2\n")
+    assert sheet.heads == ("t", "w")
+    assert sheet.remark.endswith("; the column 'd' holds dates without times and is left out")
+
+
+@pytest.mark.parametrize(("answer", "seconds"), [("day", 2_592_000), ("month", 86_400)])
+def test_a_date_of_two_readings_is_asked(tmp_path, answer, seconds):
+    sheet = sheet_of(tmp_path, b"Time,w [mm]\n3/4/2026 10:00:00,1\n3/5/2026 10:00:00,2\n")
+    stated = {"kind": {"": "static"}, "column": {"w": "force"}, "unit": {"w": "N"}}
+    asked = LaboratoryImport([sheet], stated)
+    expected = "day or month, whichever comes first in '3/4/2026 10:00:00' in line 2"
+    assert asked.questions["date-order", expected] == ["odd.csv"]
+    understood = asked.with_answer("date-order", "odd.csv", answer)
+    assert not understood.questions
+    assert understood.sheets[0].numbers("Time", ".")[1] == str(seconds)
 
 
 def test_true_and_false_are_values(tmp_path):
@@ -335,6 +382,44 @@ def test_excel_workbooks(tmp_path, rows, text):
     sheet = read_sheet(book_of(tmp_path, rows))
     assert text_of(sheet) == text
     assert len(sheet.heads) == len(text[0].split())
+
+
+@pytest.mark.parametrize("rate", [400, 5_000, 8_000])
+@pytest.mark.parametrize("number_format", ["yyyy-mm-dd hh:mm:ss.000", "mm:ss.0"])
+def test_stamps_of_excel_are_exact_at_high_rates(tmp_path, rate, number_format):
+    book = Workbook()
+    book.active.append(["t", "w [mm]"])
+    start = (datetime(2026, 3, 31, 10) - datetime(1899, 12, 30)) / timedelta(days=1)
+    for row in range(200):
+        book.active.append([start + row / rate / 86_400, row])
+        book.active.cell(row + 2, 1).number_format = number_format
+    book.save(tmp_path / "lab.xlsx")
+    sheet = read_sheet(tmp_path / "lab.xlsx")
+    seconds = np.array([float(cell) for cell in sheet.numbers("t", ".")])
+    np.testing.assert_allclose(seconds, np.arange(200) / rate, rtol=0.0, atol=1e-12)
+
+
+def test_a_clock_of_excel_goes_on_after_24_hours_without_brackets(tmp_path):
+    book = Workbook()
+    for row in (["t", "w [mm]"], [23.5 / 24, 1], [24.5 / 24, 2], [49.0 / 24, 3]):
+        book.active.append(row)
+    for row in range(2, 5):
+        book.active.cell(row, 1).number_format = "hh:mm:ss"
+    book.save(tmp_path / "lab.xlsx")
+    assert read_sheet(tmp_path / "lab.xlsx").numbers("t", ".") == ("0", "3600", "91800")
+
+
+def test_dates_and_times_in_two_columns_of_excel_are_one_time(tmp_path):
+    days = [["Datum", "Zeit", "w [mm]"]]
+    days += [[datetime(2026, 3, 30 + row), clock(22, 7 * row), row] for row in range(2)]
+    sheet = read_sheet(book_of(tmp_path, days))
+    assert (sheet.heads, sheet.numbers("Zeit", ".")) == (("Zeit", "w"), ("0", "86820"))
+
+
+def test_the_row_of_a_number_that_became_a_date_is_named(tmp_path):
+    rows = [["t [s]", "w [mm]"], [0, 0.5], [1, 0.5], [2, datetime(2026, 2, 1)], [3, 0.5]]
+    with refused(CampaignFileError, "row 4: '2026-02-01T00:00:00' is a date or a time among the numbers"):
+        read_sheet(book_of(tmp_path, rows))
 
 
 def test_a_workbook_has_its_name_heads_units_and_rows(tmp_path):
