@@ -38,7 +38,7 @@ from reporting.words import listing
 KINDS = (*TrialKind, NOISE)
 """Kinds of a file: those of trials, and samples at rest."""
 _RECORDED_IN_TIME = (TrialKind.RINGDOWN, TrialKind.FORCED, TrialKind.DRIVEN, NOISE)
-_NOT_TITLE = re.compile(r".*\.xls[mx]#|\.[^.]*$")
+_NOT_TITLE = re.compile(r".*\.xls[mx]?#|\.[^.]*$")
 
 
 class LaboratoryImport:

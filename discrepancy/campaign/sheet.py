@@ -41,7 +41,7 @@ from discrepancy.campaign.workbook import (
 )
 from discrepancy.errors import CampaignFileError
 from reporting.files import hash_file
-from reporting.text_file import read_text
+from reporting.text_file import read_bytes, read_text
 from reporting.words import counted, is_or_are, listing, one_line
 
 MATLAB = ".mat"
@@ -63,6 +63,9 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
+_ZIP = b"PK"
+_COMPOUND_FILE = bytes.fromhex("d0cf11e0a1b11ae1")
+"""First bytes of Excel files of before 2007, and of encrypted ones of any year."""
 LEAST_LOST_VALUE = 1e30
 """Numbers from here on stand for no reading, as 9.9E+37 of instruments does."""
 _MOST_LISTED_LINES = 5
@@ -145,8 +148,8 @@ def read_sheets(path: Path) -> list[Sheet]:
     CampaignFileError
         For the causes of `read_sheet`, or if no sheet has a number.
     """
-    file = path.with_name(path.name.removesuffix(f"#{ALL_SHEETS}"))
-    if file == path or path.exists() or file.suffix.lower() not in EXCEL:
+    file, sheet_name = _file_and_sheet(path)
+    if sheet_name != ALL_SHEETS or _ending_by_content(file) not in EXCEL:
         return [read_sheet(path)]
     workbook = read_workbook(file)
     if ALL_SHEETS in workbook:
@@ -177,8 +180,8 @@ def read_sheet(path: Path) -> Sheet:
         If the file cannot be read, holds no table with a head, has a row with a text for a number,
         has decimals written in two ways, or a time that cannot be read or can be read in two ways.
     """
-    file = path if path.exists() else path.with_name(path.name.partition("#")[0])
-    ending = file.suffix.lower()
+    file, sheet_name = _file_and_sheet(path)
+    ending = _ending_by_content(file)
     if ending in OTHER_FORMATS:
         format_name, remedy = OTHER_FORMATS[ending]
         raise CampaignFileError(f"{file.name} is {format_name}, which is not read: {remedy}.")
@@ -186,7 +189,7 @@ def read_sheet(path: Path) -> Sheet:
         return _without_fill_values(_matlab_sheet(file), "row")
     if ending in EXCEL:
         workbook = read_workbook(file)
-        title = title_of_sheet(file, path.name.partition("#")[2], workbook)
+        title = title_of_sheet(file, sheet_name, workbook)
         return _table_of_workbook(path.name, file, title, workbook)
     rows, separator = _text_rows(file)
     sheet = _sheet_of_rows(path.name, file, rows, unit_of_place="line", separator=separator)
@@ -251,6 +254,39 @@ def _places(unit_of_place: str, lines: Sequence[int]) -> str:
     if len(lines) > _MOST_LISTED_LINES:
         return f"{len(lines)} {unit_of_place}s from {lines[0]} on"
     return f"{unit_of_place}s {listing(map(str, lines))}"
+
+
+def _file_and_sheet(path: Path) -> tuple[Path, str]:
+    """Return the file and the sheet's name in `FILE#SHEET`; both names may hold a `#`."""
+    file, sheet_name = path, ""
+    while not file.exists() and "#" in file.name:
+        name, _, end = file.name.rpartition("#")
+        sheet_name = f"{end}#{sheet_name}" if sheet_name else end
+        file = path.with_name(name)
+    return file, sheet_name
+
+
+def _ending_by_content(file: Path) -> str:
+    """Return the ending of a file; a workbook has that of its content, whatever its name says.
+
+    Raises
+    ------
+    CampaignFileError
+        If the workbook is encrypted.
+    """
+    ending = file.suffix.lower()
+    if ending not in (".xls", *EXCEL) or not file.exists():
+        return ending
+    content = read_bytes(file, CampaignFileError)
+    if content.startswith(_ZIP):
+        return EXCEL[0]
+    if not content.startswith(_COMPOUND_FILE):
+        return ending
+    if "EncryptedPackage".encode("utf-16-le") in content:
+        raise CampaignFileError(
+            f"{file.name} is encrypted: save it without a password, or save its table as CSV."
+        )
+    return ".xls"
 
 
 def _sheet_of_rows(

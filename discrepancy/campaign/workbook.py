@@ -1,5 +1,6 @@
 """Workbooks of Excel: the cells of their sheets as text, with stamps to the microsecond."""
 
+import io
 import warnings
 from collections.abc import Mapping, Set
 from datetime import date, datetime, time, timedelta
@@ -44,7 +45,7 @@ def read_workbook(path: Path) -> dict[str, WorkbookSheet]:
     sheets: dict[str, WorkbookSheet] = {}
     try:
         with warnings.catch_warnings(action="ignore"):
-            book = load_workbook(path, read_only=True, data_only=True)
+            book = load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
             # cells of times keep their numbers of days, which openpyxl rounds to milliseconds
             book._date_formats = frozenset()
             for sheet in book.worksheets:
@@ -75,10 +76,12 @@ def title_of_sheet(file: Path, stated_title: str, workbook: Mapping[str, Workboo
         If the workbook does not have that sheet, or not one sheet only.
     """
     filled = [title for title, sheet in workbook.items() if sheet.rows]
+    if not filled:
+        raise CampaignFileError(f"{file.name} is an empty workbook: no sheet has a filled cell.")
     is_clear = stated_title in workbook if stated_title else len(filled) == 1
     if not is_clear:
         raise CampaignFileError(
-            f"{file.name} has the sheets {', '.join(filled) or 'none'}: say which as "
+            f"{file.name} has the sheets {', '.join(filled)}: say which as "
             f"{file.name}#SHEET, or import all as {file.name}#{ALL_SHEETS}."
         )
     return stated_title or filled[0]
@@ -101,7 +104,7 @@ def refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None
 
     formulas = []
     with warnings.catch_warnings(action="ignore"):
-        book = load_workbook(path, read_only=True)
+        book = load_workbook(io.BytesIO(path.read_bytes()), read_only=True)
         book[title].reset_dimensions()
         for row in book[title].iter_rows():
             formulas += [cell.coordinate for cell in row if cell.data_type == "f"]

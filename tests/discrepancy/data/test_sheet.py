@@ -564,6 +564,25 @@ def test_formulas_without_values_on_another_sheet_are_of_no_concern(tmp_path):
     assert text_of(read_sheet(Path(f"{path}#Messung"))) == ["0 1.234", "0.500000 5"]
 
 
+@pytest.mark.parametrize("name", ["lab#3.xlsx", "lab.xls", "lab#3.xlsx#Messung", "lab.xls#Messung"])
+def test_a_workbook_is_read_whatever_its_name(tmp_path, name):
+    file = tmp_path / name.removesuffix("#Messung")
+    book_of(tmp_path, ROWS).rename(file)
+    assert text_of(read_sheet(tmp_path / name)) == ["0 1.234", "0.500000 5"]
+
+
+def test_an_empty_workbook_is_refused_as_empty(tmp_path):
+    with refused(CampaignFileError, "lab.xlsx is an empty workbook"):
+        read_sheet(book_of(tmp_path, []))
+
+
+def test_an_encrypted_workbook_is_refused_as_encrypted(tmp_path):
+    content = bytes.fromhex("d0cf11e0a1b11ae1") + bytes(504) + "EncryptedPackage".encode("utf-16-le")
+    (tmp_path / "lab.xlsx").write_bytes(content)
+    with refused(CampaignFileError, "lab.xlsx is encrypted: save it without a password"):
+        read_sheet(tmp_path / "lab.xlsx")
+
+
 def test_damaged_workbooks_are_refused_in_one_sentence(tmp_path):
     path = book_of(tmp_path, ROWS)
     whole = path.read_bytes()
