@@ -174,7 +174,12 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     width = 0
     for index in body:
         width = max(width, *(column + 1 for column, cell in enumerate(rows[index][1]) if cell))
-    _check_names(head, width, f"{place} {rows[first_row][0]}")
+    _check_head_is_no_reading(rows, first_row, core, places_of_values, place)
+    named_width = len(head)
+    first_wide_row = next(
+        (index for index in sorted(body) if any(rows[index][1][named_width:])), first_row
+    )
+    _check_names(head, width, f"{place} {rows[first_wide_row][0]}")
     _check_other_rows(rows, body, core, places_of_values, head, place)
     if width == 1:
         _check_no_empty_lines(rows, body, place)
@@ -225,6 +230,29 @@ def _head_and_units(rows: Rows, first_row: int) -> tuple[list[str], list[str]]:
     return row_above, no_units
 
 
+def _check_head_is_no_reading(
+    rows: Rows,
+    first_row: int,
+    core: Sequence[int],
+    places_of_values: Sequence[set[int]],
+    place: str,
+) -> None:
+    """Refuse rows with a number first and numbers in half of the core columns above the table."""
+    first_reading = first_row
+    for index in range(first_row - 1, -1, -1):
+        values = places_of_values[index]
+        if core[0] not in values or 2 * len(values & {*core}) < len(core):
+            break
+        first_reading = index
+    if first_reading < first_row:
+        line, row = rows[first_reading]
+        cells = short_repr(listing(filter(None, row)))
+        raise CampaignFileError(
+            f"{place} {line}: the names of columns or numbers alone are expected, but the line has "
+            f"{cells}; leave the cell of a reading empty if it shall be left out."
+        )
+
+
 def _check_names(head: Sequence[str], width: int, place: str) -> None:
     """Refuse a table of more columns than have a name, or with few named columns."""
     named_columns = sum(map(bool, head))
@@ -246,14 +274,16 @@ def _check_other_rows(
 ) -> None:
     """Refuse a row with texts within the table, and rows of numbers below it.
 
-    Below the table, only a row with numbers in the first and in at least half of the core columns
-    is refused; other rows are a footer. Comments and repeated heads are allowed.
+    Below the table, only a row with numbers in the first core column, and in a further one or in
+    half of them, is refused; other rows are a footer. Comments and repeated heads are allowed.
     """
     first_row, last_row = body[0], body[-1]
     other_rows = {*range(first_row, last_row)} - {*body}
     for index in range(last_row + 1, len(rows)):
         values = places_of_values[index]
-        is_row_of_numbers = core[0] in values and 2 * len(values & {*core}) >= len(core)
+        core_values = len(values & {*core})
+        has_several = core_values > 1 or 2 * core_values >= len(core)
+        is_row_of_numbers = core[0] in values and has_several
         if is_row_of_numbers:
             other_rows.add(index)
     for index in sorted(other_rows):
