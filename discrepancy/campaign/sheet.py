@@ -214,9 +214,9 @@ def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
     """
     if sheet.decimal is None:
         return sheet
-    if sheet.month_first is not None:
-        month_first = _without_fill_values(sheet.month_first, unit_of_place)
-        sheet = replace(sheet, month_first=month_first)
+    month_first = sheet.month_first
+    if month_first is not None:
+        month_first = _without_fill_values(month_first, unit_of_place)
     columns = []
     remark = sheet.remark
     for head, cells in zip(sheet.heads, sheet.columns, strict=True):
@@ -244,7 +244,7 @@ def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
                     f"; no other reading supports {place}: if it is wrong, leave its cell empty"
                 )
         columns.append(tuple(cleaned_cells))
-    return replace(sheet, columns=tuple(columns), remark=remark)
+    return replace(sheet, columns=tuple(columns), remark=remark, month_first=month_first)
 
 
 def _places(unit_of_place: str, lines: Sequence[int]) -> str:

@@ -304,6 +304,14 @@ def test_a_fill_value_is_left_out_and_named_with_its_row(tmp_path, fill):
     assert f"{fill} in line 4 of 'w' is a fill value and left out" in sheet.remark
 
 
+def test_a_fill_value_is_left_out_in_both_orders_of_a_date(tmp_path):
+    readings = [0.1, 0.2, -9999, 0.3, 0.4, 0.5, 0.6]
+    rows = "".join(f"{month}/1/2026,{w}\n" for month, w in enumerate(readings, start=1))
+    sheet = sheet_of(tmp_path, f"date,w [mm]\n{rows}".encode())
+    cleaned = ("0.1", "0.2", "", "0.3", "0.4", "0.5", "0.6")
+    assert (sheet.numbers("w", "."), sheet.month_first.numbers("w", ".")) == (cleaned, cleaned)
+
+
 @pytest.mark.parametrize("fill", ["1e30", "9.9E+37", "-1e38"])
 def test_a_number_from_1e30_on_is_lost(tmp_path, fill):
     sheet = sheet_of(tmp_path, f"F [N];w [mm]\n0;0\n1;{fill}\n".encode())
