@@ -215,8 +215,6 @@ def import_files(
 
     Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
     """  # noqa: E501
-    from discrepancy.campaign.writing import write_campaign
-
     folder = out or Path(files[0].stem)
     _check_folder(folder, replace_it=replace)
     options = {
@@ -246,6 +244,14 @@ def import_files(
     is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive:
         imported = _ask_and_confirm(ImportCommand(files, out, model), imported, folder)
+    _write_imported(imported, folder)
+    terminal.say(f"Next: uav-twin discrepancy check {shell_arguments(folder, model)}")
+
+
+def _write_imported(imported: "LaboratoryImport", folder: Path) -> None:
+    """Write the campaign of an import, and say its size and what it assumes of its sensors."""
+    from discrepancy.campaign.writing import write_campaign
+
     campaign = imported.campaign(folder.resolve().name)
     with whole_folder(folder) as fresh:
         write_campaign(campaign, fresh, si=True, units=imported.units(), left_out_as_empty=True)
@@ -255,7 +261,6 @@ def import_files(
             f"{imported.assumed} Where you know better, give --zero and --gain, or correct "
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
-    terminal.say(f"Next: uav-twin discrepancy check {shell_arguments(folder, model)}")
 
 
 def _check_folder(folder: Path, *, replace_it: bool) -> None:

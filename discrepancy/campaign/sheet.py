@@ -378,10 +378,6 @@ def _sheet_of_columns(
             units.append(unit)
             columns.append(cells)
     decimal, unclear = decimal_mark(columns, lines, place, separator)
-    first_to_last = f"{unit_of_place}s {lines[0]} to {lines[-1]}"
-    between_cells = ""
-    if separator and len(layout.head) > 1:
-        between_cells = f", {SEPARATORS[separator]} between cells"
     return Sheet(
         name=name,
         digest=hash_file(file),
@@ -391,8 +387,17 @@ def _sheet_of_columns(
         lines=lines,
         decimal=decimal,
         unclear=unclear,
-        remark=f"{first_to_last}{between_cells}{left_out}{layout.remark}",
+        remark=f"{_remark_on_extent(layout, unit_of_place, separator)}{left_out}{layout.remark}",
     )
+
+
+def _remark_on_extent(layout: TableLayout, unit_of_place: str, separator: str) -> str:
+    """Return in words between which lines the readings stand, and what separates their cells."""
+    (first_line, _), (last_line, _) = layout.body[0], layout.body[-1]
+    between_cells = ""
+    if separator and len(layout.head) > 1:
+        between_cells = f", {SEPARATORS[separator]} between cells"
+    return f"{unit_of_place}s {first_line} to {last_line}{between_cells}"
 
 
 def _increases(cells: Sequence[str]) -> bool:
