@@ -13,7 +13,7 @@ _MOST_WILD_VALUES = 2
 """Most wild values of a column; more are an event, such as an impact."""
 _LEAST_SUPPORTED_VALUES = 3
 """Fewest different values that show the range of a column."""
-_FILL_VALUE = re.compile(r"-?(?:9{3,}|[678]999|3276[78])(?:\.0*)?", re.ASCII)
+_FILL_VALUE = re.compile(r"-?(?:9{3,6}|[678]999|3276[78])(?:\.0*)?", re.ASCII)
 """What loggers write for no reading: -9999, 99999, 7999 and the ends of 16 bits."""
 
 
