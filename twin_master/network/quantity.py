@@ -184,14 +184,16 @@ class QuantityModel:
         joint = self.check_joint(joint)
         weight = joint.reshape(-1, self.state_count * self.control_count)
         mean_table = self.mean.reshape(-1, self.sensor_count)
-        mean = weight @ mean_table
-        # Variance within a pair of state and control, plus that of the means. The latter is
-        # centred, so that a certain belief gives the variance of the draws without cancellation.
         variance_table = self.variance.reshape(-1, self.sensor_count)
-        variance = weight @ variance_table
-        for row in range(len(weight)):
+        mean = np.empty((len(weight), self.sensor_count))
+        variance = np.empty_like(mean)
+        # Belief by belief: the last bits of a row of a matrix product depend on the number of rows.
+        for row, weight_of_pairs in enumerate(weight):
+            mean[row] = weight_of_pairs @ mean_table
+            # Variance within a pair of state and control, plus that of the means. The latter is
+            # centred: a certain belief gives the variance of the draws without cancellation.
             squared_distance = (mean_table - mean[row]) ** 2
-            variance[row] += weight[row] @ squared_distance
+            variance[row] = weight_of_pairs @ (variance_table + squared_distance)
         shape = (*joint.shape[:-2], self.sensor_count)
         return mean.reshape(shape), np.sqrt(variance).reshape(shape)
 
