@@ -3,9 +3,12 @@
 A key with `NotRequired` is in the record only if there is something to say.
 """
 
-from typing import NotRequired
+from typing import Annotated, NotRequired
 
+from pydantic import Field
 from typing_extensions import TypedDict
+
+WholeNumberInQuotes = Annotated[str, Field(pattern=r"^[0-9]+(\.0*)?$")]
 
 
 class NoticeRecord(TypedDict):
@@ -96,7 +99,7 @@ class ObservationMessage(TypedDict):
     begin with `_` are ignored.
     """
 
-    step: NotRequired[int | str]
+    step: NotRequired[int | WholeNumberInQuotes]
     """Whole number of the step, also in quotes; the first message says where counting begins.
     Without `step` and `time` the message is the next step.
     """

@@ -284,14 +284,18 @@ def _reference_change(
     references = _changes_at_prior_median(screen, effect) or options
     if not references:
         return None
-    largest_change = max(references, key=lambda change: change.squared_size)
+    largest_change = _largest_change(references)
     # the median of a place along the span may be where nothing is measured
     if largest_change.squared_size < DETECTION_DISTANCE:
         at_reference = [change for change in options if _has_reference_magnitude(change)]
-        largest_change = max(
-            [largest_change, *at_reference], key=lambda change: change.squared_size
-        )
+        largest_change = _largest_change([largest_change, *at_reference])
     return largest_change
+
+
+def _largest_change(changes: Sequence[ScreenedChange]) -> ScreenedChange:
+    """Return the largest change, and of those that differ by rounding errors alone the first."""
+    largest_size = max(change.squared_size for change in changes)
+    return next(change for change in changes if change.squared_size >= largest_size * (1.0 - 1e-9))
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:

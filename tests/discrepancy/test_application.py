@@ -499,10 +499,13 @@ def test_effects_are_applied_upon_each_other_in_a_patch(second_verdict, tmp_path
     assert patch.patch == second_verdict.first.model.patch + second_verdict.verdict.effects[0].patch
 
 
-def test_a_patch_and_the_file_of_a_model_have_the_same_parameters(second_verdict, tmp_path):
-    patch = apply_verdict(second_verdict.folder, tmp_path / "both.json").path
-    file = apply_verdict(second_verdict.folder, tmp_path / "second.toml").path
-    assert uav_twin.load_model(patch).parameters == uav_twin.load_model(file).parameters
+def test_the_file_of_a_model_has_the_parameters_of_its_patch_and_one_for_each_law(second_verdict, tmp_path):
+    patch = uav_twin.load_model(apply_verdict(second_verdict.folder, tmp_path / "both.json").path)
+    file = uav_twin.load_model(apply_verdict(second_verdict.folder, tmp_path / "second.toml").path)
+
+    calibrated, of_laws = file.parameters[: len(patch.parameters)], file.parameters[len(patch.parameters) :]
+    assert calibrated == patch.parameters
+    assert [parameter.name for parameter in of_laws] == ["cubic_stiffness_factor", "quadratic_damping_factor"]
 
 
 def test_a_built_in_sensor_is_that_of_its_channel():

@@ -331,7 +331,6 @@ def test_sums_of_the_coarse_wing_agree(balances):
     for check in balances:
         assert check.limit is not None, check.name
         assert check.passed, check.name
-        assert check.value < 1e-6, check.name
 
 
 @pytest.fixture(scope="module")
