@@ -9,6 +9,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
+from discrepancy.campaign.heads import load_or_time_role
 from discrepancy.errors import CampaignFileError
 from reporting.words import listing
 
@@ -182,7 +183,10 @@ def _is_column_of_times_of_day(cells: Sequence[str]) -> bool:
 
 
 def join_dates_with_times(
-    columns: Sequence[tuple[str, ...]], titles: Sequence[str], places: Sequence[str]
+    columns: Sequence[tuple[str, ...]],
+    titles: Sequence[str],
+    units: Sequence[str],
+    places: Sequence[str],
 ) -> tuple[list[tuple[str, ...]], dict[int, int]]:
     """Write the dates of a table's columns into the cells of its columns of times of day.
 
@@ -193,8 +197,8 @@ def join_dates_with_times(
     ----------
     columns : sequence of tuple of str
         Cells (N,) of each column.
-    titles : sequence of str
-        The heads of the columns, for messages.
+    titles, units : sequence of str
+        The heads of the columns, for messages, and their units, empty where not stated.
     places : sequence of str
         The file and line of each row, for messages.
 
@@ -214,7 +218,11 @@ def join_dates_with_times(
     times = [index for index, cells in enumerate(columns) if _is_column_of_times_of_day(cells)]
     dates = []
     if times:
-        dates = [index for index, cells in enumerate(columns) if is_column_of_dates(cells)]
+        dates = [
+            index
+            for index, cells in enumerate(columns)
+            if is_column_of_dates(cells) and not _is_unit_of_readings(units[index])
+        ]
     joined = [*columns]
     if not dates:
         return joined, {}
@@ -243,12 +251,18 @@ def join_dates_with_times(
     return joined, times_of_dates
 
 
+def _is_unit_of_readings(unit: str) -> bool:
+    """Return whether a column with a unit holds readings, which are neither dates nor times."""
+    return unit not in ("", "1") and load_or_time_role(unit) != "time"
+
+
 # ---------------------------------------------------------------- seconds
 
 
 def seconds_of_clock_times(
     columns: Sequence[tuple[str, ...]],
     titles: Sequence[str],
+    units: Sequence[str],
     places: Sequence[str],
     date_order: str = DAY_FIRST,
 ) -> dict[int, tuple[str, ...]]:
@@ -260,8 +274,8 @@ def seconds_of_clock_times(
     ----------
     columns : sequence of tuple of str
         Cells (N,) of each column.
-    titles : sequence of str
-        The heads of the columns, for messages.
+    titles, units : sequence of str
+        The heads of the columns, for messages, and their units, empty where not stated.
     places : sequence of str
         The file and line of each row, for messages.
     date_order : str
@@ -285,7 +299,8 @@ def seconds_of_clock_times(
         time_rows = [row for row, cell in filled_rows.items() if is_time(cell)]
         if not time_rows:
             continue
-        if 2 * len(time_rows) < len(filled_rows):
+        are_few = 2 * len(time_rows) < len(filled_rows)
+        if are_few or _is_unit_of_readings(units[column]):
             row = time_rows[0]
             raise CampaignFileError(
                 f"{places[row]}: {cells[row]!r} is a date or a time among the numbers under "

@@ -18,11 +18,14 @@ from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.campaign.schema import INPUT_COLUMNS
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import (
-    LOGGER_NAMES,
+    DEGREES,
+    FAHRENHEIT,
+    LETTERS_OF_DEGREES,
     NEVER_CONVERTED,
     UNITS,
     conversion_factor,
     factor_to_si,
+    usual_name,
 )
 from discrepancy.errors import CampaignFileError
 from reporting.words import listing
@@ -67,8 +70,15 @@ class ColumnReader:
         """Return a column of a table by its head and the unit that the file states."""
         cell_unit, reading_unit, factor = self._scaled_unit(head, unit)
         column = self._column_of_readings(sheet, head, reading_unit)
-        to_si = None if column.to_si is None else factor * column.to_si
-        return replace(column, unit=cell_unit, read_in=reading_unit, to_si=to_si)
+        if column.to_si is None:
+            return replace(column, unit=cell_unit, read_in=reading_unit)
+        return replace(
+            column,
+            unit=cell_unit,
+            read_in=column.unit if column.quantity is Quantity.TEMPERATURE else reading_unit,
+            to_si=factor * column.to_si,
+            cell_at_zero=column.cell_at_zero / factor,
+        )
 
     def _scaled_unit(self, head: str, unit: str) -> tuple[str, str, float]:
         """Return the units of a column's cells and of its readings, and the factor between them."""
@@ -88,8 +98,6 @@ class ColumnReader:
         if not unit or role == LEFT_OUT:
             return LaboratoryColumn(sheet, head, role, unit)
         try:
-            if role == "temperature" and unit == "K":
-                raise ValueError("a temperature must be in degC, but 'K' was given")
             is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN
             is_output = is_driven and self._output_quantity(role) is not None
             if role == "force" and is_driven and not is_output:
@@ -108,17 +116,20 @@ class ColumnReader:
         If its quantity cannot be determined yet, the quantity and the SI unit stay empty, and the
         user is asked for the quantity.
         """
+        stated_quantity = self._questionnaire.stated_answer("quantity", head)
+        if Quantity.TEMPERATURE in (self._output_quantity(role), stated_quantity):
+            unit = LETTERS_OF_DEGREES.get(unit, unit)
         quantity = self._determine_quantity(head, role, unit)
         if quantity is None:
             return LaboratoryColumn(sheet, head, role, unit)
-        # a logger may write a unit in its own way, such as Celsius for degC
-        usual_unit = LOGGER_NAMES.get(unit, unit)
+        if usual_name(unit) == FAHRENHEIT:
+            return replace(_temperature_in_celsius(sheet, head, role, unit), quantity=quantity)
+        usual_unit = usual_name(unit)
         return LaboratoryColumn(
             sheet=sheet,
             head=head,
             role=role,
             unit=unit,
-            # temperatures are not converted to SI
             si=usual_unit if usual_unit in NEVER_CONVERTED else UNITS[quantity].si,
             quantity=quantity,
             to_si=factor_to_si(quantity, unit),
@@ -207,13 +218,34 @@ def _column_of_table(sheet: Sheet, head: str, role: str, unit: str) -> Laborator
     ValueError
         If the unit is not one of its quantity.
     """
+    if role == "temperature":
+        return _temperature_in_celsius(sheet, head, role, LETTERS_OF_DEGREES.get(unit, unit))
     si = _UNITS_OF_INPUT_COLUMNS[role]
     if role == "force":
         to_si = factor_to_si(Quantity.FORCE, unit)
-    elif role == "temperature":
-        to_si = factor_to_si(Quantity.TEMPERATURE, unit)
     elif role == "load_factor" and unit == "g":
         to_si = 1.0
     else:
         to_si = conversion_factor(unit, si)
     return LaboratoryColumn(sheet, head, role, unit, si, to_si=to_si)
+
+
+def _temperature_in_celsius(sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
+    """Return a column of temperatures whose readings become degC.
+
+    Raises
+    ------
+    ValueError
+        If the unit is not one of temperature.
+    """
+    to_celsius = factor_to_si(Quantity.TEMPERATURE, unit)
+    _, reading_at_zero = DEGREES[usual_name(unit)]
+    return LaboratoryColumn(
+        sheet=sheet,
+        head=head,
+        role=role,
+        unit=unit,
+        si=UNITS[Quantity.TEMPERATURE].si,
+        to_si=to_celsius,
+        cell_at_zero=reading_at_zero,
+    )

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from math import isfinite
 
 import numpy as np
@@ -12,11 +13,14 @@ from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.campaign.sampling import undo_rounding
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import (
+    DEGREES,
+    LETTERS_OF_DEGREES,
     UNITS,
     amount_in_si,
     conversion_factor,
     factor_to_si,
     quantities_of,
+    usual_name,
 )
 from discrepancy.errors import CampaignFileError
 from reporting.words import counted, is_or_are, listing
@@ -58,6 +62,8 @@ class LaboratoryColumn:
         The quantity of a channel or an input.
     to_si : float or None
         The factor from its cells to SI, which includes the option `--scale`.
+    cell_at_zero : float
+        The number in a cell that is 0 in SI; it differs from 0 for K and degF, which become degC.
     read_in : str
         The unit of its readings after `--scale`; equal to `unit` without a scale.
     """
@@ -69,6 +75,7 @@ class LaboratoryColumn:
     si: str = ""
     quantity: Quantity | None = None
     to_si: float | None = None
+    cell_at_zero: float = 0.0
     read_in: str = ""
 
     @property
@@ -92,9 +99,12 @@ class LaboratoryColumn:
         if self.to_si is None or not decimal:
             return ("",) * len(self.sheet.lines)
         cells = self.sheet.numbers(self.head, decimal)
-        if self.to_si == 1.0:
+        if self.to_si == 1.0 and not self.cell_at_zero:
             return cells
         values = np.array([float(cell or "nan") for cell in cells])
+        if self.cell_at_zero:
+            zero = Decimal(str(self.cell_at_zero))  # 68.1 degF minus 32 has no more digits
+            values = np.array([float(Decimal(cell) - zero) if cell else np.nan for cell in cells])
         if self.role == "time" and len(cells) > 1 and np.all(np.diff(values) > 0.0):
             values = undo_rounding(values, cells)  # minutes with few digits may be even
         cells_in_si = []
@@ -253,16 +263,24 @@ def gain_deviation(head: str, answer: str) -> float | str:
 
 
 def degrees_celsius(answer: str) -> float:
-    """Return the temperature that the option `--reference-temperature` states [degC].
+    """Return the temperature [degC] of the option `--reference-temperature`, such as 20 or 293.15K.
 
-    Raise CampaignFileError if it is not a number.
+    Raises
+    ------
+    CampaignFileError
+        If the option is not a number, which may have a unit of temperature.
     """
-    try:
-        return float(answer)
-    except ValueError:
+    amount = AMOUNT.fullmatch(answer)
+    unit = amount[2] or "degC" if amount else ""
+    unit = usual_name(LETTERS_OF_DEGREES.get(unit, unit))
+    if amount is None or unit not in DEGREES:
         raise CampaignFileError(
-            f"--reference-temperature must be in degC, but {answer!r} was given."
-        ) from None
+            "--reference-temperature must be a temperature such as 20, 293.15K or 68degF, but "
+            f"{answer!r} was given."
+        )
+    degree, reading_at_zero = DEGREES[unit]
+    difference = Decimal(amount[1]) - Decimal(str(reading_at_zero))
+    return float(f"{float(difference) * degree:.15g}")
 
 
 def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:

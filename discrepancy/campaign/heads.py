@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 
 from discrepancy.campaign.quantity import Quantity
-from discrepancy.campaign.units import conversion_factor, quantities_of
+from discrepancy.campaign.units import LETTERS_OF_DEGREES, conversion_factor, quantities_of
 
 _LONGEST_HEAD = 200
 _HEAD = re.compile(
@@ -14,6 +14,12 @@ _HEAD = re.compile(
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+|\d+")
 _TIME_NAME = re.compile(r"(?:.*\.)?(?:time|x_value)[ _]?\d*", re.IGNORECASE)
 """Names of times that need no unit to be known as such; `X_Value` is LabVIEW's."""
+_TEMPERATURE_NAME = re.compile(r".*temp.*|T(?:[ _]?\d+|_.*)?", re.IGNORECASE | re.DOTALL)
+"""Names of temperatures, beside which F and C are degrees."""
+_CLOCK_FORMAT = re.compile(
+    r"(?=.*(?::|yy|jj|aa))[hmsfdytja0]+(?:[]:./, _-]+[hmsfdytja0]+)*(?: ?am/pm)?", re.IGNORECASE
+)
+"""How a clock is written, such as `hh:mm:ss.ffffff` and `dd.mm.yyyy`, in the place of a unit."""
 
 
 def split_head(text: str, unit: str) -> tuple[str, str]:
@@ -31,15 +37,33 @@ def split_head(text: str, unit: str) -> tuple[str, str]:
         return text, unit
     name, *forms_of_unit = match.groups()
     unit_of_head = next(filter(None, forms_of_unit), "").strip()
-    if not is_unit(unit_of_head):
-        return text, unit
-    return name.strip(), unit or plain_unit(unit_of_head)
+    name = name.strip()
+    if is_clock_format(unit_of_head):
+        return name, unit
+    known_unit = unit_beside(name, unit_of_head)
+    return (name, unit or known_unit) if known_unit else (text, unit)
 
 
 def plain_unit(text: str) -> str:
     """Return a unit without brackets; a dash stands for a plain number."""
     text = text.strip("[]() ")
     return "1" if text in ("-", "–") else text
+
+
+def unit_beside(name: str, text: str) -> str:
+    """Return the unit that a text beside a column's name means; empty if it is not a unit.
+
+    F and C are degrees beside a temperature.
+    """
+    unit = plain_unit(text)
+    if unit in LETTERS_OF_DEGREES and _TEMPERATURE_NAME.fullmatch(name):
+        return LETTERS_OF_DEGREES[unit]
+    return unit if is_unit(unit) else ""
+
+
+def is_clock_format(text: str) -> bool:
+    """Return whether a text is the format of a clock, such as `(hh:mm:ss.ffffff)`."""
+    return _CLOCK_FORMAT.fullmatch(text.strip("[]() ")) is not None
 
 
 def is_unit(text: str) -> bool:

@@ -25,9 +25,10 @@ from discrepancy.campaign.records import (
 )
 from discrepancy.campaign.sampling import check_sampling, is_nearly_even, spacing_sentence
 from discrepancy.campaign.trial_reading import numbers_in_si, read_trial
+from discrepancy.campaign.wild_readings import without_fill_values
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.files import hash_file, hash_record
-from reporting.table_file import TableErrors, TextTable, read_table
+from reporting.table_file import TableErrors, TextTable, is_number, read_table
 from reporting.toml_file import read_toml
 from reporting.words import comma_list, counted, is_or_are
 
@@ -78,7 +79,11 @@ def read_campaign(folder: str | Path) -> Campaign:
     tables = {name: _read_table(folder, name) for name in sorted(table_names)}
     names = sorted({CAMPAIGN_FILE, *table_names})
     data_hash = hash_record({name: hash_file(folder / name) for name in names})
-    return assemble_campaign(section, tables, data_hash)
+    remarks = []
+    for name, table in tables.items():
+        tables[name], clauses = _without_fill_values(table, section)
+        remarks += [f"In {name}, {clause} and left out." for clause in clauses]
+    return assemble_campaign(section, tables, data_hash, remarks)
 
 
 def _check_inside(name: str) -> None:
@@ -92,7 +97,10 @@ def _check_inside(name: str) -> None:
 
 
 def assemble_campaign(
-    section: schema.CampaignSection, tables: Mapping[str, TextTable], data_hash: str
+    section: schema.CampaignSection,
+    tables: Mapping[str, TextTable],
+    data_hash: str,
+    remarks_on_tables: Sequence[str] = (),
 ) -> Campaign:
     """Return the campaign of a description and its tables.
 
@@ -104,13 +112,15 @@ def assemble_campaign(
         The tables by the names that the description has for them.
     data_hash : str
         SHA-256 of all that was read.
+    remarks_on_tables : sequence of str
+        The remarks on how the tables were read.
 
     Raises
     ------
     CampaignFileError, CampaignDataError
         For the causes of `read_campaign`.
     """
-    remarks = remarks_on_unused_columns(section, tables)
+    remarks = [*remarks_on_tables, *remarks_on_unused_columns(section, tables)]
     trials = tuple(
         read_trial(trial, tables[trial.file], section, remarks) for trial in section.trial
     )
@@ -249,6 +259,36 @@ def _read_table(folder: Path, name: str) -> TextTable:
             f"There is no file {name} in {folder}; the tables there are {tables}."
         )
     return read_table(folder / name, TABLE_ERRORS, name=name)
+
+
+def _without_fill_values(
+    table: TextTable, section: schema.CampaignSection
+) -> tuple[TextTable, list[str]]:
+    """Return a table with empty cells for the fill values of channels, and a clause on each.
+
+    Raises
+    ------
+    CampaignDataError
+        If a load or another input has a fill value.
+    """
+    channel_columns = {channel.table_column for channel in section.channel}
+    load_columns = {recorded_input.table_column for recorded_input in section.input}
+    load_columns |= {*schema.INPUT_COLUMNS}
+    columns = dict(table.columns)
+    clauses: list[str] = []
+    for name, cells in table.columns.items():
+        is_read = name in channel_columns or name in load_columns
+        if not is_read or not all(is_number(cell) for cell in cells if cell):
+            continue  # a text among the numbers is refused where the column is read
+        cleaned = without_fill_values(cells, cells, table.lines, name, "line")
+        if cleaned.fill_values and name not in channel_columns:
+            raise CampaignDataError(
+                f"{table.name}: {cleaned.fill_values[0]}, but the trial needs a number in each "
+                "row: correct it, or leave the row out."
+            )
+        columns[name] = cleaned.cells
+        clauses += cleaned.fill_values
+    return replace(table, columns=columns), clauses
 
 
 # ---------------------------------------------------------------- channels

@@ -12,7 +12,13 @@ import pydantic
 
 from discrepancy.campaign import records
 from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Release
-from discrepancy.campaign.units import amount_in_si, conversion_factor, factor_to_si
+from discrepancy.campaign.units import (
+    FAHRENHEIT,
+    amount_in_si,
+    conversion_factor,
+    factor_to_si,
+    usual_name,
+)
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.json_file import JsonRecord
@@ -58,6 +64,11 @@ class NoiseFileSection(Section):
 
 def _unit_in_si(record: records.InTables) -> float:
     """Return the factor from the unit of a channel or input to SI."""
+    if usual_name(record.unit) == FAHRENHEIT:
+        raise ValueError(
+            f"the unit of {record.name!r} is {record.unit}: convert its readings to degC or K, or "
+            "import the table with `discrepancy import`"
+        )
     try:
         return factor_to_si(record.quantity, record.unit)
     except ValueError as cause:
@@ -308,7 +319,7 @@ class CampaignSection(Section):
         temperatures = [
             reader for reader in self.columns if reader.quantity is records.Quantity.TEMPERATURE
         ]
-        count_in_kelvin = sum(reader.unit == "K" for reader in temperatures)
+        count_in_kelvin = sum(usual_name(reader.unit) == "K" for reader in temperatures)
         yield (
             0 < count_in_kelvin < len(temperatures),
             "temperatures are given in degC and in K: use one of the two units for all of them",

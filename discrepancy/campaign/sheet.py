@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from discrepancy.campaign.cells import (
     LOGICAL,
@@ -27,11 +28,13 @@ from discrepancy.campaign.clock_cells import (
     possible_date_orders,
     seconds_of_clock_times,
 )
+from discrepancy.campaign.head_rows import RECORD_NUMBER, Rows
 from discrepancy.campaign.heads import split_head
+from discrepancy.campaign.lost_readings import leave_out_lost_readings
 from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.campaign.number_formats import unit_beside_number_formats
-from discrepancy.campaign.table_layout import SEPARATORS, Rows, TableLayout, find_table
-from discrepancy.campaign.wild_readings import is_fill_value, numbers_or_nan, wild_readings
+from discrepancy.campaign.table_layout import SEPARATORS, TableLayout, find_table
+from discrepancy.campaign.wild_readings import LEAST_LOST_VALUE, without_fill_values
 from discrepancy.campaign.workbook import (
     ALL_SHEETS,
     WorkbookSheet,
@@ -42,7 +45,7 @@ from discrepancy.campaign.workbook import (
 from discrepancy.errors import CampaignFileError
 from reporting.files import hash_file
 from reporting.text_file import read_bytes, read_text
-from reporting.words import counted, is_or_are, listing, one_line
+from reporting.words import counted, one_line
 
 MATLAB = ".mat"
 EXCEL = (".xlsx", ".xlsm")
@@ -66,10 +69,6 @@ OTHER_FORMATS = {
 _ZIP = b"PK"
 _COMPOUND_FILE = bytes.fromhex("d0cf11e0a1b11ae1")
 """First bytes of Excel files of before 2007, and of encrypted ones of any year."""
-LEAST_LOST_VALUE = 1e30
-"""Numbers from here on stand for no reading, as 9.9E+37 of instruments does."""
-_MOST_LISTED_LINES = 5
-"""Most lines of wild readings that a remark lists."""
 _LINES_FOR_SEPARATOR = 500
 """Number of first lines by which the separator is chosen."""
 
@@ -221,39 +220,11 @@ def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
     remark = sheet.remark
     for head, cells in zip(sheet.heads, sheet.columns, strict=True):
         numbers = sheet.numbers(head, sheet.decimal)
-        is_lost = [bool(cell) and not number for cell, number in zip(cells, numbers, strict=True)]
-        if any(is_lost):
-            lines = [line for line, lost in zip(sheet.lines, is_lost, strict=True) if lost]
-            remark += (
-                f"; {_places(unit_of_place, lines)} of {head!r} {is_or_are(len(lines))} beyond "
-                f"{LEAST_LOST_VALUE:g} and left out"
-            )
-        cleaned_cells = list(cells)
-        lines_of_cells: dict[str, list[int]] = {}
-        for row in wild_readings(numbers_or_nan(numbers)).nonzero()[0].tolist():
-            lines_of_cells.setdefault(cells[row], []).append(sheet.lines[row])
-            if is_fill_value(numbers[row]):
-                cleaned_cells[row] = ""
-        for cell, lines in lines_of_cells.items():
-            place = f"{cell} in {_places(unit_of_place, lines)} of {head!r}"
-            number = plain_number(cell, sheet.decimal)
-            if number is not None and is_fill_value(number):
-                remark += f"; {place} is a fill value and left out"
-            else:
-                remark += (
-                    f"; no other reading supports {place}: if it is wrong, leave its cell empty"
-                )
-        columns.append(tuple(cleaned_cells))
+        column = without_fill_values(cells, numbers, sheet.lines, head, unit_of_place)
+        columns.append(column.cells)
+        remark += "".join(f"; {clause} and left out" for clause in column.fill_values)
+        remark += "".join(f"; {clause}" for clause in column.unsupported)
     return replace(sheet, columns=tuple(columns), remark=remark, month_first=month_first)
-
-
-def _places(unit_of_place: str, lines: Sequence[int]) -> str:
-    """Return lines or rows for a sentence; a long list is cut."""
-    if len(lines) == 1:
-        return f"{unit_of_place} {lines[0]}"
-    if len(lines) > _MOST_LISTED_LINES:
-        return f"{len(lines)} {unit_of_place}s from {lines[0]} on"
-    return f"{unit_of_place}s {listing(map(str, lines))}"
 
 
 def _file_and_sheet(path: Path) -> tuple[Path, str]:
@@ -313,6 +284,8 @@ def _sheet_of_rows(
     columns = []
     for index in range(len(layout.head)):
         columns.append(tuple(_cell(row, index) for _, row in layout.body))
+    columns, remark = leave_out_lost_readings(columns, layout.head, lines, name, unit_of_place)
+    layout = layout._replace(remark=f"{remark}{layout.remark}")
     sheets = [
         _sheet_of_columns(name, file, layout, columns, unit_of_place, separator, date_order=order)
         for order in possible_date_orders(columns)
@@ -343,29 +316,23 @@ def _sheet_of_columns(
     place = f"{name}, {unit_of_place}"
     lines = tuple(line for line, _ in layout.body)
     places = [f"{place} {line}" for line in lines]
-    cells_of_columns, times_of_dates = join_dates_with_times(columns_of_file, layout.head, places)
-    seconds_of_columns = seconds_of_clock_times(cells_of_columns, layout.head, places, date_order)
+    names_and_units = [
+        split_head(title or f"column {number}", unit)
+        for number, (title, unit) in enumerate(zip(layout.head, layout.units, strict=True), start=1)
+    ]
+    units_of_file = [unit for _, unit in names_and_units]
+    table = _columns_with_seconds(layout, columns_of_file, units_of_file, places, date_order)
 
     # columns of numbers or times; columns with texts are left out with a remark, empty ones without
     heads: list[str] = []
     units: list[str] = []
     columns: list[tuple[str, ...]] = []
-    left_out = ""
-    for index, title in enumerate(layout.head):
-        head, unit = split_head(title or f"column {index + 1}", layout.units[index])
-        cells = cells_of_columns[index]
-        if index in times_of_dates:
-            left_out += f"; {title!r} has the dates of {layout.head[times_of_dates[index]]!r}"
-            continue
-        if index in seconds_of_columns:
-            seconds = seconds_of_columns[index]
-            if is_column_of_dates(cells) and not (
-                len(seconds_of_columns) == 1 and _increases(seconds)
-            ):
-                left_out += f"; the column {title!r} holds dates without times and is left out"
-                continue
+    left_out = table.remark
+    for index, cells in table.columns.items():
+        title = layout.head[index]
+        head, unit = names_and_units[index]
+        if index in table.clocks:
             unit = "s"
-            cells = tuple(ExactNumber(cell) if cell else "" for cell in seconds)
         filled = [cell for cell in cells if cell]
         texts = [cell for cell in filled if not is_value(cell)]
         if texts:
@@ -389,6 +356,59 @@ def _sheet_of_columns(
         unclear=unclear,
         remark=f"{_remark_on_extent(layout, unit_of_place, separator)}{left_out}{layout.remark}",
     )
+
+
+class _ColumnsWithSeconds(NamedTuple):
+    """The columns of a table, with seconds in place of clock times.
+
+    Attributes
+    ----------
+    columns : dict of int to tuple of str
+        The cells (N,) by the number of the column in the file.
+    clocks : set of int
+        The numbers of the columns that had clock times.
+    remark : str
+        The remark on columns of dates and of record numbers, which are left out.
+    """
+
+    columns: dict[int, tuple[str, ...]]
+    clocks: set[int]
+    remark: str
+
+
+def _columns_with_seconds(
+    layout: TableLayout,
+    columns_of_file: Sequence[tuple[str, ...]],
+    units: Sequence[str],
+    places: Sequence[str],
+    date_order: str,
+) -> _ColumnsWithSeconds:
+    """Return the columns of a layout, with seconds in place of its clock times and dates."""
+    cells_of_columns, times_of_dates = join_dates_with_times(
+        columns_of_file, layout.head, units, places
+    )
+    seconds_of_columns = seconds_of_clock_times(
+        cells_of_columns, layout.head, units, places, date_order
+    )
+    columns = dict(enumerate(cells_of_columns))
+    clocks: set[int] = set()
+    remark = ""
+    for index, title in enumerate(layout.head):
+        seconds = seconds_of_columns.get(index, ())
+        is_only_clock = len(seconds_of_columns) == 1 and _increases(seconds)
+        if index in times_of_dates:
+            remark += f"; {title!r} has the dates of {layout.head[times_of_dates[index]]!r}"
+            del columns[index]
+        elif layout.units[index] == RECORD_NUMBER:
+            remark += f"; the column {title!r} counts the records and is left out"
+            del columns[index]
+        elif seconds and is_column_of_dates(columns[index]) and not is_only_clock:
+            remark += f"; the column {title!r} holds dates without times and is left out"
+            del columns[index]
+        elif seconds:
+            columns[index] = tuple(ExactNumber(cell) if cell else "" for cell in seconds)
+            clocks.add(index)
+    return _ColumnsWithSeconds(columns, clocks, remark)
 
 
 def _remark_on_extent(layout: TableLayout, unit_of_place: str, separator: str) -> str:

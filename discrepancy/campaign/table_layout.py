@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 from discrepancy.campaign.cells import is_value
 from discrepancy.campaign.clock_cells import is_time
-from discrepancy.campaign.heads import is_unit, plain_unit, split_head, time_heads
+from discrepancy.campaign.head_rows import Rows, find_head_rows
+from discrepancy.campaign.heads import split_head, time_heads
+from discrepancy.campaign.lost_readings import places_of_readings
 from discrepancy.errors import CampaignFileError
 from reporting.toml_file import short_repr
 from reporting.words import counted, listing
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
 """Characters that separate cells, and their names in messages."""
-Rows = list[tuple[int, list[str]]]
-"""Rows of a file that are not empty: the number of the line or row, and the cells."""
 
 
 def _is_single_column(rows: Rows) -> bool:
@@ -137,9 +137,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
         If there is no table, its columns have no names, or there are numbers that do not fit into
         it.
     """
-    places_of_values = [
-        {index for index, cell in enumerate(row) if is_value(cell)} for _, row in rows
-    ]
+    places_of_values = places_of_readings(rows)
     core = _core_columns(rows, places_of_values)
     has_text = [
         any(index not in values and index < len(row) and row[index] for index in core)
@@ -165,7 +163,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
         for index in range(first_row, last_row + 1)
         if not has_text[index] and places_of_values[index]
     ]
-    head, units = _head_and_units(rows, first_row)
+    head, units = find_head_rows(rows, first_row)
     body += _rows_of_longer_clocks(
         rows[last_row + 1 :], last_row + 1, head, units, places_of_values
     )
@@ -180,7 +178,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
         (index for index in sorted(body) if any(rows[index][1][named_width:])), first_row
     )
     _check_names(head, width, f"{place} {rows[first_wide_row][0]}")
-    _check_other_rows(rows, body, core, places_of_values, head, place)
+    _check_other_rows(rows, body, core, places_of_values, head[core[0]], place)
     if width == 1:
         _check_no_empty_lines(rows, body, place)
     lines_below = [line for line, _ in rows[last_row + 1 :]]
@@ -205,29 +203,6 @@ def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]
         if is_in_half_of_rows:
             core_columns.append(column)
     return sorted(core_columns)
-
-
-def _head_and_units(rows: Rows, first_row: int) -> tuple[list[str], list[str]]:
-    """Return the heads and the units of the columns, from the two rows above the first numbers.
-
-    The row above the numbers holds the units if all its cells are units, and if the row above it
-    has at least as many cells: the latter holds the heads then. Otherwise there is no row of units.
-
-    Parameters
-    ----------
-    rows : list of (int, list of str)
-        The rows of the file: the number of the line, and its cells.
-    first_row : int
-        The index of the first row of numbers.
-    """
-    row_above = rows[first_row - 1][1]
-    row_two_above = rows[first_row - 2][1] if first_row > 1 else []
-    no_units = [""] * len(row_above)
-    if sum(map(bool, row_two_above)) < sum(map(bool, row_above)):
-        return row_above, no_units
-    if all(is_unit(cell) for cell in row_above if cell):
-        return row_two_above, [plain_unit(cell) for cell in row_above]
-    return row_above, no_units
 
 
 def _check_head_is_no_reading(
@@ -269,7 +244,7 @@ def _check_other_rows(
     body: Sequence[int],
     core: Sequence[int],
     places_of_values: Sequence[set[int]],
-    head: Sequence[str],
+    name: str,
     place: str,
 ) -> None:
     """Refuse a row with texts within the table, and rows of numbers below it.
@@ -286,14 +261,14 @@ def _check_other_rows(
         is_row_of_numbers = core[0] in values and has_several
         if is_row_of_numbers:
             other_rows.add(index)
+    head_rows = [row for _, row in rows[:first_row]]
     for index in sorted(other_rows):
         line, row = rows[index]
-        is_head = row in (head, rows[first_row - 1][1])
-        if is_head or row[0].startswith("#"):
+        if row in head_rows or row[0].startswith("#"):
             continue
         cells = short_repr(listing(filter(None, row)))
         raise CampaignFileError(
-            f"{place} {line}: numbers are expected under {head[core[0]]!r} and the other names, "
+            f"{place} {line}: numbers are expected under {name!r} and the other names, "
             f"but the line has {cells}; leave the cell of a reading empty if it shall be left out, "
             "and remove lines that do not belong to the table."
         )

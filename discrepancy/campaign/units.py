@@ -17,13 +17,20 @@ from reporting.words import listing
 _TABLES = Path(__file__).with_suffix(".toml")
 NEVER_CONVERTED = {"degC", "°C", "K"}
 """Units of temperature; all temperatures of a campaign are in degC, or all in K."""
+FAHRENHEIT = "degF"
+DEGREES = {"degC": (1.0, 0.0), "°C": (1.0, 0.0), "K": (1.0, 273.15), FAHRENHEIT: (5.0 / 9.0, 32.0)}
+"""Units of temperature in tables: one degree of each in degC, and its reading at 0 degC."""
+LETTERS_OF_DEGREES = {"F": FAHRENHEIT, "C": "degC"}
+"""Letters that mean degrees where they stand beside a temperature; else C is a charge."""
 
 _NAMES_OF_LOGGERS = {
     "microstrain": "uE µE μE ue uStrain ustrain 1e-6 1E-6 10^-6",
     "g": "G Gs",
     "lbf": "lb lbs Lbs LBS Lbf",
     "rpm": "RPM Rpm",
-    "degC": "DegC Celsius",
+    "degC": "DegC Celsius celsius",
+    "K": "Kelvin kelvin degK DegK °K",
+    FAHRENHEIT: "DegF Fahrenheit fahrenheit °F",
     "s": "Sec sec SEC secs Seconds",
     "ms": "msec",
     "V": "Volts",
@@ -32,10 +39,11 @@ _NAMES_OF_LOGGERS = {
     "kN": "KN",
     "inch": "inches Inches",
 }
-_NAMES_WITH_BLANKS = {"deg C": "degC", "Deg C": "degC", "degrees C": "degC"}
-LOGGER_NAMES = _NAMES_WITH_BLANKS | {
-    name: unit for unit, names in _NAMES_OF_LOGGERS.items() for name in names.split()
-}
+LOGGER_NAMES = {name: unit for unit, names in _NAMES_OF_LOGGERS.items() for name in names.split()}
+for _letter, _degrees in (("C", "degC"), ("K", "K"), ("F", FAHRENHEIT)):
+    LOGGER_NAMES |= dict.fromkeys(
+        (f"deg {_letter}", f"Deg {_letter}", f"degrees {_letter}"), _degrees
+    )
 """Names of units that loggers write and pint does not know, or knows as something else."""
 
 
@@ -69,6 +77,11 @@ UNITS = {
 """The units of each quantity; a new kind of sensor is a further table in `units.toml`."""
 
 
+def usual_name(unit: str) -> str:
+    """Return a unit as pint calls it, such as degC for a logger's Celsius."""
+    return LOGGER_NAMES.get(unit, unit)
+
+
 @cache
 def conversion_factor(unit: str, si: str) -> float:
     """Return the factor from a unit to a unit of SI: 0.001 from mm to m.
@@ -87,7 +100,7 @@ def conversion_factor(unit: str, si: str) -> float:
     ValueError
         If pint does not know the unit, or it belongs to another quantity.
     """
-    unit = LOGGER_NAMES.get(unit, unit)
+    unit = usual_name(unit)
     if unit == si:
         return 1.0  # without pint, which takes a third of a second to load
     # acceleration is the only quantity for which `g` is the standard gravity, and not a gram
@@ -109,6 +122,8 @@ def quantity_with_unit(quantity: Quantity) -> str:
 @cache
 def factor_to_si(quantity: Quantity, unit: str) -> float:
     """Return the factor from a unit to the SI unit of a quantity.
+
+    The factor of a temperature is that of its differences, see `DEGREES`.
 
     Raises
     ------
@@ -134,9 +149,10 @@ def _factor_to_si(quantity: Quantity, unit: str) -> float:
         If the quantity is not measured in that unit; the error has no message.
     """
     if quantity is Quantity.TEMPERATURE:
-        if LOGGER_NAMES.get(unit, unit) not in NEVER_CONVERTED:
+        if usual_name(unit) not in DEGREES:
             raise ValueError
-        return 1.0
+        degree, _ = DEGREES[usual_name(unit)]
+        return degree
     if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
         raise ValueError  # the output of a bridge is not a strain before its gauge factor is known
     if quantity is Quantity.SIGNAL:

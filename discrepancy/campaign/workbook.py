@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from discrepancy.campaign.cells import ExactNumber
+from discrepancy.campaign.head_rows import Rows
 from discrepancy.campaign.number_formats import shown_number
-from discrepancy.campaign.table_layout import Rows
 from discrepancy.errors import CampaignFileError
 from reporting.words import counted, is_or_are, one_line
 

@@ -16,6 +16,7 @@ from discrepancy.campaign.units import (
     conversion_factor,
     factor_to_si,
     quantities_of,
+    usual_name,
 )
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
@@ -63,9 +64,13 @@ class _FileUnits:
             The factor from its unit to SI.
         """
         in_unit = values / to_si
-        if self.digits == _EXACT_DIGITS or name not in self.units:
-            return in_unit
-        return np.array([float(f"{value:.{self.digits}g}") for value in in_unit.tolist()])
+        return self.rounded(in_unit) if name in self.units else in_unit
+
+    def rounded(self, values: records.FloatArray) -> records.FloatArray:
+        """Return values (N,) rounded to the digits of the files."""
+        if self.digits == _EXACT_DIGITS:
+            return values
+        return np.array([float(f"{value:.{self.digits}g}") for value in values.tolist()])
 
     @property
     def force_unit(self) -> str:
@@ -167,7 +172,9 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
             raise CampaignFileError(no_reference_temperature_message(trial.name))
-        columns["temperature"] = trial.temperature + campaign.reference_temperature
+        columns["temperature"] = file_units.rounded(
+            trial.temperature + campaign.reference_temperature
+        )
     columns |= _loss_columns(trial)
     for recorded_input in trial.inputs:
         to_si = factor_to_si(recorded_input.quantity, _input_unit(recorded_input, file_units))
@@ -197,8 +204,8 @@ def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
 
 def _unit(record: records.InTables, in_si: bool) -> str:
     """Return the unit in which a channel or input is written if the user states none."""
-    if record.unit in NEVER_CONVERTED:
-        return record.unit
+    if usual_name(record.unit) in NEVER_CONVERTED:
+        return usual_name(record.unit)
     units = UNITS[record.quantity]
     return units.si if in_si else units.written
 

@@ -648,6 +648,8 @@ def test_a_unit_is_converted_into_one_of_its_quantity_alone():
         ("lbs", Quantity.FORCE, 4.4482216152605),
         ("RPM", Quantity.ANGULAR_VELOCITY, np.pi / 30.0),
         ("deg C", Quantity.TEMPERATURE, 1.0),
+        ("kelvin", Quantity.TEMPERATURE, 1.0),
+        ("°F", Quantity.TEMPERATURE, 5.0 / 9.0),
     ],
 )
 def test_loggers_names_of_units_are_known(unit, quantity, in_si):
@@ -664,7 +666,7 @@ def test_a_release_in_micrometres_is_the_number_that_one_would_write(amount, uni
 
 @pytest.mark.parametrize(
     "unit",
-    ["", "kg", "t", "1/min", "Hz", "links", "dB", "2 mm", "9**9**9", "kN/m", "i.O.", "degF", "x", "m" * 9999,
+    ["", "kg", "t", "1/min", "Hz", "links", "dB", "2 mm", "9**9**9", "kN/m", "i.O.", "F", "x", "m" * 9999,
      "mV/V", "V/V", "µV/V", "mV/volt"],
 )  # fmt: skip
 def test_what_is_no_unit_of_ours_is_of_no_quantity_and_a_ratio_of_volts_a_signal(unit):

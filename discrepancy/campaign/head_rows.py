@@ -1,0 +1,95 @@
+"""The rows of names and of units above a laboratory's table."""
+
+import re
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import NamedTuple
+
+from discrepancy.campaign.cells import is_value
+from discrepancy.campaign.heads import is_clock_format, unit_beside
+
+Rows = list[tuple[int, list[str]]]
+"""Rows of a file that are not empty: the number of the line or row, and the cells."""
+RECORD_NUMBER = "RN"
+"""Unit of the column that counts the records in files of Campbell's loggers."""
+_CAMPBELL = "TOA5"
+"""First cell of a file of Campbell's loggers.
+
+Its four head rows are the logger, the names, the units, and what is stored (`Smp`, `Avg`).
+"""
+_CAMPBELL_NAMES_LINE = 2
+_CAMPBELL_UNITS_LINE = 3
+_IN_BRACKETS = re.compile(r"\[.*\]|\(.*\)", re.DOTALL)
+
+
+class HeadRows(NamedTuple):
+    """The names (C,) above the columns of a table, and their units, empty where not known."""
+
+    names: list[str]
+    units: list[str]
+
+
+def find_head_rows(rows: Rows, first_row: int) -> HeadRows:
+    """Return the names and units of the columns, from the rows above the first numbers.
+
+    The row above the numbers holds the units if each of its cells is a unit, the format of a clock
+    or in brackets, and if there are as many names in the row above it, which holds the names then.
+    Otherwise there is no row of units. Files of Campbell's loggers have lines for both.
+
+    Parameters
+    ----------
+    rows : list of (int, list of str)
+        The rows of the file: the number of the line, and its cells.
+    first_row : int
+        The index of the first row of numbers.
+    """
+    cells_of_lines = dict(rows[:first_row])
+    if rows[0][1][0] == _CAMPBELL and _CAMPBELL_NAMES_LINE in cells_of_lines:
+        names = cells_of_lines[_CAMPBELL_NAMES_LINE]
+        return _names_with_units(names, cells_of_lines.get(_CAMPBELL_UNITS_LINE, []))
+    row_above = rows[first_row - 1][1]
+    if first_row > 1:
+        row_over_names = rows[first_row - 3][1] if first_row > 2 else []
+        names = _names_of_merged_cells(rows[first_row - 2][1], row_over_names, row_above)
+        has_names = sum(map(bool, names)) >= sum(map(bool, row_above))
+        if has_names and _are_units(names, row_above):
+            return _names_with_units(names, row_above)
+    return _names_with_units(row_above, [])
+
+
+def _names_of_merged_cells(
+    names: Sequence[str], row_over_names: Sequence[str], units: Sequence[str]
+) -> list[str]:
+    """Return a row of names in which a cell that is merged with others names all their columns.
+
+    The text of a merged cell is in its first cell: above, or else to the left. A row with numbers,
+    or with less than two texts, is a title and stays as it is.
+    """
+    texts = [cell for cell in names if cell]
+    if len(texts) < 2 or not names[0] or any(map(is_value, texts)):
+        return [*names]
+    spread_names: list[str] = []
+    cells = zip_longest(names, row_over_names, units, fillvalue="")
+    for name, name_above, unit in cells:
+        if unit and not name:
+            spread_names.append(name_above or spread_names[-1])
+        else:
+            spread_names.append(name)
+    return spread_names
+
+
+def _are_units(names: Sequence[str], cells: Sequence[str]) -> bool:
+    """Return whether each filled cell of a row below names stands in the place of a unit."""
+    for name, cell in zip_longest(names, cells, fillvalue=""):
+        is_unit = bool(unit_beside(name, cell)) or is_clock_format(cell)
+        if cell and not is_unit and not _IN_BRACKETS.fullmatch(cell):
+            return False
+    return True
+
+
+def _names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
+    """Return names with the units in the cells below them; what is no unit is left out."""
+    units = []
+    for name, cell in zip_longest(names, cells, fillvalue=""):
+        units.append(cell if cell == RECORD_NUMBER else unit_beside(name, cell))
+    return HeadRows(names, units[: len(names)])
