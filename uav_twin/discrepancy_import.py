@@ -189,7 +189,8 @@ def import_files(
         typer.Option(
             "--reference-temperature",
             metavar="DEGC",
-            help="Temperature at which the model's parameters hold, if a column is a temperature.",
+            help="Temperature at which the model's parameters hold, such as 20, 293.15K or "
+            "68degF, if a column is a temperature.",
         ),
     ] = None,
     model: Annotated[

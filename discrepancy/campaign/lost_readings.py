@@ -91,13 +91,17 @@ def leave_out_lost_readings(
     remark = ""
     cleaned_columns = []
     for cells, title in zip(columns, titles, strict=True):
-        cleaned_cells = ["" if _is_not_a_number(cell) else cell for cell in cells]
-        lost_rows = [row for row, cell in enumerate(cells) if _is_not_a_number(cell)]
+        are_values = [is_value(cell) for cell in cells]
+        number_rows = [row for row, holds_value in enumerate(are_values) if holds_value]
+        text_rows = [row for row, cell in enumerate(cells) if cell and not are_values[row]]
+        lost_rows = [row for row in text_rows if _is_not_a_number(cells[row])]
+        overload_rows = [row for row in text_rows if _is_overload(cells[row])]
+        cleaned_cells = list(cells)
         if lost_rows:
+            for row in lost_rows:
+                cleaned_cells[row] = ""
             places = places_text(unit_of_place, [lines[row] for row in lost_rows])
             remark += f"; {title!r} has {cells[lost_rows[0]]} in {places}"
-        number_rows = [row for row, cell in enumerate(cells) if is_value(cell)]
-        overload_rows = [row for row, cell in enumerate(cells) if _is_overload(cell)]
         if number_rows and overload_rows and overload_rows[0] > number_rows[0]:
             first_row = overload_rows[0]
             cell, line = cells[first_row], lines[first_row]

@@ -39,11 +39,14 @@ _NAMES_OF_LOGGERS = {
     "kN": "KN",
     "inch": "inches Inches",
 }
-LOGGER_NAMES = {name: unit for unit, names in _NAMES_OF_LOGGERS.items() for name in names.split()}
-for _letter, _degrees in (("C", "degC"), ("K", "K"), ("F", FAHRENHEIT)):
-    LOGGER_NAMES |= dict.fromkeys(
-        (f"deg {_letter}", f"Deg {_letter}", f"degrees {_letter}"), _degrees
-    )
+_NAMES_WITH_BLANKS = {
+    f"{degrees} {letter}": unit
+    for letter, unit in (("C", "degC"), ("K", "K"), ("F", FAHRENHEIT))
+    for degrees in ("deg", "Deg", "degrees")
+}
+LOGGER_NAMES = _NAMES_WITH_BLANKS | {
+    name: unit for unit, names in _NAMES_OF_LOGGERS.items() for name in names.split()
+}
 """Names of units that loggers write and pint does not know, or knows as something else."""
 
 

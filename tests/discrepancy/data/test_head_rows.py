@@ -111,6 +111,12 @@ def test_a_merged_cell_names_all_columns_that_it_spans(tmp_path, rows, merged, h
     assert (sheet.heads, sheet.units) == (heads, tuple(units))
 
 
+def test_a_merged_cell_that_was_saved_as_text_names_all_columns_that_it_spans(tmp_path):
+    sheet = table_of(tmp_path, "Zeit;Dehnung;;;Weg\ns;µm/m;µm/m;µm/m;mm\n0;1;2;3;4\n1;2;3;4;5\n")
+
+    assert sheet.heads == ("Zeit", "Dehnung", "Dehnung 2", "Dehnung 3", "Weg")
+
+
 def test_a_title_above_heads_that_are_units_is_no_merged_name(tmp_path):
     sheet = table_of_workbook(tmp_path, [["Prüfstand 3"], ["s", "mm"], [0, 1], [1, 2]], ["A1:B1"])
 

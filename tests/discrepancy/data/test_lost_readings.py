@@ -1,6 +1,7 @@
 """Readings that a file says are lost: overloads, NaN, and fill values of a campaign's own tables."""
 
 import pytest
+from openpyxl import Workbook
 
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.sheet import read_sheet
@@ -42,6 +43,23 @@ def test_a_channel_ends_where_its_overload_begins_and_the_others_go_on(tmp_path,
 )
 def test_no_reading_is_lost_with_an_overload_beside_it(tmp_path, text, head, numbers):
     assert table_of(tmp_path, text).numbers(head, ".") == numbers
+
+
+def test_a_channel_of_a_workbook_ends_where_its_overload_begins(tmp_path):
+    book = Workbook()
+    for row in (["t [s]", "e", "w"], [0, 1, 5], [1, 2, 6], [2, "OVL", 7], [3, "OVL", 8]):
+        book.active.append(row)
+    book.save(tmp_path / "lab.xlsx")
+
+    sheet = read_sheet(tmp_path / "lab.xlsx")
+
+    assert (sheet.numbers("e", "."), sheet.numbers("w", ".")) == (("1", "2", "", ""), ("5", "6", "7", "8"))
+    assert "; 'e' has OVL from row 4 on and ends there" in sheet.remark
+
+
+def test_a_channel_that_begins_with_an_overload_is_refused_with_its_line(tmp_path):
+    with refused(CampaignFileError, "lab.csv, line 2: the names of columns or numbers alone are expected"):
+        table_of(tmp_path, "t,e,w\n0,OVL,5\n1,OVL,6\n2,3,7\n3,4,8\n4,5,9\n")
 
 
 def test_an_overload_between_readings_is_refused_with_its_line(tmp_path):
