@@ -38,15 +38,17 @@ _Function = TypeVar("_Function", bound=NumericalFunction)
 
 # A division by zero gives infinity, as in NumPy: numba does not vectorise a loop that may raise an
 # error.
-OPTIONS: dict[str, bool | str] = {"nogil": True, "error_model": "numpy"}
+OPTIONS: dict[str, object] = {"nogil": True, "error_model": "numpy"}
 """Options of numba."""
-# Machine code holds a copy of each function that it calls, unless the call is inlined, and the copy
-# may round reordered sums otherwise than the function by itself. Which of the two is called depends
-# on what the process has compiled or loaded before.
-_SELF_CONTAINED: dict[str, bool | str] = {**OPTIONS, "forceinline": True}
-"""Options of a compiled function whose bits are the same in every process."""
-REORDERED_SUMS = frozenset({"reassoc", "contract", "nsz"})
-"""What the compiler may do with sums: add in another order, and round a product and a sum once."""
+# A caller's machine code holds a copy of each function that it calls, and reordered sums of the
+# copy may round otherwise than those of the function by itself. Which of the two runs depends on
+# what the process has compiled or loaded before, unless the callers inline the function.
+OPTIONS_OF_REORDERED_SUMS: dict[str, object] = {
+    **OPTIONS,
+    "forceinline": True,
+    "fastmath": {"reassoc", "contract", "nsz"},
+}
+"""Options of numba that allow to add in another order, and to round a product and a sum once."""
 
 WITHOUT_NUMBA = (
     "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, "
@@ -84,9 +86,7 @@ def compiled(
     """
     if numba is None:
         return _plain_with_note(function)
-    options: dict[str, object] = {**(_SELF_CONTAINED if reorders_sums else OPTIONS)}
-    if reorders_sums:
-        options["fastmath"] = set(REORDERED_SUMS)
+    options = OPTIONS_OF_REORDERED_SUMS if reorders_sums else OPTIONS
     sources = (function, *calls, *_compiled_callees(function))
     source_files = [inspect.getfile(source) for source in sources]
     with _cache_named_by_sources(source_files):

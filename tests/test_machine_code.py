@@ -1,41 +1,44 @@
 """What a process computes does not depend on whether it compiles its loops or reads them from disk."""
 
+import json
 import os
 import subprocess
 import sys
-from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fe import compilation
 from tests.kept import ROOT
+from tests.machine_code_cases import CASES
 
-FLY = """
-import sys
-from pathlib import Path
-
-from tests.twin_master.runs import of_library
-from twin_master.mission.side_by_side import fly_side_by_side
-
-knowledge, source = of_library("growing_damage", Path(sys.argv[1]))
-asset = source.open()
-truths = [knowledge.truth(seed) for seed in range(5)]
-flights = fly_side_by_side(knowledge, truths, [asset] * 5)
-for values in (flights.filtered, flights.log_evidence, flights.unexplained):
-    sys.stdout.buffer.write(values.tobytes())
-sys.stdout.buffer.write(repr(flights.notices).encode())
-"""
-"""A program that writes the beliefs and notices of a fleet."""
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(compilation.numba is None, reason="needs numba: pip install 'uav-twin[fast]'"),
+]
+LEAST_BYTES = 400
+"""Each case has fifty numbers or more."""
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(compilation.numba is None, reason="needs numba: pip install 'uav-twin[fast]'")
-def test_a_process_that_compiles_and_one_that_loads_fly_the_same_fleet(library_file: Path, tmp_path: Path):
-    words = [sys.executable, "-c", FLY, str(library_file)]
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+@pytest.fixture(scope="module")
+def results(library_file, write_beam, tmp_path_factory) -> list[dict[str, Any]]:
+    """Size and digest of each case in a process that compiles, and in one that finds machine code on disk."""
+    beam = write_beam(tmp_path_factory.mktemp("beam"))
+    machine_code = tmp_path_factory.mktemp("machine_code")
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(machine_code)}
+    program = [sys.executable, "-m", "tests.machine_code_cases", str(library_file), str(beam)]
+    outputs = []
+    for name in ("compiling", "loading"):
+        words = [*program, str(tmp_path_factory.mktemp(name))]
+        done = subprocess.run(words, env=environment, cwd=ROOT, stdout=subprocess.PIPE, check=True)
+        outputs.append(json.loads(done.stdout))
+    return outputs
 
-    compiling = subprocess.run(words, env=environment, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
-    loading = subprocess.run(words, env=environment, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
 
-    assert len(compiling) > 50_000  # bytes: beliefs of 5 twins about 25 states in 50 steps
-    assert compiling == loading
+@pytest.mark.parametrize("name", CASES)
+def test_a_process_that_compiles_and_one_that_loads_compute_the_same_bytes(name, results):
+    compiling, loading = results
+
+    size, _ = compiling[name]
+    assert size >= LEAST_BYTES
+    assert compiling[name] == loading[name]
