@@ -1,4 +1,4 @@
-"""Types of arrays, by the names that signatures use, and numbers of users as arrays."""
+"""Types of arrays, numbers of users as arrays, and products of rows that are alike in all bits."""
 
 from typing import Any
 
@@ -21,3 +21,12 @@ def nan_where_masked(values: ArrayLike) -> Float:
     Without a mask the result may share memory with the argument.
     """
     return np.asarray(np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan))
+
+
+def product_of_each(rows: Float, matrix: Float) -> Float:
+    """Return the product (..., N) of each row (..., S) and a matrix (S, N), or its own (..., S, N).
+
+    Each product is computed by itself: in a product of all rows at once, the last bits of a row
+    depend on the number of rows.
+    """
+    return np.asarray(np.matmul(rows[..., None, :], matrix).squeeze(axis=-2))

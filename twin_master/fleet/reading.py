@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, Index
+from reporting.arrays import Float, Index, product_of_each
 from reporting.json_file import JsonRecord
 from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
@@ -161,7 +161,7 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
         return leaving_probability(
             knowledge.problem,
             knowledge.plan.on_belief,
-            transition.forward(control, belief),
+            np.stack([transition.forward(control, row) for row in belief]),
             control,
             steps,
             generator(scenario.mission.seed, "planning"),
@@ -174,7 +174,8 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
         probability_kept = keeps_control * transition.expected_value(control, probability_kept)
     if scenario.planner.decide_on == "predicted":  # the state after the next transition decides
         probability_kept = transition.expected_value(control, probability_kept)
-    return np.asarray(np.maximum(1.0 - belief @ probability_kept, 0.0))
+    probability_of_twin = product_of_each(belief, probability_kept[:, None]).squeeze(axis=-1)
+    return np.asarray(np.maximum(1.0 - probability_of_twin, 0.0))
 
 
 class TwinsOfScenario(NamedTuple):

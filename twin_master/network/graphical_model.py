@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float
+from reporting.arrays import Float, product_of_each
 from reporting.words import brief, comma_list
 from twin_master.errors import InvalidModelError
 from twin_master.network.transition import (
@@ -141,14 +141,13 @@ class StateSpace:
 
     def mean(self, belief: ArrayLike) -> Float:
         """Return the mean of each factor: (..., S) -> (..., factors)."""
-        return np.asarray(belief, dtype=np.float64) @ self.coordinates
+        return product_of_each(np.asarray(belief, dtype=np.float64), self.coordinates)
 
     def standard_deviation(self, belief: ArrayLike) -> Float:
         """Return the standard deviation of each factor: (..., S) -> (..., factors)."""
         belief = np.asarray(belief, dtype=np.float64)
         deviation = self.coordinates - self.mean(belief)[..., None, :]
-        variance = np.einsum("...s,...sf->...f", belief, deviation**2)
-        return np.asarray(np.sqrt(variance))
+        return np.asarray(np.sqrt(product_of_each(belief, deviation**2)))
 
     def change_within_interval(self, table: ArrayLike) -> Float:
         """Return the typical change of a table within the interval that each state stands for.

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import AnyArray, Float, Index
+from reporting.arrays import AnyArray, Float, Index, product_of_each
 from reporting.words import comma_list
 from twin_master.errors import PlanningError
 from twin_master.network.kernels import sweep_bellman
@@ -80,14 +80,14 @@ class BeliefPolicy:
 
     def value(self, belief: ArrayLike) -> Float:
         """Return the expected return of the best plan under each belief: (..., S) -> (...)."""
-        return np.asarray((np.asarray(belief) @ self.vectors.T).max(axis=-1))
+        return np.asarray(product_of_each(np.asarray(belief), self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
         """Return the expected return of each first control: beliefs (..., S) -> (..., U).
 
         It is minus infinity for a control with which no plan begins.
         """
-        expected_returns = np.asarray(belief) @ self.vectors.T  # (..., N)
+        expected_returns = product_of_each(np.asarray(belief), self.vectors.T)  # (..., N)
         best_returns: Float = np.full((*expected_returns.shape[:-1], controls), -np.inf)
         for control in np.unique(self.control).tolist():
             has_control = self.control == control
@@ -96,7 +96,7 @@ class BeliefPolicy:
 
     def decide(self, belief: ArrayLike) -> Index:
         """Return the index of the control to take under each belief: (..., S) -> (...)."""
-        best_plan = np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)
+        best_plan = np.argmax(product_of_each(np.asarray(belief), self.vectors.T), axis=-1)
         return np.asarray(self.control[best_plan])
 
 
@@ -164,11 +164,8 @@ def decision_probability(
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
     if on_belief is not None:
         # The policy is deterministic: its control has the probability one.
-        controls = [on_belief.decide(row) for row in belief]
-        return np.eye(policy.shape[1])[controls]
-    # One product for each twin, so that its last bit does not depend on the number of twins.
-    row_vectors = belief[:, None, :]
-    return np.asarray(np.matmul(row_vectors, policy).squeeze(axis=1))
+        return np.eye(policy.shape[1])[on_belief.decide(belief)]
+    return product_of_each(belief, policy)
 
 
 def ration_controls(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fe.compilation import compiled
-from reporting.arrays import Float, Index, nan_where_masked
+from reporting.arrays import Float, Index, nan_where_masked, product_of_each
 from twin_master.errors import InvalidModelError
 from twin_master.network.transition import check_shape, distribution
 
@@ -185,11 +185,9 @@ class QuantityModel:
         weight = joint.reshape(-1, self.state_count * self.control_count)
         mean_table = self.mean.reshape(-1, self.sensor_count)
         variance_table = self.variance.reshape(-1, self.sensor_count)
-        mean = np.empty((len(weight), self.sensor_count))
+        mean = product_of_each(weight, mean_table)
         variance = np.empty_like(mean)
-        # Belief by belief: the last bits of a row of a matrix product depend on the number of rows.
         for row, weight_of_pairs in enumerate(weight):
-            mean[row] = weight_of_pairs @ mean_table
             # Variance within a pair of state and control, plus that of the means. The latter is
             # centred: a certain belief gives the variance of the draws without cancellation.
             squared_distance = (mean_table - mean[row]) ** 2
@@ -300,11 +298,9 @@ def _mixture_moments(weight: Float, mean: Float, variance: Float) -> tuple[Float
     weight = weight.reshape(len(weight), -1)
     mean = mean.reshape(len(mean), -1)
     variance = variance.reshape(len(variance), -1)
-    # With einsum the last bit of a result does not depend on the number of beliefs; with a product
-    # of matrices it does.
-    mixture_mean = np.einsum("bn,rn->br", weight, mean)
+    mixture_mean = product_of_each(weight, mean.T)
     # Law of total variance: mean of the variances, plus variance of the means.
-    mixture_variance = np.einsum("bn,rn->br", weight, variance)
+    mixture_variance = product_of_each(weight, variance.T)
     for b in range(len(weight)):
         deviation = mean - mixture_mean[b][:, None]
         mixture_variance[b] += deviation**2 @ weight[b]

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float, Index, nan_where_masked
+from reporting.arrays import Float, Index, nan_where_masked, product_of_each
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
@@ -584,8 +584,10 @@ class GaussianSensorModel(QuantityModel):
         _rows : (..., G + I) array, optional
             What was observed; only sensors with a covariance of their own use it.
         """
-        variance = np.tensordot(self.check_joint(joint), self.total_standard_deviation**2, axes=2)
-        return np.asarray(np.sqrt(variance))
+        weight = self.check_joint(joint)
+        weight = weight.reshape(*weight.shape[:-2], -1)
+        variance = self.total_standard_deviation.reshape(-1, self.sensor_count) ** 2
+        return np.asarray(np.sqrt(product_of_each(weight, variance)))
 
 
 def _steps_by_group(
