@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +21,8 @@ CHROMIUM = (
     shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 )
 _MOST = 256 * 2**20
-_PATIENCE = 60.0
+_PATIENCE = 600.0
+"""After so long [s] a browser hangs."""
 
 
 class Tab:
@@ -176,9 +178,8 @@ def open_browser() -> Iterator[Browser]:
 
 
 def _port(path: Path, process: subprocess.Popen[bytes]) -> int:
-    import time
-
-    for _ in range(600):
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline:
         assert process.poll() is None, "the browser did not start"
         if path.is_file() and (text := path.read_text(encoding="ascii")).count("\n"):
             return int(text.splitlines()[0])

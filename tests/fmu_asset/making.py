@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import fmpy
 import pytest
@@ -24,9 +25,14 @@ from fmu_asset.coupling.structure import (
     expand_connection,
 )
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.worker.client import WorkerInstance
 from tests.kept import packed
 
 ROOT = Path(__file__).parents[2]
+HANGS = 600.0
+"""After so long [s] a test hangs."""
+NEVER_ANSWERED = 5.0
+"""Limit [s] of a call that an FMU never answers."""
 DESCRIPTION, XML = "modelDescription.xml", (".xml", ".ssd", ".ssv", ".ssm")
 
 
@@ -42,6 +48,44 @@ def has_compiler() -> bool:
 needs_compiler = pytest.mark.skipif(
     not has_compiler(), reason="there is no C compiler, which compiled FMUs are built with"
 )
+
+
+def limit_call_without_answer(
+    patch: pytest.MonkeyPatch, name: str, number: int = 1, since: str = "initialise"
+) -> None:
+    """Give the one call that an FMU never answers `NEVER_ANSWERED`, and all others `HANGS`.
+
+    So no sound call is judged by the clock of a machine that is busy.
+
+    Parameters
+    ----------
+    patch : MonkeyPatch
+        Ends the limits.
+    name : str
+        The kind of the call: "open", "initialise", "step", "run", ...
+    number : int
+        Its number among the calls of this kind to one worker; the first is 1.
+    since : str
+        The kind of the call with which counting begins anew.
+    """
+    ask = WorkerInstance._ask
+    count: WeakKeyDictionary[WorkerInstance, int] = WeakKeyDictionary()
+    last_call: WeakKeyDictionary[WorkerInstance, str] = WeakKeyDictionary()
+
+    def ask_and_count(worker: WorkerInstance, kind: Any, call: str, content: Any) -> None:
+        if call == since:
+            count[worker] = 0
+        if call == name and worker in count:
+            count[worker] += 1
+        last_call[worker] = call
+        ask(worker, kind, call, content)
+
+    def limit(worker: WorkerInstance) -> float:
+        has_no_answer = last_call[worker] == name and count.get(worker) == number
+        return NEVER_ANSWERED if has_no_answer else HANGS
+
+    patch.setattr(WorkerInstance, "_ask", ask_and_count)
+    patch.setattr(WorkerInstance, "_time_limit", limit)
 
 
 def tables(test: str, name: str = "refused") -> dict[str, Any]:

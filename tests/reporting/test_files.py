@@ -146,11 +146,13 @@ while True:
 def test_a_kill_at_any_moment_leaves_a_whole_file(tmp_path, delay):
     target = tmp_path / "state"
     process = subprocess.Popen([sys.executable, "-c", WRITE_FOR_EVER, str(target)])
-    while not target.exists():
-        time.sleep(0.01)
-    time.sleep(delay)
-    process.kill()
-    process.wait()
+    try:
+        while not target.exists() and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(delay)
+    finally:
+        process.kill()
+        process.wait()
 
     content = target.read_bytes()
     files.remove_leftovers(tmp_path)

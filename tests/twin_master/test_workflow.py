@@ -16,6 +16,7 @@ from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
 from reporting.former_names import FormerNameWarning
 from tests.twin_master.runs import check_same, cut_off_after, noted, with_former_names, written
+from tests.twin_master.watch.conftest import HANGS
 from twin_master import workflow
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, read_config
@@ -96,6 +97,7 @@ class KilledReplacement:
         written(self.folder, "mine", name="notes.txt")
         child = os.fork()
         if not child:
+            signal.alarm(HANGS)  # it ends by itself if it hangs
             try:
                 self.replace(moves)
             finally:

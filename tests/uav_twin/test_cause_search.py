@@ -40,9 +40,11 @@ def test_a_search_is_a_process_of_its_own_that_is_ended_with_the_watch(tmp_path)
     script.write_text(SCRIPT)
     request = request_in(tmp_path, low_priority=False)
     search = DiscrepancySearch(command=(sys.executable, str(script))).start(request)
-    wait_until(lambda: request.log.read_text().endswith("\n"))
-    assert not search.has_ended()
-    search.stop()
+    try:
+        wait_until(lambda: request.log.read_text().endswith("\n"))
+        assert not search.has_ended()
+    finally:
+        search.stop()
     assert search.has_ended()
     search.stop()  # of one that has ended does nothing
     options = (
@@ -57,8 +59,10 @@ def test_a_search_beside_a_live_watch_gives_way_to_it(tmp_path):
     search = DiscrepancySearch(command=(sys.executable, str(script))).start(
         request_in(tmp_path, low_priority=True)
     )
-    assert os.getpriority(os.PRIO_PROCESS, search._process.pid) == NICENESS
-    search.stop()
+    try:
+        assert os.getpriority(os.PRIO_PROCESS, search._process.pid) == NICENESS
+    finally:
+        search.stop()
 
 
 def test_the_search_that_a_watch_gets_is_the_command_that_an_alarm_names():

@@ -19,7 +19,16 @@ from fmu_asset.checks.fmu_check import FmuCheck, check_fmu
 from fmu_asset.client.draft import draft_binding
 from fmu_asset.client.session import FmiAsset
 from tests.fmu_asset.client.kinds import HOSTILE, WING_BINDING
-from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
+from tests.fmu_asset.making import (
+    DESCRIPTION,
+    MODELS,
+    archive_of,
+    bound,
+    edited,
+    limit_call_without_answer,
+    members,
+    tables,
+)
 
 REFUSED = tables(__file__)["refused"]
 
@@ -339,10 +348,11 @@ def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu, model):
 
 
 @pytest.mark.parametrize(("fault", "check", "sentence"), FAULTS["fault"])
-def test_one_fault_is_one_problem(foreign_fmu, fault, check, sentence):
-    timeout = 5.0 if fault == "HANG" else None
+def test_one_fault_is_one_problem(foreign_fmu, monkeypatch, fault, check, sentence):
+    if fault == "HANG":
+        limit_call_without_answer(monkeypatch, "step", 3)
 
-    result = check_fmu(foreign_fmu("hostile2", fault), step_timeout=timeout)
+    result = check_fmu(foreign_fmu("hostile2", fault))
 
     verdicts = verdicts_of(result)
     assert (result.passed, verdicts[check]) == (False, "problem")

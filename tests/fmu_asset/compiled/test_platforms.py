@@ -24,7 +24,7 @@ from fmu_asset.compiled.platforms import targets_by_folder
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import check_form, recorded_content_hash
 from tests.fmu_asset.compiled.exports import exported_names, mach_o_parts
-from tests.fmu_asset.making import DESCRIPTION, members, run_well
+from tests.fmu_asset.making import DESCRIPTION, HANGS, members, run_well
 from tests.kept import compiled_wing
 
 HOST = Path(__file__).with_name("host.c")
@@ -295,7 +295,7 @@ def test_the_library_for_windows_gives_the_same_under_wine(
         fmu,
         folder,
         Path("host.exe"),
-        lambda words: run_well(["wine", *words], cwd=folder, env=wine, timeout=120),
+        lambda words: run_well(["wine", *words], cwd=folder, env=wine, timeout=HANGS),
         "win64/*.dll",
     )
 

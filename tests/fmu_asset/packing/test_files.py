@@ -29,7 +29,7 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts
 from tests.fmu_asset.client.kinds import BINDINGS, WING_BINDING
-from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
+from tests.fmu_asset.making import DESCRIPTION, HANGS, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import STRUCTURES
 
 REFUSED = tables(__file__)
@@ -550,7 +550,7 @@ def test_fmpy_ends_a_simulation_at_a_refused_step(ours, kind):
 
     A host that is not told to end repeats the refused step for ever.
     """
-    output = run_python(SIMULATE_WITH_REFUSED_STEP, ours(kind), timeout=60)
+    output = run_python(SIMULATE_WITH_REFUSED_STEP, ours(kind), timeout=HANGS)
 
     assert output.splitlines()[-1] == "[0.0, 1.0, 1.0]"
     assert kind == "python" or "load_factor = 33.6" in output

@@ -23,16 +23,24 @@ from fmu_asset.client.session import FmiAsset
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import HEADER, Question
 from tests.fmu_asset.client.kinds import HOSTILE, SPRING_BINDING, WING_BINDING
-from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python, tables
+from tests.fmu_asset.making import (
+    HANGS,
+    NEVER_ANSWERED,
+    ROOT,
+    archive_of,
+    changed,
+    limit_call_without_answer,
+    members,
+    run_python,
+    tables,
+)
 
 MISBEHAVIOURS = tables(__file__, "misbehaviours")
 REPLAYED = changed(HOSTILE, header={"state": "replay"})
 FREE = changed(HOSTILE, limits={"sandbox": False})
-HANGS = 600.0
-"""After so long [s] a test hangs."""
-LIMITS = {"step_timeout": HANGS, "load_timeout": HANGS, "memory_limit": 400.0}
-NEVER_ANSWERED = 5.0
-"""Limit [s] of FMUs that never answer; a loaded machine, too, makes a sound step in less."""
+LIMITS_OF_TIME = {"step_timeout": HANGS, "load_timeout": HANGS}
+HANGING_CALLS = {"HANG_AT_LOAD": "open", "HANG_IN_INITIALISATION": "initialise"}
+"""The call of a start that an FMU never answers."""
 Hostile = Callable[..., FmiAsset]
 
 
@@ -40,7 +48,7 @@ Hostile = Callable[..., FmiAsset]
 def hostile(foreign_fmu: Any) -> Hostile:
     """Return what makes an asset of an FMU that misbehaves."""
     return lambda *what, binding=HOSTILE, **limits: FmiAsset(
-        foreign_fmu("hostile2", *what), binding, **limits
+        foreign_fmu("hostile2", *what), binding, **LIMITS_OF_TIME | limits
     )
 
 
@@ -103,10 +111,11 @@ def leaves_nothing(scratch: Path) -> Iterator[None]:
 
 @cases("step")
 @pytest.mark.usefixtures("leaves_nothing")
-def test_a_step_that_goes_wrong_is_one_sentence(hostile, what, kind, sentence) -> None:
+def test_a_step_that_goes_wrong_is_one_sentence(hostile, monkeypatch, what, kind, sentence) -> None:
     """The same instance is never used again; another one goes on from the last state."""
-    limits = LIMITS | ({"step_timeout": NEVER_ANSWERED} if kind is errors.FmuTimeoutError else {})
-    with hostile(what, **limits) as asset:
+    if kind is errors.FmuTimeoutError:
+        limit_call_without_answer(monkeypatch, "step", 3)
+    with hostile(what, memory_limit=400.0) as asset:
         assert [asset.step().values[0] for _ in range(2)] == [1.0, 2.0]
         saved = asset.save_state()
         with pytest.raises(kind, match=sentence) as caught:
@@ -120,14 +129,18 @@ def test_a_step_that_goes_wrong_is_one_sentence(hostile, what, kind, sentence) -
 
 
 def test_a_slow_leak_is_noticed_between_short_steps(hostile) -> None:
-    asset = hostile("LEAK_SLOWLY", **LIMITS)
+    asset = hostile("LEAK_SLOWLY", memory_limit=400.0)
     with asset, pytest.raises(errors.FmuMemoryError, match=r"more than the limit of 400 MiB"):
         wait_until(lambda: asset.step() is None)
 
 
 @cases("start")
-def test_a_start_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
-    asset = hostile(what, load_timeout=NEVER_ANSWERED if kind is errors.FmuTimeoutError else HANGS)
+def test_a_start_that_goes_wrong_is_one_sentence(
+    hostile, scratch, monkeypatch, what, kind, sentence
+) -> None:
+    if kind is errors.FmuTimeoutError:
+        limit_call_without_answer(monkeypatch, HANGING_CALLS[what], since="open")
+    asset = hostile(what)
     for _ in range(2):
         with pytest.raises(kind, match=sentence):
             asset.reset()
@@ -228,9 +241,11 @@ def kill_supervisor(worker: int | None) -> None:
 
 
 @pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
-def test_nothing_is_left_when_the_supervisor_is_killed(hostile, scratch, end) -> None:
+def test_nothing_is_left_when_the_supervisor_is_killed(hostile, scratch, monkeypatch, end) -> None:
     """The worker has cleared its parent-death signal; what it has started has its own session."""
-    with hostile(f"ESCAPE={end}", binding=FREE, step_timeout=NEVER_ANSWERED) as asset:
+    if end == "hang()":
+        limit_call_without_answer(monkeypatch, "step", 3)
+    with hostile(f"ESCAPE={end}", binding=FREE) as asset:
         asset.step(), asset.step()
         if end == "hang()":
             threading.Timer(0.3, kill_supervisor, [asset.worker_process_id]).start()
@@ -308,7 +323,8 @@ def test_an_fmu_in_python_that_spoils_what_we_share(
 def test_an_fmu_in_python_that_loops(spring_mass, scratch, misbehaviour) -> None:
     """It holds the interpreter of the worker, which neither the limit nor a dead twin needs."""
     load = {"misbehaviour": misbehaviour}
-    asset = FmiAsset(spring_mass, SPRING_BINDING, step_timeout=NEVER_ANSWERED)
+    limits = {"step_timeout": NEVER_ANSWERED, "load_timeout": HANGS}
+    asset = FmiAsset(spring_mass, SPRING_BINDING, **limits)
     with asset, pytest.raises(errors.FmuTimeoutError, match=r"longer than 5 s for the step"):
         asset.step(load=load)
     lines = "asset.step()", "print('loops', flush=True)", f"asset.step(load={load})"

@@ -16,7 +16,7 @@ from fmu_asset.worker.refusal_tracer import RefusalTracer
 from fmu_asset.worker.refusals import RefusalReport, watch_for_refusals
 from fmu_asset.worker.sandbox import landlock_version
 from tests.fmu_asset.client.kinds import HOSTILE, SPRING_BINDING
-from tests.fmu_asset.making import changed
+from tests.fmu_asset.making import changed, limit_call_without_answer
 from tests.fmu_asset.worker.test_hostile import ASKED, await_nothing, twin
 
 pytestmark = pytest.mark.skipif(
@@ -136,9 +136,13 @@ def test_the_flight_of_a_watched_fmu_in_python_is_the_same_and_no_file_is_refuse
     ],
     ids=lambda case: case[0],
 )
-def test_a_watched_worker_ends_with_all_that_it_has_started(foreign_fmu, scratch, case) -> None:
+def test_a_watched_worker_ends_with_all_that_it_has_started(
+    foreign_fmu, scratch, monkeypatch, case
+) -> None:
+    if case == ["HANG"]:
+        limit_call_without_answer(monkeypatch, "step", 3)
     with watch_for_refusals() as report:
-        fly(FmiAsset(foreign_fmu("hostile2", *case), HOSTILE, step_timeout=5.0))
+        fly(FmiAsset(foreign_fmu("hostile2", *case), HOSTILE))
         await_nothing(scratch)
         assert report.sentence() == "The sandbox refused nothing."
 

@@ -76,6 +76,7 @@ def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
 def process(cleaner: ExitStack) -> int:
     running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     cleaner.callback(running.communicate)
+    cleaner.callback(running.kill)
     return running.pid
 
 

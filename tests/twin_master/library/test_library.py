@@ -25,6 +25,7 @@ from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
 from scenarios.assets.gear_pump import Conditions, steady_temperature
+from tests.fmu_asset.making import limit_call_without_answer
 from tests.kept import ROOT
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_same, cut_off_after, loaded_from, merged, table_of, written
@@ -114,11 +115,14 @@ class InterruptedSampling:
 
     def stop_at(self, points: int, end: signal.Signals, *options: str) -> tuple[int, str]:
         """Sample until so many points are finished; return exit code and what was said."""
-        process = subprocess.Popen([*self.words, *options], cwd=ROOT, stderr=subprocess.PIPE)
-        while finished(self.out) < 2 * points and process.poll() is None:
-            time.sleep(0.01)
-        process.send_signal(end)
-        complaint = process.communicate()[1].decode()
+        with subprocess.Popen([*self.words, *options], cwd=ROOT, stderr=subprocess.PIPE) as process:
+            try:
+                while finished(self.out) < 2 * points and process.poll() is None:
+                    time.sleep(0.01)
+                process.send_signal(end)
+                complaint = process.communicate()[1].decode()
+            finally:
+                process.kill()
         return process.returncode, complaint
 
 
@@ -195,7 +199,7 @@ def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(files, 
     assert settled.library.settling_steps == 40
 
 
-def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, tmp_path):
+def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, tmp_path, monkeypatch):
     out = tmp_path / "lever.nc"
     with pytest.raises(
         FmuCallError, match=r"at wear = 0\.5, control push = [24], mode = 5, gain = 0\.9: .*Discard"
@@ -205,8 +209,9 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, 
     assert finished(out)
     with pytest.raises(FmuWorkerError, match=r"at or soon after wear = .*ended by signal 6 \(SIGABRT\)"):
         sample_library(grid(files, DIE), out, workers=1, replace_existing=True)
+    limit_call_without_answer(monkeypatch, "run")
     with pytest.raises(FmuTimeoutError, match=r"longer than 5 s for a step"):
-        sample_library(grid(files, SLEEP, step_timeout=5.0), out, workers=1, replace_existing=True)
+        sample_library(grid(files, SLEEP), out, workers=1, replace_existing=True)
     assert not out.exists()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.twin_master.runs import journal, of_library
+from tests.twin_master.watch.conftest import HANGS
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line, record_of_line, records
@@ -218,6 +219,7 @@ def killed_where(known: Known, folder: Path, patch: Callable[[pytest.MonkeyPatch
     """Fly in a process of its own that kills itself with SIGKILL where a patch says so."""
     child = os.fork()
     if not child:
+        signal.alarm(HANGS)  # it ends by itself if it hangs
         try:
             with pytest.MonkeyPatch.context() as monkeypatch:
                 patch(monkeypatch)

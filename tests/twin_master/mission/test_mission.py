@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 from fmu_asset.errors import FmuTimeoutError
 from tests.command_line import said
+from tests.fmu_asset.making import limit_call_without_answer
 from tests.kept import ROOT
 from tests.refusals import Inputs
 from tests.twin_master.runs import (
@@ -345,14 +346,18 @@ def hostile(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = B
 def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch):
     fmu, flag = foreign_fmu("hostile2", "HANG", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
-    loaded = hostile(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 5.0 }}\n")
+    loaded = hostile(tmp_path, fmu)
     whole = new_run(loaded, tmp_path / "whole").folder
     flag.touch()
     sentence = r"step 20 from t = 20 s: .*longer than 5 s for the step"
-    with pytest.raises(FmuTimeoutError, match=sentence):
-        new_run(loaded, tmp_path / "part")
-    with pytest.raises(FmuTimeoutError, match=sentence):
-        resume(tmp_path / "part")
+    with monkeypatch.context() as patch:
+        limit_call_without_answer(patch, "step", 21)
+        with pytest.raises(FmuTimeoutError, match=sentence):
+            new_run(loaded, tmp_path / "part")
+    with monkeypatch.context() as patch:
+        limit_call_without_answer(patch, "step", since="restore")
+        with pytest.raises(FmuTimeoutError, match=sentence):
+            resume(tmp_path / "part")
     flag.unlink()
     resume(tmp_path / "part")
     check_same(tmp_path / "part", whole, "run.nc", "config.json", "summary.json", "csv/observed.csv")

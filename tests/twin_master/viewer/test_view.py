@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from fe.wing.design import SHIPPED_DESIGN
 from reporting.figures import new_figure, to_svg
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
-from tests.twin_master.watch.conftest import served, viewed
+from tests.twin_master.watch.conftest import HANGS, served, viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, encode_line, record_of_line
@@ -288,7 +288,7 @@ def opened(folder: Path) -> Iterator[str]:
             assert found
             yield found.group()
             process.send_signal(signal.SIGINT)
-            assert process.wait() == 130
+            assert process.wait(HANGS) == 130
         finally:
             process.kill()
 
@@ -300,7 +300,7 @@ def check_served_to_this_machine_alone(address: str) -> None:
     own = socket.gethostbyname(socket.gethostname())
     if not own.startswith("127."):
         with pytest.raises(OSError, match="refused"):
-            socket.create_connection((own, port), timeout=5.0)
+            socket.create_connection((own, port), timeout=HANGS)
 
 
 def check_nothing_wider_than_the_window(tab: Any) -> None:
@@ -424,7 +424,8 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_pat
                 assert told, f"ended with exit code {process.wait()}: {said}"
                 said += told
             os.killpg(process.pid, signal.SIGINT)
-            assert process.wait() == 0, process.stderr.read()
+            assert process.wait(HANGS) == 0, process.stderr.read()
         finally:
-            process.kill()
+            with suppress(ProcessLookupError):  # all of them have ended
+                os.killpg(process.pid, signal.SIGKILL)
     check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")

@@ -14,7 +14,16 @@ import pytest
 from tests.command_line import command
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.conftest import PASSWORD, Mosquitto, begun, killed_at, mosquitto, ran, wait_until
+from tests.twin_master.watch.conftest import (
+    HANGS,
+    PASSWORD,
+    Mosquitto,
+    begun,
+    killed_at,
+    mosquitto,
+    ran,
+    wait_until,
+)
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.watch.broker_address import PASSWORD_VARIABLE, Broker, parse_broker
@@ -48,7 +57,7 @@ def message(step: int, **others: object) -> str:
 
 def publish(client: Any, *steps: int) -> None:
     for step in steps:
-        client.publish(TOPIC, message(step), qos=1).wait_for_publish(60)
+        client.publish(TOPIC, message(step), qos=1).wait_for_publish(HANGS)
 
 
 @contextmanager
@@ -60,11 +69,11 @@ def watching(where: Broker, watch: Watch, steps: int) -> Iterator[list[str]]:
     """
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
-    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"step_limit": steps})
+    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"step_limit": steps}, daemon=True)
     thread.start()
     wait_until(lambda: notes or not thread.is_alive())
     yield notes
-    thread.join(60)
+    thread.join(HANGS)
     assert not thread.is_alive()
     feed.close()
 
@@ -108,7 +117,7 @@ class Hostilities:
         for step in range(first, end):
             control = ("2g", "3g")[self.mission.control_index[step]]
             record = {"step": step, "control": control, "strain": self.mission.observed[step].tolist()}
-            self.publisher.publish(TOPIC, json.dumps(record), qos=1).wait_for_publish(20)
+            self.publisher.publish(TOPIC, json.dumps(record), qos=1).wait_for_publish(HANGS)
 
     def send_garbage(self) -> None:
         for number in range(1000):
@@ -325,10 +334,10 @@ class Replacement:
         self.publisher = station.publisher
         publish(self.publisher, 599)
         retained = self.publisher.publish(TOPIC, message(598), qos=1, retain=True)
-        retained.wait_for_publish(20)
+        retained.wait_for_publish(HANGS)
         listener, self.states = heard_at(station.broker, "listener", f"{TOPIC}/heartbeat")
         wait_until(lambda: self.states)
-        beginning = threading.Thread(target=self.begin)
+        beginning = threading.Thread(target=self.begin, daemon=True)
         beginning.start()
         where = ("--observations", address(station.broker), "--out", watch.folder)
         words = ("watch", scenario.path, *where, "--steps", 1, "--no-report")
@@ -437,7 +446,7 @@ def test_batches_and_lines_of_telegraf_over_a_broker(watch, broker):
         batch = {"metrics": [metric(1), metric(2), metric(3)]}
         lines = "\n".join(f"wing,control=2g strain_1=1e-3 {1_714_557_600 + step}000000000" for step in (4, 5))
         for payload in (json.dumps(metric(0)), json.dumps(batch), lines):
-            client.publish(TOPIC, payload, qos=1).wait_for_publish(60)
+            client.publish(TOPIC, payload, qos=1).wait_for_publish(HANGS)
     wait_until(lambda: len(heard) >= 6)
     client.disconnect()
     assert [decision["step"] for decision in heard] == [0, 1, 2, 3, 4, 5]
@@ -449,7 +458,7 @@ def test_a_batch_is_acknowledged_once_all_of_it_is_in_the_journal(watch, broker)
     with watching(where_of(broker), timed(watch), 2):
         client = broker.client("publisher")
         batch = {"metrics": [metric(step) for step in range(4)]}
-        client.publish(TOPIC, json.dumps(batch), qos=1).wait_for_publish(60)
+        client.publish(TOPIC, json.dumps(batch), qos=1).wait_for_publish(HANGS)
     with watching(where_of(broker), watch, 4):
         pass
     client.disconnect()

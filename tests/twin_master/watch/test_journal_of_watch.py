@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.twin_master.runs import check_same, in_format_1, journal
-from tests.twin_master.watch.conftest import Mosquitto, begun, mosquitto, ran, wait_until, write_csv
+from tests.twin_master.watch.conftest import HANGS, Mosquitto, begun, mosquitto, ran, wait_until, write_csv
 from tests.twin_master.watch.test_brokers import TOPIC, heard_at, where_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.recent_parts import RECENT_NAMES
@@ -78,6 +78,7 @@ def kill_at(step: int, run: Callable[[], object], *, after: bool) -> None:
     """Run in a process of its own, which is killed before or after its journal has a step."""
     child = os.fork()
     if not child:
+        signal.alarm(HANGS)  # it ends by itself if it hangs
         try:
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(JournalFile, "append", dying_at(step, after=after))

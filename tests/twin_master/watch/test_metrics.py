@@ -14,7 +14,7 @@ import pytest
 from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.refusals import refused
-from tests.twin_master.watch.conftest import served, wait_until
+from tests.twin_master.watch.conftest import HANGS, served, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
@@ -136,7 +136,7 @@ def test_the_media_type_is_that_of_the_text_format(watch, plain):
     with serve_metrics(0) as server:
         server.attach("wing", watch)
         connection = HTTPConnection(
-            "127.0.0.1", int(server.address.split(":")[2].partition("/")[0]), timeout=20
+            "127.0.0.1", int(server.address.split(":")[2].partition("/")[0]), timeout=HANGS
         )
         connection.request("GET", "/metrics?name=step")
         answer = connection.getresponse()
@@ -240,12 +240,12 @@ def test_the_figures_can_be_read_while_the_watch_goes_on(watch, plain):
             while not is_over.is_set():
                 texts.append(served(port, "/metrics")[1])
 
-        thread = threading.Thread(target=read)
+        thread = threading.Thread(target=read, daemon=True)
         thread.start()
         watch.run(CsvFeed(plain, watch.scenario), metrics.note_decision)
         wait_until(lambda: f"{watch.twin.steps - 1}.0" in texts[-1])
         is_over.set()
-        thread.join(60)
+        thread.join(HANGS)
     steps = [value(parsed(text), "step") for text in texts if "uav_twin_step" in text]
     assert steps == sorted(steps)
     assert steps[-1] == watch.twin.steps - 1

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.twin_master.watch.conftest import Mosquitto, mosquitto, wait_until
+from tests.twin_master.watch.conftest import HANGS, Mosquitto, mosquitto, wait_until
 from twin_master.watch.broker_address import parse_broker
 from twin_master.watch.mqtt_session import Session
 
@@ -62,7 +62,7 @@ def publish(broker: Mosquitto, count: int, text: str = "") -> Any:
         for number in range(count)
     ]
     for message in sent:
-        message.wait_for_publish(60)
+        message.wait_for_publish(HANGS)
     return client
 
 

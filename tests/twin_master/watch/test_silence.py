@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.twin_master.watch.conftest import begun, journalled, ran, viewed, wait_until
+from tests.twin_master.watch.conftest import HANGS, begun, journalled, ran, viewed, wait_until
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feed import Feed
 from twin_master.watch.feeds import feed_of_lines
@@ -36,7 +36,10 @@ class SilentSource:
         self.first_kinds: tuple[int, list[str]] | None = None
         texts = self.open_standard_input() if self.from_standard_input else self.open_file(plain, folder)
         watching = threading.Thread(
-            target=self.watch.run, args=(self.feed, self.decisions.append), kwargs={"step_limit": 3}
+            target=self.watch.run,
+            args=(self.feed, self.decisions.append),
+            kwargs={"step_limit": 3},
+            daemon=True,
         )
         watching.start()
         if self.from_standard_input:
@@ -50,7 +53,7 @@ class SilentSource:
         self.send(texts[1] + texts[2][:9])  # half a message is none
         self.wait_for_decisions(5)
         self.send(texts[2][9:])
-        watching.join(60)
+        watching.join(HANGS)
         os.close(self.write)
         self.stream.close()
         self.wait_for_decisions(6)
