@@ -14,6 +14,7 @@ from discrepancy.campaign.columns import (
     role_by_unit,
     scaled_unit,
 )
+from discrepancy.campaign.heads import load_or_time_role
 from discrepancy.campaign.records import Quantity, TrialKind
 from discrepancy.campaign.schema import INPUT_COLUMNS
 from discrepancy.campaign.sheet import Sheet
@@ -95,7 +96,8 @@ class ColumnReader:
         self._check_role(sheet, head, role)
         if not unit and role != LEFT_OUT:
             self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a plain number")
-        if not unit or role == LEFT_OUT:
+        may_be_a_time = not role and load_or_time_role(unit) == "time"
+        if not unit or role == LEFT_OUT or may_be_a_time:
             return LaboratoryColumn(sheet, head, role, unit)
         try:
             is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN

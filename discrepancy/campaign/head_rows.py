@@ -10,8 +10,8 @@ from discrepancy.campaign.heads import is_clock_format, unit_beside
 
 Rows = list[tuple[int, list[str]]]
 """Rows of a file that are not empty: the number of the line or row, and the cells."""
-RECORD_NUMBER = "RN"
-"""Unit of the column that counts the records in files of Campbell's loggers."""
+NO_READINGS = {"RN": "counts the records", "TS": "holds times beside TIMESTAMP"}
+"""What a column contains instead of readings, by the unit that Campbell's loggers state for it."""
 _CAMPBELL = "TOA5"
 """First cell of a file of Campbell's loggers.
 
@@ -46,7 +46,7 @@ def find_head_rows(rows: Rows, first_row: int) -> HeadRows:
     cells_of_lines = dict(rows[:first_row])
     if rows[0][1][0] == _CAMPBELL and _CAMPBELL_NAMES_LINE in cells_of_lines:
         names = cells_of_lines[_CAMPBELL_NAMES_LINE]
-        return _names_with_units(names, cells_of_lines.get(_CAMPBELL_UNITS_LINE, []))
+        return _campbell_names_with_units(names, cells_of_lines.get(_CAMPBELL_UNITS_LINE, []))
     row_above = rows[first_row - 1][1]
     if first_row > 1:
         row_over_names = rows[first_row - 3][1] if first_row > 2 else []
@@ -91,5 +91,17 @@ def _names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
     """Return names with the units in the cells below them; what is no unit is left out."""
     units = []
     for name, cell in zip_longest(names, cells, fillvalue=""):
-        units.append(cell if cell == RECORD_NUMBER else unit_beside(name, cell))
+        units.append(unit_beside(name, cell))
     return HeadRows(names, units[: len(names)])
+
+
+def _campbell_names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
+    """Return the names and units of a file of Campbell's loggers.
+
+    Columns without readings keep their unit of `NO_READINGS`.
+    """
+    units = _names_with_units(names, cells).units
+    for index, (name, cell) in enumerate(zip(names, cells, strict=False)):
+        if cell in NO_READINGS:
+            units[index] = "" if name == "TIMESTAMP" else cell
+    return HeadRows(names, units)

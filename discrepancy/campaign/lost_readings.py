@@ -35,22 +35,20 @@ def _is_overload(cell: str) -> bool:
 def places_of_readings(rows: Rows) -> list[set[int]]:
     """Return the indices of the cells of each row that hold a reading or say that it is lost.
 
-    A reading is a number or a time. An overload counts below a number of its column only, and is
-    the text of a head otherwise.
+    A reading is a number or a time. An overload counts beside and below numbers only: elsewhere it
+    is the text of a head, or a line of dashes.
     """
     places = []
     columns_with_numbers: set[int] = set()
     for _, row in rows:
-        places_of_row = set()
+        numbers = {index for index, cell in enumerate(row) if is_value(cell)}
+        columns_with_numbers |= numbers
+        lost = set()
         for index, cell in enumerate(row):
-            if is_value(cell):
-                columns_with_numbers.add(index)
-            elif index in columns_with_numbers and _is_overload(cell):
-                pass
-            elif not _is_not_a_number(cell):
-                continue
-            places_of_row.add(index)
-        places.append(places_of_row)
+            is_below_number = index in columns_with_numbers and index not in numbers
+            if _is_not_a_number(cell) or (numbers and is_below_number and _is_overload(cell)):
+                lost.add(index)
+        places.append(numbers | lost)
     return places
 
 

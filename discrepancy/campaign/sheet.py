@@ -28,7 +28,7 @@ from discrepancy.campaign.clock_cells import (
     possible_date_orders,
     seconds_of_clock_times,
 )
-from discrepancy.campaign.head_rows import RECORD_NUMBER, Rows
+from discrepancy.campaign.head_rows import NO_READINGS, Rows
 from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.lost_readings import leave_out_lost_readings
 from discrepancy.campaign.matlab_file import read_matlab
@@ -285,6 +285,10 @@ def _sheet_of_rows(
     for index in range(len(layout.head)):
         columns.append(tuple(_cell(row, index) for _, row in layout.body))
     columns, remark = leave_out_lost_readings(columns, layout.head, lines, name, unit_of_place)
+    for index, (title, unit) in enumerate(zip(layout.head, layout.units, strict=True)):
+        if unit in NO_READINGS:
+            columns[index] = ("",) * len(lines)
+            remark += f"; the column {title!r} {NO_READINGS[unit]} and is left out"
     layout = layout._replace(remark=f"{remark}{layout.remark}")
     sheets = [
         _sheet_of_columns(name, file, layout, columns, unit_of_place, separator, date_order=order)
@@ -368,7 +372,7 @@ class _ColumnsWithSeconds(NamedTuple):
     clocks : set of int
         The numbers of the columns that had clock times.
     remark : str
-        The remark on columns of dates and of record numbers, which are left out.
+        The remark on columns of dates, which are left out.
     """
 
     columns: dict[int, tuple[str, ...]]
@@ -398,9 +402,6 @@ def _columns_with_seconds(
         is_only_clock = len(seconds_of_columns) == 1 and _increases(seconds)
         if index in times_of_dates:
             remark += f"; {title!r} has the dates of {layout.head[times_of_dates[index]]!r}"
-            del columns[index]
-        elif layout.units[index] == RECORD_NUMBER:
-            remark += f"; the column {title!r} counts the records and is left out"
             del columns[index]
         elif seconds and is_column_of_dates(columns[index]) and not is_only_clock:
             remark += f"; the column {title!r} holds dates without times and is left out"

@@ -215,3 +215,13 @@ def test_a_reading_without_a_time_is_refused_by_its_line(tmp_path):
     lines[5] = lines[5].replace(f",{LATE[4]},", ",,")
     file.write_text("\n".join(lines) + "\n", "utf-8")
     assert "lab.csv, line 6: 'acc2' has a reading, but 'time2' has no time" in refusal(read_sheet(file))
+
+
+@pytest.mark.parametrize("cells", ["0,0.5", "10:00:00,11:00:00"])
+def test_of_two_columns_of_times_without_a_common_name_the_clock_is_asked(tmp_path, cells):
+    (tmp_path / "lab.csv").write_text(f"stamp [s],delay [s],w [mm]\n{cells},1\n", "utf-8")
+
+    understood = LaboratoryImport([read_sheet(tmp_path / "lab.csv")], {"kind": {"": "driven"}})
+
+    asked = [heads for (option, _), heads in understood.questions.items() if option == "column"]
+    assert asked == [["stamp", "delay", "w"]]

@@ -52,6 +52,18 @@ def test_the_record_numbers_of_a_campbell_logger_are_left_out_with_a_remark(tmp_
     assert "; the column 'RECORD' counts the records and is left out" in sheet.remark
 
 
+def test_the_times_of_extremes_of_a_campbell_logger_are_no_second_clock(tmp_path):
+    sheet = table_of(
+        tmp_path,
+        '"TOA5","Bridge7","CR6"\n"TIMESTAMP","RECORD","w_Max","w_TMx"\n"TS","RN","mm","TS"\n'
+        '"","","Max","TMx"\n"2026-03-31 10:00:00",0,5,"2026-03-31 09:59:10"\n'
+        '"2026-03-31 10:01:00",1,6,"2026-03-31 10:00:20"\n',
+    )
+
+    assert (sheet.heads, sheet.units) == (("TIMESTAMP", "w_Max"), ("s", "mm"))
+    assert sheet.numbers("TIMESTAMP", ".") == ("0", "60")
+
+
 def test_a_lost_reading_of_a_campbell_logger_is_an_empty_cell(tmp_path):
     sheet = table_of(tmp_path, CAMPBELL)
 

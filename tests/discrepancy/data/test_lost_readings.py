@@ -38,8 +38,18 @@ def test_a_channel_ends_where_its_overload_begins_and_the_others_go_on(tmp_path,
         ("t,e,w\n0,1,5\n1,OVL,6\n2,OVL,7\n3,OVL,8\n", "e", ("1", "", "", "")),
         ("t,w\n0,0.5\n1,0.6\n2,OVL\n", "w", ("0.5", "0.6", "")),
         ("t,e,w\n0,1,5\n1,OVL,6\n2,OVL,7\nMean,3,6\n", "w", ("5", "6", "7")),
+        ("t,e,w\n0,1,5\n1,2,6\n---,---,---\n", "t", ("0", "1")),
+        ("w\n0.5\n0.6\n0.7\nOVL\nOVL\n", "w", ("0.5", "0.6", "0.7")),
     ],
-    ids=["first column", "most columns", "most rows", "only channel", "footer below"],
+    ids=[
+        "first column",
+        "most columns",
+        "most rows",
+        "only channel",
+        "footer below",
+        "line of dashes below",
+        "single column",
+    ],
 )
 def test_no_reading_is_lost_with_an_overload_beside_it(tmp_path, text, head, numbers):
     assert table_of(tmp_path, text).numbers(head, ".") == numbers
