@@ -238,6 +238,9 @@ class EffectKeys:
     at_several_places : bool
         Whether it may act at several places at once, with a size at each. A search for errors of
         whole simulations then adds it at a second place, too.
+    relative_frequency : float or None
+        How often it occurs, compared with the other effects that state this; all others are equally
+        probable.
     """
 
     identifier: Annotated[str, Field(alias="id")]
@@ -252,6 +255,7 @@ class EffectKeys:
     confusable: tuple[str, ...] = ()
     spectral: str = ""
     at_several_places: Annotated[bool, Strict()] = False
+    relative_frequency: Number | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,11 +272,23 @@ class Effect(EffectKeys):
         lines); ("",) if there is no choice.
     unavailable : callable
         Returns why it cannot be tested in a setting, or None.
+    variant_of : str
+        Identifier of the effect of which this is a variant that acts only in an event; empty if it
+        is none.
+    prior_weight : float
+        Prior probability over that of an effect without a stated frequency.
     """
 
     build: Build
     places: Callable[[Setting], tuple[str, ...]] = field(default=lambda setting: ("",))
     unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
+    variant_of: str = ""
+    prior_weight: float = 1.0
+
+    @property
+    def kind(self) -> str:
+        """The identifier of the effect of which this is a variant, or else its own."""
+        return self.variant_of or self.identifier
 
     def canonical_shape(self) -> dict[str, float]:
         """Return the shape parameters of the named effect by name, such as the exponent 2."""

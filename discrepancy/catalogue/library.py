@@ -192,9 +192,36 @@ def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effe
         effect,
         identifier=f"{effect.identifier}_during_{event_name}",
         name=f"{effect.name} during {event_name}",
+        variant_of=effect.identifier,
         acts_on=effect.acts_on & DYNAMIC,
         build=build,
     )
+
+
+def with_prior_weights(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return the effects that are compared, with prior weights by their stated frequencies.
+
+    Effects that state a frequency share as much prior probability as the same number of other
+    effects. A kind, which is an effect with its variants in events, gets the share of its
+    frequency, however many variants it has.
+    """
+    frequencies: dict[str, float] = {}
+    variant_counts: Counter[str] = Counter()
+    for effect in effects:
+        if effect.relative_frequency is not None:
+            frequencies[effect.kind] = effect.relative_frequency
+            variant_counts[effect.kind] += 1
+    effects_per_frequency = (
+        variant_counts.total() / sum(frequencies.values()) if frequencies else 0.0
+    )
+    weighted_effects = []
+    for effect in effects:
+        if effect.kind in frequencies:
+            weight_of_kind = effects_per_frequency * frequencies[effect.kind]
+            weight = weight_of_kind / variant_counts[effect.kind]
+            effect = replace(effect, prior_weight=weight)
+        weighted_effects.append(effect)
+    return tuple(weighted_effects)
 
 
 def check_effects(effects: Iterable[Effect]) -> None:
@@ -230,6 +257,8 @@ def _effect_faults(effect: Effect) -> Iterator[str]:
     for name, count in Counter(parameter.name for parameter in parameters).items():
         if count > 1:
             yield f" has {count} parameters with the name {name!r}."
+    if effect.relative_frequency is not None and effect.relative_frequency <= 0.0:
+        yield f" must have a positive relative_frequency, but has {effect.relative_frequency:g}."
     for parameter in parameters:
         prior = parameter.prior
         place = f", parameter {parameter.name!r}: "

@@ -21,13 +21,16 @@ from discrepancy.fits.candidate import (
     ResidualProcess,
     TrialDerivatives,
 )
+from discrepancy.fits.cut_gaussian import TruncatedGaussian
 from discrepancy.fits.normal_equations import (
+    NormalEquations,
     check_finite,
     cholesky_factor,
     normal_equations,
     solve_factored,
 )
 from discrepancy.fits.problem import Problem
+from discrepancy.fits.trial_data import LARGEST_LOSS
 from reporting.words import comma_list
 
 CONVERGED_DECREASE = 1e-2
@@ -474,7 +477,8 @@ def _with_evidence(
     """Return the fit at a state, with its Laplace evidence, covariance and degrees of freedom.
 
     The log evidence is -objective - ln(det H) / 2 with the Hessian H = U^T U, up to a constant:
-    ln(det H) / 2 is the sum of the logarithms of the diagonal of U.
+    ln(det H) / 2 is the sum of the logarithms of the diagonal of U. The integral is limited to
+    possible stiffness losses by their probability under the Gaussian density.
     """
     precision = problem.noise_precisions(state.squares_by_channel)
     equations = normal_equations(problem, state, candidate, precision)
@@ -493,14 +497,60 @@ def _with_evidence(
             absorbed_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
         )
     shared_count = problem.shared.unknown_count + candidate.parameter_count
+    log_integral = -state.objective - float(np.log(np.diag(factor)).sum())
     return CandidateFit(
         **vars(state),
         candidate=candidate,
-        log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
+        log_evidence=log_integral + _log_probability_of_losses(problem, equations, covariance),
         covariance=covariance[:shared_count, :shared_count],
         absorbed_freedom=absorbed_freedom,
         converged=converged,
     )
+
+
+def _log_probability_of_losses(
+    problem: Problem, equations: NormalEquations, covariance: FloatArray
+) -> float:
+    """Return ln of the posterior probability that all stiffness losses are possible [nat].
+
+    A loss below zero has no physical meaning. Fits may pass through such losses (see `LEAST_LOSS`),
+    but the evidence must not count them: else a hypothesis under which readings determine the
+    losses less well gains by each further sample. Trials in motion are left out, as the evidence
+    with a missing force has no such limit.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model, with the layout of their unknowns.
+    equations : NormalEquations
+        The normal equations at the maximum of the posterior.
+    covariance : (n, n) array
+        The posterior covariance of all scaled unknowns.
+    """
+    mean_losses, scales, unknown_indices = [], [], []
+    for data, (trial_jacobian, indices_of_trial) in zip(
+        problem.trials, equations.trials, strict=True
+    ):
+        unknowns = data.unknowns
+        if data.trial.is_dynamic or not len(unknowns.health_rows):
+            continue
+        health = slice(unknowns.indices.health.start, unknowns.indices.health.stop)
+        scale = unknowns.scale[health]
+        prior_means = data.trial.health[unknowns.health_rows, unknowns.health_columns]
+        mean_losses.append(prior_means + scale * trial_jacobian.local_values[health])
+        scales.append(scale)
+        unknown_indices.append(indices_of_trial[health])
+    if not scales:
+        return 0.0
+    scale, indices = np.concatenate(scales), np.concatenate(unknown_indices)
+    losses = TruncatedGaussian(
+        mean=np.concatenate(mean_losses),
+        covariance=covariance[np.ix_(indices, indices)] * np.outer(scale, scale),
+        low=np.zeros(len(scale)),
+        high=np.full(len(scale), LARGEST_LOSS),
+        log_integral=0.0,
+    )
+    return losses.log_evidence
 
 
 def _move_point(

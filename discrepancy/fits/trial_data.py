@@ -34,7 +34,7 @@ FREE_STATE_DEVIATION = 3.0
 LEAST_LOSS = -0.5
 """Lower limit of an uncertain stiffness loss. A loss below zero has no physical meaning. But with a
 limit at zero, the loss of a healthy wing, fits would stop there: by noise about half of the
-readings give a loss below zero."""
+readings give a loss below zero. The evidence does not count such losses."""
 LARGEST_LOSS = 0.95
 """Upper limit of an uncertain stiffness loss."""
 

@@ -60,8 +60,9 @@ def can_estimate_forces(problem: Problem) -> bool:
 def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> float:
     """Return the log prior probability of a candidate [nat].
 
-    All sets with the same number of effects have the same prior, and so have all places of an
-    effect. An effect with a free shape has the smaller prior that the shape test asks for.
+    The prior of a set of effects is proportional to the product of their prior weights, and the
+    same at all places of an effect. An effect with a free shape has the smaller prior that the
+    shape test asks for.
 
     Parameters
     ----------
@@ -75,13 +76,15 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
     terms = candidate.terms
     if not terms:
         return log(SEARCH.prior_none)
-    # The number of effects has a prior probability, which is divided equally among the sets of this
-    # number, and among the places of each effect.
+    # The number of effects has a prior probability, which the sets of this number share by their
+    # weights, and the places of each effect equally. As the mean weight is 1, the priors of single
+    # effects add up to that of their number, and those of larger sets nearly do.
+    log_weights = sum(log(term.effect.prior_weight) for term in terms)
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
     shape_penalty = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
     probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_probabilities[len(terms) - 1]
     set_count = comb(max(effect_count, len(terms)), len(terms))
-    return log(probability_of_length / set_count) - log_places - shape_penalty
+    return log(probability_of_length / set_count) + log_weights - log_places - shape_penalty
 
 
 def values_to_try(term: EffectTerm) -> list[FloatArray]:

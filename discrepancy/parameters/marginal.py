@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.cut_gaussian import TruncatedGaussian
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.normal_equations import cholesky_factor, normal_equations, solve_factored
 from discrepancy.fits.problem import Problem
-from discrepancy.parameters.cut_gaussian import TruncatedGaussian
 
 NO_EFFECTS = Candidate()
 """The hypothesis that the model lacks nothing."""

@@ -16,9 +16,9 @@ from calibration.result.record import Procedure
 from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
+from discrepancy.fits.cut_gaussian import TruncatedGaussian
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.parameters.cut_gaussian import TruncatedGaussian
 from discrepancy.parameters.marginal import MarginalPosterior
 
 QUADRATURE_RANGE = 6.0

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.library import variants_in_events
+from discrepancy.catalogue.library import variants_in_events, with_prior_weights
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, try_fit
@@ -57,10 +57,8 @@ def search(
         problem, no_effect, iterations=SEARCH.no_effect_iterations
     )
     usable_catalogue = [effect for effect in effects if effect.unavailable(problem.setting) is None]
-    usable_effects = (
-        *usable_catalogue,
-        *variants_in_events(tuple(usable_catalogue), problem.setting),
-    )
+    variants = variants_in_events(usable_catalogue, problem.setting)
+    usable_effects = with_prior_weights((*usable_catalogue, *variants))
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
     _, own_laws = problem.model.without_laws()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
-from scipy.stats import multivariate_normal
+from scipy.integrate import quad, trapezoid
+from scipy.stats import multivariate_normal, norm
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
-from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.fits.normal_equations import cholesky_factor
 from discrepancy.fits.predictive import residual_set
@@ -359,3 +359,48 @@ def test_a_free_gain_is_fixed_where_only_releases_of_unknown_amplitude_show_it()
 
     assert layout.fixed_gain == {"y1": GAIN - 1.0}
     assert layout.gain_channels == ()
+
+
+class HealthySteps:
+    """Three readings of a closed form whose losses are zero, with a prior deviation of 0.1."""
+
+    def __init__(self, seed: int) -> None:
+        force = np.array([0.5, 1.0, 2.0])
+        deviation = np.array([[0.1, 0.0]] * 3)
+        trial = kit.blank_trial("steps", TrialKind.STATIC, kit.OUTPUTS, force, health_deviation=deviation)
+        noise = 0.02 * np.random.default_rng(seed).standard_normal((3, 3))
+        values = force[:, None] * kit.STATIC_SHAPES[0] + noise
+        channels = {
+            name: Channel(name, Quantity.DISPLACEMENT, name, NoiseRecord(0.02, inf)) for name in kit.OUTPUTS
+        }
+        parameters = {"curvature": (0.0, 0.0)}
+        trials = (replace(trial, values=values),)
+        bare = Campaign("steps", channels, trials, None, parameters, "")
+        self.problem = kit.problem_of(bare, kit.ClosedForm(bent=True))
+
+    def log_likelihoods(self, slope: float, loss: float) -> FloatArray:
+        """Return the log likelihood of each reading row (3,) at a scaled slope and a loss."""
+        point = Point(np.array([slope, 0.0]), (np.full(3, loss / 0.1),), np.empty(0))
+        response = self.problem.response_of_candidate(0, point, Candidate())
+        residual = self.problem.standardised_residual(0, point, response)
+        return -0.5 * (residual**2).sum(axis=1)
+
+    def log_evidence(self) -> float:
+        """Return the log evidence by quadrature over the slope and, at each slope, over each loss."""
+        slopes = np.linspace(-4.0, 4.0, 41)
+        losses = np.linspace(0.0, 0.5, 61)
+        integrals = []
+        for slope in slopes:
+            rows = np.array([self.log_likelihoods(slope, loss) for loss in losses])
+            joint = np.exp(rows) * norm.pdf(losses, scale=0.1)[:, None]
+            integrals.append(norm.pdf(slope) * trapezoid(joint, losses, axis=0).prod())
+        return float(np.log(trapezoid(integrals, slopes)))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_evidence_counts_no_loss_below_zero(seed):
+    steps = HealthySteps(seed)
+
+    fit = kit.fitted(steps.problem)
+
+    assert fit.log_evidence == pytest.approx(steps.log_evidence(), abs=0.1)
