@@ -112,7 +112,7 @@ class ReducedModel(ReducedArrays):
         Parameters
         ----------
         values : mapping of str to float, or (V,) array, optional
-            Values by name; an array is returned as it is.
+            Values by name; an array is returned as it is, with NaN where it is masked.
         stiffness_loss : mapping or iterable of float
             Losses of the damage regions together, see `fe.runtime.state.losses_of`.
         **named : float
@@ -131,7 +131,7 @@ class ReducedModel(ReducedArrays):
             If the losses are not those of the regions.
         """
         if isinstance(values, np.ndarray):
-            return values
+            return np.asarray(np.ma.filled(values, np.nan))
         vector = self.nominal.copy()
         vector[self._loss_inputs] = self.losses(stiffness_loss)
         for name, value in {**(values or {}), **named}.items():
@@ -157,7 +157,10 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If a name is not that of an input.
         """
-        arrays = [np.asarray(column) for column in columns.values()]
+        arrays = [
+            np.ma.filled(np.ma.asarray(column, dtype=np.float64), np.nan)
+            for column in columns.values()
+        ]
         # With an array of length one among them, single numbers alone make one case.
         zeros_of_cases, *broadcast = np.broadcast_arrays(np.zeros(1), *arrays)
         vectors = np.tile(self.nominal, (len(zeros_of_cases), 1))
@@ -334,6 +337,7 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If a value lies outside the validity box or is not finite.
         """
+        vectors = np.ma.filled(vectors, np.nan)
         low, high = self.validity_box.T
         is_within = (vectors >= low) & (vectors <= high)
         outside = np.flatnonzero(~is_within.all(axis=1))

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, product_of_each
+from reporting.arrays import Float, nan_where_masked, product_of_each
 from reporting.words import brief, comma_list
 from twin_master.errors import InvalidModelError
 from twin_master.network.transition import (
@@ -141,11 +141,11 @@ class StateSpace:
 
     def mean(self, belief: ArrayLike) -> Float:
         """Return the mean of each factor: (..., S) -> (..., factors)."""
-        return product_of_each(np.asarray(belief, dtype=np.float64), self.coordinates)
+        return product_of_each(nan_where_masked(belief), self.coordinates)
 
     def standard_deviation(self, belief: ArrayLike) -> Float:
         """Return the standard deviation of each factor: (..., S) -> (..., factors)."""
-        belief = np.asarray(belief, dtype=np.float64)
+        belief = nan_where_masked(belief)
         deviation = self.coordinates - self.mean(belief)[..., None, :]
         return np.asarray(np.sqrt(product_of_each(belief, deviation**2)))
 
@@ -167,7 +167,7 @@ class StateSpace:
             The change of the table if each of F factors is one standard deviation off its level,
             by the straight line that fits the table best; zero for a factor of one level.
         """
-        table = np.asarray(table, dtype=np.float64)
+        table = nan_where_masked(table)
         # The axis of joint states becomes one axis for the levels of each factor.
         table_by_levels = table.reshape(*self.shape, *table.shape[1:])
         change_of_factors = []
@@ -190,7 +190,7 @@ class StateSpace:
             raise InvalidModelError(
                 f"no factor is named {name!r}; there are {', '.join(self.names)}"
             )
-        belief = np.asarray(belief, dtype=np.float64)
+        belief = nan_where_masked(belief)
         belief_by_levels = belief.reshape(*belief.shape[:-1], *self.shape)
         # The axes of the factors are the last ones, counted from the end by negative numbers.
         factor_count = len(self.shape)

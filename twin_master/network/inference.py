@@ -295,8 +295,8 @@ def predict(
         If shapes do not fit, or there is no such control.
     """
     control_index = int(checked_controls(control_index, len(model.controls)))
-    belief = np.asarray(belief, dtype=np.float64)
-    policy = np.asarray(policy, dtype=np.float64)
+    belief = nan_where_masked(belief)
+    policy = nan_where_masked(policy)
     check_shape("a belief", belief.shape, model.states.size)
     if horizon < 0:
         raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
@@ -349,6 +349,5 @@ def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: in
     control_count : int
         The number U of controls.
     """
-    belief = np.asarray(belief, dtype=np.float64)
-    is_control = np.eye(control_count)[np.asarray(control_index)]
-    return np.asarray(belief[..., :, None] * is_control[..., None, :])
+    is_control = np.eye(control_count)[checked_controls(control_index, control_count)]
+    return nan_where_masked(belief)[..., :, None] * is_control[..., None, :]

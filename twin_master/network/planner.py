@@ -9,11 +9,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import AnyArray, Float, Index, product_of_each
+from reporting.arrays import AnyArray, Float, Index, nan_where_masked, product_of_each
 from reporting.words import comma_list
 from twin_master.errors import PlanningError
 from twin_master.network.kernels import sweep_bellman
-from twin_master.network.transition import TransitionModel, check_shape
+from twin_master.network.transition import (
+    TransitionModel,
+    check_shape,
+    checked_beliefs,
+    checked_controls,
+)
 
 LARGEST_SOLVED = 1000
 """States up to which the value of a policy is the solution of a dense linear system."""
@@ -48,6 +53,14 @@ class BeliefPolicy:
     vectors: Float
     control: Index
 
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite(nan_where_masked(self.vectors))):
+            raise PlanningError(
+                "expected finite returns of plans, got NaN, masked or infinite ones"
+            )
+        control = checked_controls(self.control, np.iinfo(np.int64).max)
+        object.__setattr__(self, "control", control)
+
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, AnyArray], prefix: str = "") -> BeliefPolicy:
         """Return the policy whose two arrays were read from a file.
@@ -80,14 +93,14 @@ class BeliefPolicy:
 
     def value(self, belief: ArrayLike) -> Float:
         """Return the expected return of the best plan under each belief: (..., S) -> (...)."""
-        return np.asarray(product_of_each(np.asarray(belief), self.vectors.T).max(axis=-1))
+        return np.asarray(product_of_each(checked_beliefs(belief), self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
         """Return the expected return of each first control: beliefs (..., S) -> (..., U).
 
         It is minus infinity for a control with which no plan begins.
         """
-        expected_returns = product_of_each(np.asarray(belief), self.vectors.T)  # (..., N)
+        expected_returns = product_of_each(checked_beliefs(belief), self.vectors.T)  # (..., N)
         best_returns: Float = np.full((*expected_returns.shape[:-1], controls), -np.inf)
         for control in np.unique(self.control).tolist():
             has_control = self.control == control
@@ -96,7 +109,7 @@ class BeliefPolicy:
 
     def decide(self, belief: ArrayLike) -> Index:
         """Return the index of the control to take under each belief: (..., S) -> (...)."""
-        best_plan = np.argmax(product_of_each(np.asarray(belief), self.vectors.T), axis=-1)
+        best_plan = np.argmax(product_of_each(checked_beliefs(belief), self.vectors.T), axis=-1)
         return np.asarray(self.control[best_plan])
 
 
@@ -164,7 +177,8 @@ def decision_probability(
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
     if on_belief is not None:
         # The policy is deterministic: its control has the probability one.
-        return np.eye(policy.shape[1])[on_belief.decide(belief)]
+        # A twin whose flight has failed has no belief, and its control is not used.
+        return np.eye(policy.shape[1])[on_belief.decide(np.nan_to_num(belief))]
     return product_of_each(belief, policy)
 
 
@@ -270,7 +284,7 @@ class _DecisionProcess:
             1 - 1e-12.
         """
         controls, states, _ = transition.shape
-        rewards = np.array(reward, dtype=np.float64, order="C")
+        rewards = np.array(nan_where_masked(reward), order="C")
         check_shape("rewards", rewards.shape, states, controls, error=PlanningError)
         is_finite = np.isfinite(rewards)
         if not np.all(is_finite):
@@ -279,7 +293,7 @@ class _DecisionProcess:
                 f"reward at (state, control) {position} is {rewards[position]}; expected finite "
                 "rewards"
             )
-        factors = np.array(discount, dtype=np.float64)
+        factors = np.array(nan_where_masked(discount))
         in_range = np.all((factors >= 0.0) & (factors < 1.0))
         if factors.shape not in ((), (controls,)) or not in_range:
             raise PlanningError(
@@ -479,7 +493,7 @@ def value_iteration(
         If a row of the transition does not sum to one.
     """
     if not isinstance(transition, TransitionModel):
-        transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
+        transition = TransitionModel((nan_where_masked(transition),))
     problem = _DecisionProcess.from_arrays(transition, reward, discount)
     most_sweeps = max_iterations
     if problem.is_solved:

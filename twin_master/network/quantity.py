@@ -162,7 +162,7 @@ class QuantityModel:
 
     def check_joint(self, joint: ArrayLike) -> Float:
         """Return a joint belief (..., S, U) as an array, or refuse its shape."""
-        joint = np.asarray(joint, dtype=np.float64)
+        joint = nan_where_masked(joint)
         what = "a joint belief, see `known_control`,"
         leading_axes = joint.shape[:-2]
         check_shape(what, joint.shape, *leading_axes, self.state_count, self.control_count)

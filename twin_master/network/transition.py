@@ -151,6 +151,24 @@ def checked_controls(control_index: ArrayLike, count: int) -> Index:
     return np.array(numbers, dtype=np.int64, order="C")
 
 
+def checked_beliefs(beliefs: ArrayLike) -> Float:
+    """Return beliefs (..., S) as an array of floats, without lost probabilities.
+
+    Raises
+    ------
+    InvalidModelError
+        If a probability is masked or not finite.
+    """
+    probabilities = nan_where_masked(beliefs)
+    is_finite = np.isfinite(probabilities)
+    if not np.all(is_finite):
+        raise InvalidModelError(
+            "expected the probability of each state in a belief, got "
+            f"{probabilities[~is_finite].flat[0]} (NaN stands for a masked one)"
+        )
+    return probabilities
+
+
 def check_fits(parts: Mapping[str, float], advice: str) -> None:
     """Raise an error if arrays together need more memory than is available.
 

@@ -37,7 +37,7 @@ from twin_master.network.graphical_model import (
 )
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision_probability
-from twin_master.network.transition import checked_controls
+from twin_master.network.transition import checked_beliefs, checked_controls
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
 
@@ -370,7 +370,9 @@ class Twin:
     def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
         """Predict through the policy from any belief (S,) under a control in force: (37)-(39)."""
         horizon = self.prediction_steps if steps is None else steps
-        return predict(self.model, belief, self._index_of(control), self.policy, horizon)
+        return predict(
+            self.model, checked_beliefs(belief), self._index_of(control), self.policy, horizon
+        )
 
     def smoothed(self) -> Float:
         """Return p(D_k | o_0..o_t) for the steps k = `first_kept`..t: (n, S).

@@ -202,6 +202,21 @@ def test_values_outside_validity_are_refused_by_name(pair, value):
             model.static_outputs(np.stack((model.nominal, vector)))
 
 
+def test_a_masked_value_is_refused_by_name(pair):
+    model = pair.model
+    name = model.input_names[0]
+    sentence = rf"^{name} must lie between"
+    is_masked = np.arange(len(model.nominal)) == 0
+    column = np.ma.masked_equal([model.nominal[0], 9.0], 9.0)
+
+    with pytest.raises(OutsideModelError, match=sentence):
+        model.static_response(np.ma.masked_array(model.nominal, is_masked))
+    with pytest.raises(OutsideModelError, match=sentence):
+        model.static_outputs(np.ma.masked_array([model.nominal], is_masked[None]))
+    with pytest.raises(OutsideModelError, match=sentence):
+        model.static_outputs(model.vectors({name: column}))
+
+
 def test_an_unknown_value_is_refused(pair):
     with pytest.raises(OutsideModelError, match="mass or control named 'z9'"):
         pair.model.static_response({"z9": 0.1})

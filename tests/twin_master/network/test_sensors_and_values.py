@@ -525,6 +525,7 @@ QUANTITY = QuantityModel(VALUES, WEIGHT)
 REWARDS = RewardModel(QUANTITY, 1.0, (0.0, 1.0), 1.0)
 _, SHOWN, SHARE, DEVIATION, OBSERVATION = random_sensors(7)
 HOLDING = GaussianSensorModel(SHOWN, DEVIATION, SHARE)
+PLANS = BeliefPolicy(np.eye(3), np.array([0, 1, 1]))
 REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(SHOWN, bad, SHARE), "positive noise standard deviation")
       for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
@@ -550,6 +551,14 @@ REFUSED = [
     (lambda: value_iteration(MANY, np.ones((2000, 3)), 0.9, max_iterations=3), "after 3 sweeps"),
     (lambda: value_iteration(TABLE * 0.95, REWARD, 0.6), "does not sum to one"),
     (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
+    (lambda: value_iteration(MOVES, np.ma.masked_equal(REWARD, REWARD[2, 1]), 0.6), r"\(2, 1\) is nan"),
+    (lambda: value_iteration(np.ma.masked_equal(TABLE, TABLE[0, 0, 0]), REWARD, 0.6), "a value that is not"),
+    (lambda: value_iteration(MOVES, REWARD, np.ma.masked_equal([0.6, 0.7, 0.6], 0.7)), "discount factor"),
+    (lambda: BeliefPolicy(np.ma.masked_equal(np.eye(2), 1.0), [0, 1]), "finite returns of plans"),
+    (lambda: BeliefPolicy(np.eye(2), [0.0, 1.5]), r"whole numbers as control indices, got 1\.5"),
+    *((lambda ask=ask: ask(np.ma.masked_equal([0.2, 0.3, 0.5], 0.3)), "NaN stands for a masked one")
+      for ask in (PLANS.decide, PLANS.value, lambda belief: PLANS.action_value(belief, 2))),
+    (lambda: known_control(np.ones(3) / 3, 1.5, 2), r"whole numbers as control indices, got 1\.5"),
 ]  # fmt: skip
 
 
@@ -658,3 +667,14 @@ def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypat
     found = leaving_probability(problem, policy, beliefs, 1, 4, rng)
     np.testing.assert_allclose(found, exact, atol=0.03)
     assert sum(0.05 < value < 0.95 for value in exact) > 1
+
+
+def test_a_masked_belief_has_no_moments():
+    is_masked = np.zeros(JOINT.shape, dtype=bool)
+    is_masked[0, 0] = True
+
+    mean, deviation = QUANTITY.moments(np.ma.masked_array(JOINT, is_masked))
+
+    assert np.isnan(mean[0, 0]).all()
+    assert np.isnan(deviation[0, 0]).all()
+    assert np.isfinite(mean[1:]).all()
