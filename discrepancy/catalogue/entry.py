@@ -239,8 +239,8 @@ class EffectKeys:
         Whether it may act at several places at once, with a size at each. A search for errors of
         whole simulations then adds it at a second place, too.
     relative_frequency : float or None
-        How often it occurs, compared with the other effects that state this; all others are equally
-        probable.
+        How often it occurs, compared with the other effects that state this [1]. Those that do not
+        are equally probable.
     """
 
     identifier: Annotated[str, Field(alias="id")]
