@@ -18,6 +18,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Start, TrialKind
 from discrepancy.campaign.sampling import is_even
 from discrepancy.campaign.schema import INPUT_COLUMNS
+from discrepancy.campaign.wild_readings import is_fill_value
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignFileError, DiscrepancyError
 from tests.discrepancy.rigs import CAMPAIGNS, asked, campaign_folder, same
@@ -376,7 +377,15 @@ def test_a_word_that_is_no_fault_cannot_be_accepted(tmp_path):
         read_campaign(campaign_folder(tmp_path / "a", PLAIN, change))
 
 
-finite = st.floats(-1e6, 1e6, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-200)
+def has_digits_of_a_fill_value(number: float) -> bool:
+    """Return whether a number is 9999 or another fill value in some unit, which the reader leaves out."""
+    digits, _ = f"{abs(number):.12e}".split("e")
+    return is_fill_value(digits.replace(".", "").rstrip("0"))
+
+
+finite = st.floats(-1e6, 1e6, allow_nan=False).filter(
+    lambda x: x == 0.0 or (abs(x) > 1e-200 and not has_digits_of_a_fill_value(x))
+)
 positive = st.floats(1e-9, 1e6)
 names = st.text(
     st.characters(codec="utf-8", exclude_categories=("Cc", "Cs", "Zl", "Zp", "Zs"), exclude_characters="#*"),
@@ -388,7 +397,7 @@ names = st.text(
 @st.composite
 def campaigns(draw):
     channel_names = draw(st.lists(names, min_size=1, max_size=3, unique=True))
-    interval, rest = draw(st.floats(1e-5, 1.0)), st.floats(-1.0, 1.0)
+    interval, rest = draw(st.floats(1e-5, 1.0)), finite.map(lambda x: 1e-6 * x)
     noise = (
         st.builds(NoiseRecord, positive, positive | st.just(math.inf))
         | st.builds(NoiseRecord, positive, positive, source=st.just("repeats"))
