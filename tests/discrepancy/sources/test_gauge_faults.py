@@ -8,7 +8,7 @@ from benchmarks.studies.hidden_effects import fly_mission
 from discrepancy.sources.from_run import run_campaign, run_model
 from discrepancy.verdict import Verdict
 from discrepancy.workflow import investigate
-from fe.runtime.patch import Primitive, SensorGain, SensorSaturation
+from fe.runtime.patch import Primitive, SensorDrift, SensorGain, SensorSaturation
 from tests.discrepancy.rigs import chosen
 
 pytestmark = [pytest.mark.xdist_group("wing"), pytest.mark.long]
@@ -30,6 +30,16 @@ def test_a_gauge_that_shows_too_little_has_a_wrong_gain_first_of_all(tmp_path, s
 
     first = verdict.effects[0]
     assert (first.identifier, first.place) == ("gauge_gain", "g17")
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_gauge_with_an_offset_that_grows_has_a_drifting_zero_first_of_all(tmp_path, seed):
+    """By 600 microstrain over the flight, where single readings scatter by 150."""
+    drift = SensorDrift("strain[17]", 6e-4, time=float(STEPS))
+    verdict = verdict_on_flight(tmp_path / "run", seed, drift)
+
+    first = verdict.effects[0]
+    assert (first.identifier, first.place) == ("gauge_zero_drift", "g17")
 
 
 @pytest.mark.parametrize("seed", SEEDS)
