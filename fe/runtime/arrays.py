@@ -27,6 +27,14 @@ STUCK, POSITION, LAGGED_FORCE, FADING_POSITION, FORCE, FIRST_ELEMENT = range(6)
 """Columns of a law's memory, see `laws.interface`; from `FIRST_ELEMENT` on its hysteretic
 elements."""
 
+
+def nan_where_masked(values: npt.ArrayLike) -> FloatArray:
+    """Return values as an array; a masked one becomes floats, with NaN where it is masked."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
+    return np.asarray(values)
+
+
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
 
 

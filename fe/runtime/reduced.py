@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.linalg import solve
 
-from .arrays import FloatArray, IntArray
+from .arrays import FloatArray, IntArray, nan_where_masked
 from .dense_matrices import dense_sum, lowest_modes
 from .errors import OutsideModelError
 from .reduced_arrays import CertifiedSolver, ReducedArrays
@@ -131,7 +131,7 @@ class ReducedModel(ReducedArrays):
             If the losses are not those of the regions.
         """
         if isinstance(values, np.ndarray):
-            return np.asarray(np.ma.filled(values, np.nan))
+            return nan_where_masked(values)
         vector = self.nominal.copy()
         vector[self._loss_inputs] = self.losses(stiffness_loss)
         for name, value in {**(values or {}), **named}.items():
@@ -157,10 +157,7 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If a name is not that of an input.
         """
-        arrays = [
-            np.ma.filled(np.ma.asarray(column, dtype=np.float64), np.nan)
-            for column in columns.values()
-        ]
+        arrays = [nan_where_masked(column) for column in columns.values()]
         # With an array of length one among them, single numbers alone make one case.
         zeros_of_cases, *broadcast = np.broadcast_arrays(np.zeros(1), *arrays)
         vectors = np.tile(self.nominal, (len(zeros_of_cases), 1))
@@ -337,7 +334,7 @@ class ReducedModel(ReducedArrays):
         OutsideModelError
             If a value lies outside the validity box or is not finite.
         """
-        vectors = np.ma.filled(vectors, np.nan)
+        vectors = nan_where_masked(vectors)
         low, high = self.validity_box.T
         is_within = (vectors >= low) & (vectors <= high)
         outside = np.flatnonzero(~is_within.all(axis=1))

@@ -217,6 +217,14 @@ def test_a_masked_value_is_refused_by_name(pair):
         model.static_outputs(model.vectors({name: column}))
 
 
+def test_a_masked_whole_number_is_lost_as_a_masked_float(pair):
+    whole_numbers = np.arange(len(pair.model.nominal))
+
+    vector = pair.model.vector(np.ma.masked_equal(whole_numbers, 0))
+
+    np.testing.assert_array_equal(vector, [np.nan, *whole_numbers[1:]])
+
+
 def test_an_unknown_value_is_refused(pair):
     with pytest.raises(OutsideModelError, match="mass or control named 'z9'"):
         pair.model.static_response({"z9": 0.1})
