@@ -5,7 +5,6 @@ in the cache folder, or with the record of `--compare FILE`.
 """
 
 import argparse
-import importlib
 import os
 import pkgutil
 import shutil
@@ -21,7 +20,7 @@ import benchmarks
 from benchmarks import lines
 from benchmarks.comparison import NOTEWORTHY, Change, change_since
 from benchmarks.measurement import Measurement, NotAvailableError
-from benchmarks.own_process import Benchmark, figures_of_own_process
+from benchmarks.own_process import Benchmark, figures_of_own_process, imported_benchmark
 from benchmarks.peer_networks import PEER_PYTHON
 from benchmarks.record import (
     BenchmarkRecord,
@@ -190,13 +189,8 @@ def chosen_benchmarks(words: Sequence[str]) -> list[str]:
 
 def load_benchmark(name: str) -> Benchmark:
     """Return the function that measures a benchmark in a process of its own."""
-    return partial(figures_of_own_process, partial(_imported_benchmark, name))
-
-
-def _imported_benchmark(name: str) -> Benchmark:
-    """Import a benchmark and return the function that measures it."""
-    benchmark: Benchmark = importlib.import_module(f"benchmarks.{_PREFIX}{name}").run
-    return benchmark
+    load = partial(imported_benchmark, f"benchmarks.{_PREFIX}{name}")
+    return partial(figures_of_own_process, load)
 
 
 def _parser() -> argparse.ArgumentParser:

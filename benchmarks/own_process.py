@@ -1,5 +1,6 @@
 """A benchmark in a process of its own, so that none changes the memory or the time of the next."""
 
+import importlib
 import multiprocessing
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -45,6 +46,16 @@ def figures_of_own_process(load: Callable[[], Benchmark]) -> Iterator[Measuremen
     finally:
         receiver.close()
         process.join()
+
+
+def imported_benchmark(module: str) -> Benchmark:
+    """Import a module of a benchmark and return the function that measures it.
+
+    The new process finds this function in its own module; it does not find those of the module that
+    was started as a program.
+    """
+    benchmark: Benchmark = importlib.import_module(module).run
+    return benchmark
 
 
 def _send_figures(load: Callable[[], Benchmark], sender: Connection) -> None:
