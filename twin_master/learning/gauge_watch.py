@@ -180,34 +180,51 @@ class GaugeWatch:
         begins_now = self.faults.probability_to_begin_now(step_count)
         return self._standstill.update(before, readings, step_count, begins_now)
 
-    def assimilate(
-        self, state: WatchState, checked: CheckedReadings, model_belief: Float, step: int
-    ) -> list[list[Notice]]:
-        """Correct the hypotheses by observations, mix their beliefs, and return the notices.
+    def step(
+        self,
+        state: WatchState | None,
+        checked: CheckedReadings,
+        forecast: Float,
+        model_belief: Float,
+        previous_control: Index,
+        step: int,
+    ) -> tuple[WatchState, list[list[Notice]]]:
+        """Advance the hypotheses of B twins to a step, correct them, and mix their beliefs.
 
         Parameters
         ----------
-        state : WatchState
-            The state of the watch of B twins in this step, before its observation; updated in
-            place.
+        state : WatchState or None
+            The state of the watch after the previous step, updated in place; None if this is the
+            first step of the model.
         checked : CheckedReadings
-            The observations.
-        model_belief : (B, S) array
-            The filtered belief under the model.
+            The observations of the step.
+        forecast, model_belief : (B, S) array
+            The beliefs under the model before and after the observations.
+        previous_control : (B,) array
+            The controls of the previous step; not used in the first step of the model.
         step : int
             The number of the step.
 
         Returns
         -------
-        list of list of Notice
+        state : WatchState
+            The state of the watch after the step.
+        notices : list of list of Notice
             The notices of each twin.
         """
+        if state is None:
+            state = self.faults.start(forecast, checked.observations.control)
+        else:
+            self.faults.advance(state, previous_control, checked.observations.control)
         self.faults.assimilate(state, checked.observations)
         notices = self._report_useless_readings(state, checked, step)
+        if step == 0:
+            own_likelihood = self._notices.report_own_likelihood(self._sensor_model)
+            notices = [own_likelihood + of_twin for of_twin in notices]
         self._raise_alarms(state, notices, step)
         self._report_followed_hypothesis(state, notices, step)
         state.mixed = hypothesis_weights.mix_beliefs(state.weights, model_belief, state.beliefs)
-        return notices
+        return state, notices
 
     def _report_useless_readings(
         self, state: WatchState, checked: CheckedReadings, step: int
@@ -266,10 +283,6 @@ class GaugeWatch:
             notices[twin] += self._notices.report_followed_hypothesis(
                 int(hypothesis[twin]), float(probability[twin]), step
             )
-
-    def report_own_likelihood(self) -> list[Notice]:
-        """Return the notice that a user's sensor model has a likelihood that alarms do not use."""
-        return self._notices.report_own_likelihood(self._sensor_model)
 
     def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
         """Return the evidence for the kinds of fault, relative to that for the model.

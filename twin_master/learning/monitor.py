@@ -121,14 +121,11 @@ class WatchfulEstimator:
         estimate = self._inner.step(before, checked.rows[0], control_index, step)
 
         # Advance and correct the hypotheses about the gauges.
-        if before is None or state is None:
-            state = faults.start(estimate.forecast[None], controls)
-        else:
-            faults.advance(state, np.array([before.control_index]), controls)
         model_belief = estimate.filtered[None]
-        (notices,) = self.watch.assimilate(state, checked, model_belief, step)
-        if before is None:
-            notices = self.watch.report_own_likelihood() + notices
+        previous_control = controls if before is None else np.array([before.control_index])
+        state, (notices,) = self.watch.step(
+            state, checked, estimate.forecast[None], model_belief, previous_control, step
+        )
 
         hypotheses = self.watch.hypotheses(state, model_belief)
         probabilities = {hypothesis.name: hypothesis.probability for hypothesis in hypotheses}

@@ -17,15 +17,15 @@ from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
-from twin_master.errors import ImpossibleObservation, TwinMasterError
+from twin_master.errors import TwinMasterError
 from twin_master.learning.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.learning.monitor import gauge_watch_of
 from twin_master.learning.watch_state import WatchState
 from twin_master.mission.loop import early_end_sentence, fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
-from twin_master.network.estimator import Notice
-from twin_master.network.inference import Filtered, checked_sequence, filter_many
+from twin_master.network.estimator import ExactFilter, Notice
+from twin_master.network.inference import NO_CONTROL, Filtered
 from twin_master.network.planner import decision_probability, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, unbelievable_observation
 
@@ -269,28 +269,6 @@ def fly_side_by_side(
     return Flights.concatenate(flights)
 
 
-class _StepOfTwins(NamedTuple):
-    """What B twins have seen and concluded in a step.
-
-    Attributes
-    ----------
-    observed_rows : (B, G + I) array
-        The observed values, SI.
-    state : (B, F) array
-        The true states, SI.
-    filtered : (B, S) array
-        The beliefs about the state.
-    log_evidence, unexplained : (B,) array
-        As in `Flights`.
-    """
-
-    observed_rows: Float
-    state: Float
-    filtered: Float
-    log_evidence: Float
-    unexplained: Float
-
-
 class _Formation:
     """B twins that fly the same step at the same time.
 
@@ -310,7 +288,8 @@ class _Formation:
         self._assets = _StatelessAssets(knowledge, truths, assets)
         first_control = scenario.control_names.index(scenario.mission.first_control)
         self._control = np.full(count, first_control)
-        self._previous_control: Index = np.array(-1)  # -1: there is no step before
+        self._previous_control: Index = np.full(count, NO_CONTROL)
+        self._filter = ExactFilter(knowledge.model, knowledge.sensor_model, scenario.mission.name)
         self._log_belief: Float = knowledge.model.log_prior
         self._is_flying = np.ones(count, dtype=bool)
         self._ends_mission = np.array(
@@ -334,23 +313,38 @@ class _Formation:
         )
         self._is_flying &= np.array(self.flights.failure) == ""
         observed_rows[~self._is_flying] = np.nan
-        if self._watch is None:
-            filtered_beliefs = self._filter(step, observed_rows)
-            beliefs = filtered_beliefs.filtered
-            unexplained = np.zeros(len(beliefs))
-        else:
+
+        # The beliefs: under the model and, with notices, averaged over the faults of gauges.
+        checked = None
+        if self._watch is not None:
             checked = self._watch.leave_out_useless_readings(
                 self._watch_state, observed_rows, self._control
             )
-            filtered_beliefs = self._filter(step, checked.rows)
-            watch_state = self._watch_gauges(self._watch, step, checked, filtered_beliefs)
+        used_rows = observed_rows if checked is None else checked.rows
+        model_beliefs, errors = self._filter.step_of_twins(
+            self._log_belief, self._previous_control, used_rows, self._control, step
+        )
+        for twin, error in errors.items():
+            self.flights.failure[twin] = self.flights.failure[twin] or str(error)
+            self._is_flying[twin] = False
+        beliefs = model_beliefs.filtered
+        unexplained = np.zeros(len(beliefs))
+        if self._watch is not None and checked is not None:
+            watch_state = self._watch_gauges(self._watch, step, checked, model_beliefs)
             beliefs = watch_state.mixed.belief
             unexplained = watch_state.weights.free_gains_probability
-        self._store(
-            step,
-            _StepOfTwins(observed_rows, state, beliefs, filtered_beliefs.log_evidence, unexplained),
-        )
-        self._log_belief = filtered_beliefs.log_filtered
+
+        # Store the step of the twins that are still flying.
+        is_flying = self._is_flying
+        flights = self.flights
+        flights.observation_rows[is_flying, step] = observed_rows[is_flying]
+        flights.control_index[is_flying, step] = self._control[is_flying]
+        flights.state[is_flying, step] = state[is_flying]
+        flights.filtered[is_flying, step] = beliefs[is_flying]
+        flights.log_evidence[is_flying, step] = model_beliefs.log_evidence[is_flying]
+        flights.unexplained[is_flying, step] = unexplained[is_flying]
+
+        self._log_belief = model_beliefs.log_filtered
         self._previous_control = self._control
         self._control = self._decide(beliefs, unexplained)
 
@@ -363,42 +357,8 @@ class _Formation:
             self.flights.ended[twin] = early_end_sentence(scenario, step, reason)
             self._is_flying[twin] = False
 
-    def _filter(self, step: int, observed_rows: Float) -> Filtered:
-        """Return the filtered beliefs of a step, and mark twins with an impossible observation.
-
-        Such a twin stops flying, and its error is stored in `flights.failure`.
-        """
-        knowledge = self._knowledge
-        (control,), (likelihood,) = checked_sequence(
-            knowledge.model,
-            self._control,
-            knowledge.sensor_model.log_likelihood_sequence(observed_rows, self._control),
-            what="log-likelihood",
-        )
-        # The filter takes sequences of steps; each twin has a sequence of one.
-        filtered_beliefs, failed_row = filter_many(
-            knowledge.model.transition,
-            control[:, None],
-            likelihood[:, None],
-            self._log_belief,
-            self._previous_control,
-        )
-        only_step = filtered_beliefs[:, 0]
-        is_impossible = failed_row >= 0
-        for twin in np.flatnonzero(is_impossible & self._is_flying).tolist():
-            worst = knowledge.sensor_model.worst_residuals(
-                observed_rows[twin], int(self._control[twin])
-            )
-            name = knowledge.scenario.mission.name
-            self.flights.failure[twin] = str(ImpossibleObservation(name, step, worst))
-        self._is_flying &= ~is_impossible
-        # A failed twin goes on with the prior, which is never stored.
-        only_step.filtered[is_impossible] = knowledge.model.prior
-        only_step.log_filtered[is_impossible] = knowledge.model.log_prior
-        return only_step
-
     def _watch_gauges(
-        self, watch: GaugeWatch, step: int, checked: CheckedReadings, filtered_beliefs: Filtered
+        self, watch: GaugeWatch, step: int, checked: CheckedReadings, model_beliefs: Filtered
     ) -> WatchState:
         """Return the state of the watch after a step, and store its notices in `flights.notices`.
 
@@ -407,31 +367,20 @@ class _Formation:
         InvalidObservationError
             If the belief of a twin is not finite.
         """
-        if self._watch_state is None:
-            state = watch.faults.start(filtered_beliefs.forecast, self._control)
-        else:
-            state = self._watch_state
-            watch.faults.advance(state, self._previous_control, self._control)
-        notices = watch.assimilate(state, checked, filtered_beliefs.filtered, step)
-        if self._watch_state is None:
-            notices = [watch.report_own_likelihood() + of_twin for of_twin in notices]
+        state, notices = watch.step(
+            self._watch_state,
+            checked,
+            model_beliefs.forecast,
+            model_beliefs.filtered,
+            self._previous_control,
+            step,
+        )
         if np.any(self._is_flying & ~state.is_finite(LARGEST_CARRIED)):
             raise unbelievable_observation(self._knowledge.scenario.mission.name, step)
         for twin in np.flatnonzero(self._is_flying).tolist():
             self.flights.notices[twin] += [(step, notice) for notice in notices[twin]]
         self._watch_state = state
         return state
-
-    def _store(self, step: int, step_of_twins: _StepOfTwins) -> None:
-        """Store a step of the twins that are still flying."""
-        is_flying = self._is_flying
-        flights = self.flights
-        flights.observation_rows[is_flying, step] = step_of_twins.observed_rows[is_flying]
-        flights.control_index[is_flying, step] = self._control[is_flying]
-        flights.state[is_flying, step] = step_of_twins.state[is_flying]
-        flights.filtered[is_flying, step] = step_of_twins.filtered[is_flying]
-        flights.log_evidence[is_flying, step] = step_of_twins.log_evidence[is_flying]
-        flights.unexplained[is_flying, step] = step_of_twins.unexplained[is_flying]
 
     def _decide(self, filtered_belief: Float, unexplained: Float) -> Index:
         """Return the next control of each of B twins, within the budget of inspections.
@@ -441,6 +390,9 @@ class _Formation:
         knowledge = self._knowledge
         planner = knowledge.scenario.planner
         policy_on_belief = knowledge.plan.on_belief
+        safest = None
+        if self._watch is not None:
+            safest = np.eye(len(knowledge.model.controls))[knowledge.safest_control]
         probability = decision_probability(
             knowledge.model.transition,
             filtered_belief,
@@ -448,11 +400,9 @@ class _Formation:
             knowledge.plan.policy,
             policy_on_belief,
             ahead=planner.decide_on == "predicted",
+            unexplained=unexplained,
+            safest=safest,
         )
-        if self._watch is not None:
-            safest = np.eye(len(knowledge.model.controls))[knowledge.safest_control]
-            doubt = unexplained[:, None]
-            probability = (1.0 - doubt) * probability + doubt * safest
         control = np.argmax(probability, axis=1)
         if planner.inspections_per_step is not None and policy_on_belief is not None:
             flying = np.flatnonzero(self._is_flying)

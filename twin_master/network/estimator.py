@@ -19,7 +19,13 @@ from reporting.json_file import JsonObject
 from reporting.words import listing
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import filter_sequence, smooth
+from twin_master.network.inference import (
+    NO_CONTROL,
+    Filtered,
+    checked_sequence,
+    filter_many,
+    smooth,
+)
 from twin_master.scenario.schema import Scenario
 
 CarriedArrays = Mapping[str, AnyArray]
@@ -292,25 +298,97 @@ class ExactFilter:
         self, before: Carried | None, observation: Float, control_index: int, step: int
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
-        log_likelihood = self._sensor_model.log_likelihood(observation, control_index)
-        previous_belief = None
+        log_belief = self.model.log_prior
+        previous_control = NO_CONTROL
         if before is not None:
-            previous_belief = (before.arrays["log_filtered"], before.control_index)
-        try:
-            filtered_steps = filter_sequence(
-                self.model, [control_index], log_likelihood[None], previous_belief
-            )
-        except ImpossibleObservation:
-            worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
-            residuals = worst_residuals(observation, control_index) if worst_residuals else None
-            raise ImpossibleObservation(self._name, step, residuals) from None
-        this_step = filtered_steps[0]
-        return Estimate(
-            forecast=this_step.forecast,
-            filtered=this_step.filtered,
-            log_evidence=float(this_step.log_evidence),
-            carried=Carried(control_index, {"log_filtered": this_step.log_filtered}),
+            log_belief = before.arrays["log_filtered"]
+            previous_control = before.control_index
+        beliefs, errors = self.step_of_twins(
+            log_belief, previous_control, np.asarray(observation)[None], [control_index], step
         )
+        for error in errors.values():
+            raise error
+        belief = beliefs[0]
+        return Estimate(
+            forecast=belief.forecast,
+            filtered=belief.filtered,
+            log_evidence=float(belief.log_evidence),
+            carried=Carried(control_index, {"log_filtered": belief.log_filtered}),
+        )
+
+    def step_of_twins(
+        self,
+        log_before: Float,
+        control_before: ArrayLike,
+        observations: Float,
+        control_index: ArrayLike,
+        step: int,
+    ) -> tuple[Filtered, dict[int, ImpossibleObservation]]:
+        """Advance the beliefs of B twins to step t, and correct each by its own observation.
+
+        The belief of a twin does not depend on the other twins, not even in the last bit.
+
+        Parameters
+        ----------
+        log_before : (B, S) or (S,) array
+            The log beliefs in step t - 1; the log prior if this is the first step.
+        control_before : int or (B,) array
+            The controls in force in step t - 1; `NO_CONTROL` if this is the first step.
+        observations : (B, G) array
+            The sensor values, SI; NaN where a sensor is lost.
+        control_index : (B,) array
+            The controls in force in step t.
+        step : int
+            The number t of the step, for messages.
+
+        Returns
+        -------
+        beliefs : Filtered
+            The beliefs, with the leading axis B.
+        errors : dict of int to ImpossibleObservation
+            The error of each twin whose observation is impossible, by its number. Such a twin has
+            the prior as its belief.
+
+        Raises
+        ------
+        InvalidObservationError, InvalidModelError
+            If an observation has another shape, is infinite or cannot be weighed, or if there is no
+            such control.
+        """
+        (controls,), (log_likelihood,) = checked_sequence(
+            self.model,
+            control_index,
+            self._log_likelihood(observations, control_index),
+            what="log-likelihood",
+        )
+        # The filter takes sequences of steps; each twin has a sequence of one.
+        sequences, failed_step = filter_many(
+            self.model.transition,
+            controls[:, None],
+            log_likelihood[:, None],
+            log_before,
+            control_before,
+        )
+        beliefs = sequences[:, 0]
+        errors = {}
+        for twin in np.flatnonzero(failed_step >= 0).tolist():
+            worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
+            residuals = None
+            if worst_residuals is not None:
+                residuals = worst_residuals(observations[twin], int(controls[twin]))
+            errors[twin] = ImpossibleObservation(self._name, step, residuals)
+            beliefs.filtered[twin] = self.model.prior
+            beliefs.log_filtered[twin] = self.model.log_prior
+        return beliefs, errors
+
+    def _log_likelihood(self, observations: Float, control_index: ArrayLike) -> Float:
+        """Return log p(o | D, u) of each twin's observation (B, G) for each state: (B, S)."""
+        of_sequence = getattr(self._sensor_model, "log_likelihood_sequence", None)
+        if of_sequence is not None:
+            return np.asarray(of_sequence(observations, control_index))
+        controls = np.asarray(control_index).tolist()
+        pairs = zip(observations, controls, strict=True)
+        return np.stack([self._sensor_model.log_likelihood(row, u) for row, u in pairs])
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""

@@ -21,7 +21,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass
 from twin_master.network.transition import TransitionModel, check_shape, checked_controls
 
-_NO_CONTROL = -1
+NO_CONTROL = -1
 """The control before the first step: the belief before it is the prior, without a transition."""
 
 
@@ -129,7 +129,7 @@ def filter_many(
     control: Index,
     log_likelihood: Float,
     log_before: Float,
-    control_before: ArrayLike = _NO_CONTROL,
+    control_before: ArrayLike = NO_CONTROL,
 ) -> tuple[Filtered, Index]:
     """Filter the observations of B twins over T steps; the arguments are not checked.
 
@@ -237,7 +237,7 @@ def filter_sequence(
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
     control, rows = checked_sequence(model, control_index, log_likelihood, what="log-likelihood")
-    log_before, control_before = before or (model.log_prior, _NO_CONTROL)
+    log_before, control_before = before or (model.log_prior, NO_CONTROL)
     filtered_steps, failed = filter_many(
         model.transition, control, rows, log_before, control_before
     )

@@ -151,6 +151,8 @@ def decision_probability(
     on_belief: BeliefPolicy | None = None,
     *,
     ahead: bool = False,
+    unexplained: Float | None = None,
+    safest: Float | None = None,
 ) -> Float:
     """Return the probability of each next control of B twins: (B, U).
 
@@ -170,6 +172,10 @@ def decision_probability(
         A policy that takes the place of `policy`; it decides by p(D_{t+1} | o_0..o_t).
     ahead : bool
         Whether `policy` is averaged over p(D_{t+1} | o_0..o_t) instead of `filtered_belief`.
+    unexplained : (B,) array, optional
+        The probability that no state explains the sensors, with which the safest control is taken.
+    safest : (U,) array, optional
+        One for the safest control, zero for the others; only the policy decides if left out.
     """
     belief = filtered_belief
     if ahead or on_belief is not None:
@@ -178,8 +184,13 @@ def decision_probability(
     if on_belief is not None:
         # The policy is deterministic: its control has the probability one.
         # A twin whose flight has failed has no belief, and its control is not used.
-        return np.eye(policy.shape[1])[on_belief.decide(np.nan_to_num(belief))]
-    return product_of_each(belief, policy)
+        probability = np.eye(policy.shape[1])[on_belief.decide(np.nan_to_num(belief))]
+    else:
+        probability = product_of_each(belief, policy)
+    if unexplained is None or safest is None:
+        return probability
+    doubt = unexplained[:, None]
+    return (1.0 - doubt) * probability + doubt * safest
 
 
 def ration_controls(

@@ -485,10 +485,9 @@ class Twin:
         prediction = predict(
             self.model, estimate.filtered, control_index, self.policy, self.prediction_steps
         )
-        probability = self._control_probability(estimate.filtered, control_index)
+        unexplained = estimate.unexplained
+        probability = self._control_probability(estimate.filtered, control_index, unexplained)
         if self._safest is not None:
-            unexplained = estimate.unexplained
-            probability = (1.0 - unexplained) * probability + unexplained * self._safest
             prediction = prediction.mix_control(unexplained, self._safest)
         self._proposed = int(np.argmax(probability))
         return TwinStep(
@@ -528,7 +527,9 @@ class Twin:
         decided_by = max(contribution, key=contribution.__getitem__)
         return replace(estimate.suspicion, decided_by=decided_by)
 
-    def _control_probability(self, belief: Float, control_index: int) -> Float:
+    def _control_probability(
+        self, belief: Float, control_index: int, unexplained: float | None = None
+    ) -> Float:
         """Return the probability of each next control (U,) by the belief (S,) of this step."""
         probability = decision_probability(
             self.model.transition,
@@ -537,6 +538,8 @@ class Twin:
             self.policy,
             self._on_belief,
             ahead=self.decide_on == "predicted",
+            unexplained=None if unexplained is None else np.array([unexplained]),
+            safest=self._safest,
         )
         return np.asarray(probability[0])
 
