@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.measurement import Measurement, least_seconds_of
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import Binding, load_binding
-from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.asset import CoupledAsset
@@ -89,7 +89,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
     The FMUs alone have the bindings and inputs that they have in the system, and nothing passes
     between them.
     """
-    parts = stepped_components(wiring, Exchange(system_description(wiring), binding))
+    parts = stepped_components(wiring, Blocks(system_description(wiring), binding))
     loads = itertools.cycle((2.0, 3.0))
     assets, inputs = [], []
     with CoupledAsset(wiring, binding, isolated=False) as coupled:

@@ -7,9 +7,8 @@ import numpy as np
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.client.binding import INPUT_ROLES, Binding
+from fmu_asset.client.bound_fmu import BoundFmu, VariableElements
 from fmu_asset.client.bound_variables import InputBinding
-from fmu_asset.client.layout import VariableElements
-from fmu_asset.client.resolver import BindingResolver
 from fmu_asset.client.saved_state import partial_state_sentence
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.values import Value
@@ -155,12 +154,10 @@ class RunChecks:
 
     def _find_input(self, role: str, name: str, input_binding: InputBinding) -> VariableElements:
         """Return the FMU's variable that an input of the binding names."""
-        resolver = BindingResolver(self._description, self._binding)
+        fmu = BoundFmu(self._description, self._binding)
         variable = input_binding.variable
-        is_start_health = role == "health" and resolver.is_set_at_start(variable)
-        return resolver.find(
-            variable, f"{role}.{name}", "parameter" if is_start_health else "input"
-        )
+        is_start_health = role == "health" and fmu.is_set_at_start(variable)
+        return fmu.find(variable, f"{role}.{name}", "parameter" if is_start_health else "input")
 
     def _run(self) -> Float:
         """Return the n outputs in each of N steps of a run, (N, n), in a new worker."""

@@ -11,8 +11,8 @@ from fmu_asset.description import rendered
 from fmu_asset.errors import BindingError
 
 from .binding import parse_binding
+from .blocks import Blocks
 from .bound_variables import PORT_QUANTITIES
-from .exchange import Exchange
 from .units import same_dimension
 
 _HEALTH = re.compile(
@@ -94,7 +94,7 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     ).decode()
     text = text.rstrip() + "\n"
     # fails if the draft does not fit the FMU
-    Exchange(description, parse_binding(tomllib.loads(text), where="the draft"))
+    Blocks(description, parse_binding(tomllib.loads(text), where="the draft"))
     return text
 
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from reporting.arrays import Float
 
-from .exchange import Exchange
-from .slots import InputSlot
+from .blocks import Blocks, step_count
+from .bound_input import BoundInput
 from .values import InputsByRole
 
 
@@ -45,8 +45,8 @@ class _CheckedHistory(NamedTuple):
         The role and the name in the binding.
     values : array_like
         The values as the caller gave them.
-    slot : InputSlot
-        The place of the input in the request block.
+    bound_input : BoundInput
+        The input, with its positions in the request.
     numbers : (n,) or (N, n) ndarray
         The checked values in the FMU's unit.
     is_at_start : bool
@@ -56,7 +56,7 @@ class _CheckedHistory(NamedTuple):
     role: str
     name: str
     values: npt.ArrayLike
-    slot: InputSlot
+    bound_input: BoundInput
     numbers: Float
     is_at_start: bool
 
@@ -78,7 +78,7 @@ class _CheckedHistory(NamedTuple):
 
 
 def split_where_health_changes(
-    exchange: Exchange, inputs: InputsByRole, steps: int | None
+    blocks: Blocks, inputs: InputsByRole, steps: int | None
 ) -> list[ConstantHealthRun]:
     """Split histories of inputs into runs of constant health.
 
@@ -87,8 +87,8 @@ def split_where_health_changes(
 
     Parameters
     ----------
-    exchange : Exchange
-        The binding, resolved against the FMU.
+    blocks : Blocks
+        What is exchanged with the FMU.
     inputs : mapping of str to mapping
         Inputs by role and name: one value for all steps, or one for each.
     steps : int, optional
@@ -101,11 +101,11 @@ def split_where_health_changes(
     FmuInputError
         If a value is wrong, or the histories have different lengths.
     """
-    histories = _checked_histories(exchange, inputs)
-    step_count = exchange.step_count([(entry.slot, entry.numbers) for entry in histories], steps)
-    first_steps = _first_steps(histories, step_count)
+    histories = _checked_histories(blocks, inputs)
+    count = step_count([(entry.bound_input, entry.numbers) for entry in histories], steps)
+    first_steps = _first_steps(histories, count)
     runs = []
-    for begin, end in zip(first_steps, [*first_steps[1:], step_count], strict=True):
+    for begin, end in zip(first_steps, [*first_steps[1:], count], strict=True):
         first_inputs: dict[str, dict[str, npt.ArrayLike]] = {}
         step_histories: dict[str, dict[str, npt.ArrayLike]] = {}
         for history in histories:
@@ -116,16 +116,16 @@ def split_where_health_changes(
     return runs
 
 
-def _checked_histories(exchange: Exchange, inputs: InputsByRole) -> list[_CheckedHistory]:
+def _checked_histories(blocks: Blocks, inputs: InputsByRole) -> list[_CheckedHistory]:
     """Return the histories of all inputs, with their values checked and converted."""
     histories = []
     for role, by_name in inputs.items():
         table: Mapping[str, npt.ArrayLike] = by_name or {}
         for name, values in table.items():
-            slot = exchange.slot(role, name)
-            numbers = slot.numbers(values, history=True)
-            is_at_start = role == "health" and name in exchange.health_slots
-            histories.append(_CheckedHistory(role, name, values, slot, numbers, is_at_start))
+            bound_input = blocks.bound_input(role, name)
+            numbers = bound_input.numbers(values, history=True)
+            is_at_start = role == "health" and name in blocks.health_at_start
+            histories.append(_CheckedHistory(role, name, values, bound_input, numbers, is_at_start))
     return histories
 
 
@@ -142,7 +142,7 @@ def _first_steps(histories: list[_CheckedHistory], count: int) -> list[int]:
     health_columns = []
     for history in histories:
         if history.is_at_start:
-            width = len(history.slot.positions)
+            width = len(history.bound_input.positions)
             health_columns.append(
                 np.broadcast_to(history.numbers.reshape(-1, width), (count, width))
             )

@@ -9,10 +9,9 @@ from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.instances.plan import InitialValue, InitialValues
 from reporting.words import comma_list
 
+from .bound_fmu import BoundFmu, Misfits, start_values
+from .bound_input import BoundInput
 from .bound_variables import InputBinding
-from .layout import start_values
-from .resolver import BindingResolver
-from .slots import InputSlot
 from .values import InputsByRole
 
 
@@ -21,36 +20,35 @@ class InitialValueTable:
 
     Parameters
     ----------
-    resolver : BindingResolver
-        The binding and the FMU.
+    fmu : BoundFmu
+        The FMU and its binding.
+    misfits : Misfits
+        Collects the parameters that do not fit.
 
     Attributes
     ----------
-    health_slots : dict of str to InputSlot
+    health : dict of str to BoundInput
         Health that is a parameter or start value of the FMU, by the binding's names.
-
-    Raises
-    ------
-    BindingError
-        If a parameter does not fit the FMU.
     """
 
-    def __init__(self, resolver: BindingResolver) -> None:
-        self._resolver = resolver
-        self.health_slots: dict[str, InputSlot] = {}
-        for name, input_binding in resolver.binding.health.items():
-            if resolver.is_set_at_start(input_binding.variable):
-                self.health_slots[name] = resolver.start_slot(f"health.{name}", input_binding)
+    def __init__(self, fmu: BoundFmu, misfits: Misfits) -> None:
+        self._fmu = fmu
+        self.health: dict[str, BoundInput] = {}
+        for name, entry in fmu.binding.health.items():
+            if fmu.is_set_at_start(entry.variable):
+                label = f"health.{name}"
+                with misfits.at(label):
+                    self.health[name] = fmu.start_input(label, entry)
         self._text_parameters: dict[str, VariableInfo] = {}
-        self._parameter_slots: dict[str, InputSlot] = {}
-        for name, input_binding in resolver.binding.parameter.items():
-            variable = resolver.description.variable(input_binding.variable)
+        self._parameters: dict[str, BoundInput] = {}
+        for name, parameter in fmu.binding.parameter.items():
+            variable = fmu.description.variable(parameter.variable)
             if variable is not None and variable.is_text_parameter:
                 self._text_parameters[name] = variable
-            else:
-                self._parameter_slots[name] = resolver.start_slot(
-                    f"parameter.{name}", input_binding
-                )
+                continue
+            label = f"parameter.{name}"
+            with misfits.at(label):
+                self._parameters[name] = fmu.start_input(label, parameter)
 
     def split_inputs(
         self, inputs: InputsByRole
@@ -64,16 +62,14 @@ class InitialValueTable:
 
         Returns
         -------
-        sent_health : dict of str to mapping or None
+        sent_inputs : dict of str to mapping or None
             The same without health that is set at a start.
         health : mapping of str to float
             That health.
         """
         health = inputs.get("health") or {}
-        at_start = {name: value for name, value in health.items() if name in self.health_slots}
-        sent_health = {
-            name: value for name, value in health.items() if name not in self.health_slots
-        }
+        at_start = {name: value for name, value in health.items() if name in self.health}
+        sent_health = {name: value for name, value in health.items() if name not in self.health}
         return {**inputs, "health": sent_health}, at_start
 
     def initial_values(
@@ -99,40 +95,42 @@ class InitialValueTable:
             If a value is not finite or outside its range.
         """
         texts: InitialValues = []
-        slots_and_values: list[tuple[InputSlot, npt.ArrayLike]] = []
+        inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]] = []
         for name, value in {**self._values_of_binding(), **parameters}.items():
             text_parameter = self._text_parameter(name)
             if text_parameter is None:
-                slots_and_values.append((self._parameter_slot(name), value))
+                inputs_and_values.append((self._parameter(name), value))
             elif isinstance(value, str):
                 texts.append(InitialValue("String", text_parameter.reference, [value]))
             else:
                 raise FmuInputError(f"parameter.{name} must be a text, but is {value!r}.")
         for name, value in (health or {}).items():
-            slots_and_values.append((self.health_slots[name], value))
-        return [*self._numbers(slots_and_values), *texts]
+            inputs_and_values.append((self.health[name], value))
+        return [*self._numbers(inputs_and_values), *texts]
 
     def _values_of_binding(self) -> dict[str, float | str]:
         """Return the parameters that have a value in the binding."""
-        entries = self._resolver.binding.parameter.items()
+        entries = self._fmu.binding.parameter.items()
         return {name: entry.value for name, entry in entries if entry.value is not None}
 
     def _numbers(
-        self, slots_and_values: list[tuple[InputSlot, npt.ArrayLike]]
+        self, inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]]
     ) -> list[InitialValue]:
-        """Return the values of numeric variables; several slots may be elements of one array."""
+        """Return the values of numeric variables; several inputs may be elements of one array."""
         numbers_by_variable: dict[str, list[float]] = {}
         variables: dict[str, VariableInfo] = {}
-        description = self._resolver.description
-        for slot, value in slots_and_values:
-            variable = slot.variable
+        description = self._fmu.description
+        for bound_input, value in inputs_and_values:
+            variable = bound_input.variable
             if variable.name not in variables:
                 variables[variable.name] = variable
-                sets_all = len(slot.positions) == variable.size
+                sets_all = len(bound_input.positions) == variable.size
                 start = start_values(description, variable, placeholders=sets_all)
                 numbers_by_variable[variable.name] = start
             numbers = numbers_by_variable[variable.name]
-            for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
+            for position, number in zip(
+                bound_input.positions, bound_input.numbers(value).tolist(), strict=True
+            ):
                 numbers[position] = number
         initial_values = []
         for name, variable in variables.items():
@@ -143,26 +141,26 @@ class InitialValueTable:
 
     # ------------------------------------------------------------------ names
 
-    def _parameter_slot(self, name: str) -> InputSlot:
-        """Return the slot of a numeric parameter, named as in the binding or as in the FMU."""
-        if name in self._parameter_slots:
-            return self._parameter_slots[name]
-        resolver = self._resolver
-        variable = resolver.description.variable(name)
-        bound_variables = {slot.variable.name for slot in self._parameter_slots.values()}
+    def _parameter(self, name: str) -> BoundInput:
+        """Return a numeric parameter, named as in the binding or as in the FMU."""
+        if name in self._parameters:
+            return self._parameters[name]
+        fmu = self._fmu
+        variable = fmu.description.variable(name)
+        bound_variables = {bound_input.variable.name for bound_input in self._parameters.values()}
         if variable is None or variable.causality != "parameter" or name in bound_variables:
             raise BindingError(
-                f"The binding {resolver.binding.name} has no parameter {name!r}; it has "
-                f"{comma_list(resolver.binding.parameter)}."
+                f"The binding {fmu.binding.name} has no parameter {name!r}; it has "
+                f"{comma_list(fmu.binding.parameter)}."
             )
         input_binding = InputBinding(variable=name, unit=variable.unit or "1")
-        return resolver.start_slot(f"parameter.{name}", input_binding)
+        return fmu.start_input(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
         """Return the text parameter that the binding or the FMU has by a name; None without one."""
-        if name in self._text_parameters or name in self._parameter_slots:
+        if name in self._text_parameters or name in self._parameters:
             return self._text_parameters.get(name)
-        variable = self._resolver.description.variable(name)
+        variable = self._fmu.description.variable(name)
         if variable is None or not variable.is_text_parameter:
             return None
         bound_variables = {parameter.name for parameter in self._text_parameters.values()}

@@ -1,10 +1,12 @@
-"""The life of an FMU's instance: the extracted files, the worker process, and starts anew."""
+"""The instance of an asset: extracted files, worker process, starts anew, steps and log."""
 
 import weakref
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -14,8 +16,9 @@ from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.base import FmuInstance
 from fmu_asset.instances.opening import open_instance
-from fmu_asset.instances.plan import Instance, Plan
+from fmu_asset.instances.plan import Instance, Plan, values_of
 from fmu_asset.instances.python_modules import forget_modules
+from fmu_asset.instances.statuses import status_name
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 from reporting.arrays import Float
@@ -28,6 +31,71 @@ from .reset_trial import FirstStep, InstanceStart, ResetTrial, RestartMethod
 
 _logger = module_logger(__name__)
 _logged_warnings: set[str] = set()
+_LOG_LENGTH = 200
+_BLOCK_BYTES = 2**20
+"""Largest size of the requests, or replies, that are sent to a worker in one message."""
+
+
+class Host(Protocol):
+    """What runs for an asset: one FMU whose instance may be replaced, or several that are coupled.
+
+    Attributes
+    ----------
+    reset_trial : ResetTrial
+        The knowledge about restarts of the FMU.
+    """
+
+    reset_trial: ResetTrial
+
+    @property
+    def request(self) -> "memoryview[float]":
+        """Time, step size and inputs of the next step, as doubles that can be set."""
+
+    @property
+    def reply(self) -> Float:
+        """The outputs (n_outputs,) after the last step."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether it must be started again before it can be used."""
+
+    @property
+    def log(self) -> tuple[tuple[str, str], ...]:
+        """Status and text of the last messages, the oldest first."""
+
+    @property
+    def worker(self) -> WorkerInstance | None:
+        """The worker process, if there is one."""
+
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
+        """Bring it to a start; `renewed` says that `renew` was called just before."""
+
+    def renew(self) -> None:
+        """Replace what runs by something new in the same process, before a start."""
+
+    def sibling(self) -> Self:
+        """Return an independent host of the same extracted FMU."""
+
+    def close(self) -> None:
+        """End the worker and remove files that no other asset uses."""
+
+    def step(self) -> None:
+        """Make the step that the request describes."""
+
+    def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
+        """Make many steps; stop after one whose outputs are not finite. See `Instance.run`."""
+
+    def read(self) -> None:
+        """Read the outputs of this moment into the reply."""
+
+    def save(self) -> bytes:
+        """Return the serialised state."""
+
+    def restore(self, content: bytes) -> None:
+        """Go back to a serialised state."""
+
+    def note_errors(self, messages: Iterable[str]) -> None:
+        """Add messages of an error to the log."""
 
 
 class ExtractedFmu:
@@ -58,7 +126,10 @@ class ExtractedFmu:
 
 
 class InstanceHost:
-    """The owner of an asset's only instance, which makes, restarts and frees it.
+    """The owner of an asset's only instance, which makes, restarts, steps and frees it.
+
+    If the first step after a restart shows that the restart did not work, the instance is replaced
+    and the step repeated. So the instance may change in each method.
 
     Parameters
     ----------
@@ -76,9 +147,16 @@ class InstanceHost:
     ----------
     instance : FmuInstance, WorkerInstance or None
         The instance, if there is one.
+    request : memoryview of float
+        The request of this instance: time, step size, inputs.
+    reply : (n_outputs,) ndarray
+        Its reply.
     reset_trial : ResetTrial
         The knowledge about restarts of the FMU.
     """
+
+    request: "memoryview[float]"
+    reply: Float
 
     def __init__(
         self, description: FmuDescription, plan: Plan, limits: WorkerLimits, *, isolated: bool
@@ -95,19 +173,49 @@ class InstanceHost:
         self.reset_trial = ResetTrial(comparable=can_make_another)
         self._method = RestartMethod.LOADING
         self._start: InstanceStart | None = None
+        self._is_at_start = False
+        self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
-    def sibling(self) -> "InstanceHost":
+    def sibling(self) -> Self:
         """Return a host of another instance of the same extracted FMU.
 
         The folder of the FMU is kept until all siblings are closed or garbage-collected.
         """
-        sibling = InstanceHost(self._description, self._plan, self._limits, isolated=self._isolated)
+        host = type(self)
+        sibling = host(self._description, self._plan, self._limits, isolated=self._isolated)
         sibling._extracted = self._extracted
         sibling.reset_trial = self.reset_trial
         return sibling
 
-    def start(self, start: InstanceStart, *, renewed: bool = False) -> Instance:
-        """Return the instance, initialised at its start; a lost one is replaced.
+    # ------------------------------------------------------------------ properties
+
+    @property
+    def lost(self) -> bool:
+        """Whether there is no instance that can be used."""
+        return self.instance is None or self.instance.lost
+
+    @property
+    def worker(self) -> WorkerInstance | None:
+        """The instance if it runs in a worker process that is not lost, else None."""
+        instance = self.instance
+        return instance if isinstance(instance, WorkerInstance) and not instance.lost else None
+
+    @property
+    def log(self) -> tuple[tuple[str, str], ...]:
+        """Status and text of the last messages of the FMU, the oldest first."""
+        if self.instance is not None and not self.instance.lost:
+            for status, text in self.instance.take_log():
+                self._log.append((status_name(status), text))
+        return tuple(self._log)
+
+    def note_errors(self, messages: Iterable[str]) -> None:
+        """Add messages of an error to the log."""
+        self._log.extend(("Error", message) for message in messages)
+
+    # ------------------------------------------------------------------ starts
+
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
+        """Bring the instance to a start; a lost one is replaced.
 
         Parameters
         ----------
@@ -131,25 +239,122 @@ class InstanceHost:
             instance = self._restarted_instance()
         self._start = start
         start.initialise(instance)
-        return instance
+        self._is_at_start = True
+        self.request = memoryview(instance.request).cast("B").cast("d")
+        self.reply = values_of(instance.reply)
 
-    def replace_if_contradicted(self, request: bytes, reply: Float) -> Instance | None:
-        """Return a new instance if the first step proves that the restart of this one did not work.
+    def renew(self) -> None:
+        """Replace the instance by a new one in the same process.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        self._renewed_instance()
+
+    def _renewed_instance(self) -> Instance:
+        """Free the instance and return a new one in the same process."""
+        worker = self.worker
+        if worker is None:
+            return self._make_instance()
+        worker.renew()
+        return worker
+
+    def close(self) -> None:
+        """Free the instance, end the worker and remove files that no other asset uses."""
+        self.instance = None
+        self._extracted = None
+        self._release()
+
+    # ------------------------------------------------------------------ steps
+
+    def step(self) -> None:
+        """Make the step that the request describes, again if the last restart did not work."""
+        assert self.instance is not None
+        self.instance.step()
+        if self._is_at_start:
+            self._is_at_start = False
+            request = self.request.tobytes()
+            while self._replaced_if_contradicted(request, self.reply):
+                self.instance.step()
+
+    def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
+        """Make many steps, in blocks that limit the memory of a call to the worker.
+
+        It stops after a step whose outputs are not all finite. See `Instance.run`.
+        """
+        length = max(1, _BLOCK_BYTES // max(requests[0].nbytes, replies[0].nbytes))
+        for first in range(0, len(requests), length):
+            block = slice(first, first + length)
+            steps_made = self._run_block(requests[block], replies[block], report, first)
+            if steps_made < len(requests[block]):
+                return
+
+    def _run_block(
+        self, requests: Float, replies: Float, report: Callable[[int], object], first: int
+    ) -> int:
+        """Make a block of steps, of which the first one has a given number; return how many."""
+        assert self.instance is not None
+        is_at_start = self._is_at_start
+        self._is_at_start = False
+        steps_made = 0
+
+        def count_and_report(count: int) -> None:
+            nonlocal steps_made
+            steps_made = count
+            report(first + count)
+
+        while True:
+            failure: FmuError | None = None
+            try:
+                self.instance.run(requests, replies, count_and_report)
+            except FmuError as error:
+                failure = error
+            can_be_compared = is_at_start and steps_made > 0
+            if can_be_compared and self._replaced_if_contradicted(
+                requests[0].tobytes(), replies[0]
+            ):
+                count_and_report(0)
+                continue
+            if failure is not None:
+                raise failure
+            return steps_made
+
+    def read(self) -> None:
+        """Read the outputs of this moment into the reply."""
+        assert self.instance is not None
+        self.instance.read()
+
+    def save(self) -> bytes:
+        """Return the serialised state of the instance."""
+        assert self.instance is not None
+        return self.instance.save()
+
+    def restore(self, content: bytes) -> None:
+        """Bring the instance to a serialised state."""
+        assert self.instance is not None
+        self._is_at_start = False
+        self.instance.restore(content)
+
+    def _replaced_if_contradicted(self, request: bytes, reply: Float) -> bool:
+        """Replace the instance if its first step proves that its restart did not work.
 
         A restart has worked if the same start and the same first step give the same outputs as in
-        the first instance, whose first step is recorded here.
+        the first instance, whose first step is recorded here. The new instance stands before the
+        step, which is in its request.
 
         Parameters
         ----------
         request : bytes
-            The request block of the first step after a start.
-        reply : (n,) ndarray
+            The request of the first step after a start.
+        reply : (n_outputs,) ndarray
             The outputs after it.
 
         Returns
         -------
-        Instance or None
-            None if the restart worked, or if nothing can be compared.
+        bool
+            Whether there is a new instance, so that the step must be repeated.
 
         Raises
         ------
@@ -159,35 +364,19 @@ class InstanceHost:
         trial = self.reset_trial
         start = self._start
         if start is None or not trial.comparable:
-            return None
+            return False
         first_step = trial.first_step
         if first_step is None:
             trial.first_step = FirstStep(start, request, np.array(reply))
-            return None
+            return False
         if start != first_step.start or request != first_step.request:
-            return None
+            return False
         if trial.accepts(self._description.label, self._method, first_step, reply):
-            return None
-        return self.start(start)
-
-    def renew(self) -> Instance:
-        """Free the instance and return a new one in the same process.
-
-        Raises
-        ------
-        FmuError
-            If the FMU fails.
-        """
-        if isinstance(self.instance, WorkerInstance) and not self.instance.lost:
-            self.instance.renew()
-            return self.instance
-        return self._make_instance()
-
-    def close(self) -> None:
-        """Free the instance, end the worker and remove files that no other asset uses."""
-        self.instance = None
-        self._extracted = None
-        self._release()
+            return False
+        self.start(start)
+        self._is_at_start = False
+        self.request.cast("B")[:] = request
+        return True
 
     # ------------------------------------------------------------------ restarts
 
@@ -201,7 +390,7 @@ class InstanceHost:
             (RestartMethod.RESET, self._reset_instance)
         ]
         if self._isolated and not self._description.once_per_process:
-            methods.append((RestartMethod.RENEWAL, self.renew))
+            methods.append((RestartMethod.RENEWAL, self._renewed_instance))
         for method, restart in methods:
             self._method = method
             if not self._is_worth_trying(method):

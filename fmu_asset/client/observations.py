@@ -8,8 +8,6 @@ import numpy as np
 
 from reporting.arrays import Float
 
-from .units import IDENTITY, Conversion
-
 
 class Observation(NamedTuple):
     """Outputs after one communication step.
@@ -63,78 +61,3 @@ def joined_histories(parts: Sequence[ObservationHistory]) -> ObservationHistory:
         extra=extra_histories,
         ended=parts[-1].ended,
     )
-
-
-class OutputTable:
-    """The outputs that are read from a reply block: first the observations, then the extras.
-
-    Parameters
-    ----------
-    observation_count : int
-        Number of observations.
-    extra_names : sequence of str
-        Names of the extras.
-    positions : sequence of int
-        Position of each output in the block.
-    conversions : sequence of Conversion
-        Conversion of each output from the binding's unit to the FMU's.
-    """
-
-    def __init__(
-        self,
-        observation_count: int,
-        extra_names: Sequence[str],
-        positions: Sequence[int],
-        conversions: Sequence[Conversion],
-    ) -> None:
-        self._observation_count = observation_count
-        self._extra_names = tuple(extra_names)
-        self._index = _slice_or_index(positions)
-        self._needs_conversion = any(entry != IDENTITY for entry in conversions)
-        self._factors = np.array([entry.factor for entry in conversions], dtype=np.float64)
-        self._offsets = np.array([entry.offset for entry in conversions], dtype=np.float64)
-
-    def _converted(self, values: Float) -> Float:
-        """Return values in the binding's units; always a copy."""
-        if not self._needs_conversion:
-            return values.copy()
-        converted: Float = (values - self._offsets) / self._factors
-        return converted
-
-    def observation(self, block: Float, time: float) -> Observation:
-        """Return the observation in a reply block (n_outputs,) at a time [s]."""
-        values = self._converted(block[self._index])
-        extra_values = values[self._observation_count :].tolist()
-        # The lengths are equal by construction; checking them would double the time of this line.
-        extra_outputs = dict(zip(self._extra_names, extra_values))  # noqa: B905
-        return Observation(values[: self._observation_count], time, extra_outputs)
-
-    def history(self, time: Float, blocks: Float, ended: str = "") -> ObservationHistory:
-        """Return the history in reply blocks.
-
-        Parameters
-        ----------
-        time : (N,) ndarray
-            Time of each block [s].
-        blocks : (N, n_outputs) ndarray
-            The blocks.
-        ended : str
-            How the FMU ended the simulation by itself, if it did.
-        """
-        values = self._converted(blocks[:, self._index])
-        observed_values = np.ascontiguousarray(values[:, : self._observation_count])
-        extra_values = np.ascontiguousarray(values[:, self._observation_count :].T)
-        extra_histories = dict(zip(self._extra_names, extra_values, strict=True))
-        return ObservationHistory(time, observed_values, extra_histories, ended)
-
-
-def _slice_or_index(
-    positions: Sequence[int],
-) -> "slice | np.ndarray[tuple[int], np.dtype[np.intp]]":
-    """Return positions as a slice if they follow one another, which is faster, else as an array."""
-    index = np.array(positions, dtype=np.intp)
-    begin = int(index[0]) if len(index) else 0
-    end = begin + len(index)
-    if np.array_equal(index, np.arange(begin, end)):
-        return slice(begin, end)
-    return index

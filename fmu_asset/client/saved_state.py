@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -66,6 +67,28 @@ class PackedState(BaseModel):
         return state.model_copy(update={"body": content[begin_of_body:]})
 
 
+@dataclass(frozen=True)
+class AssetStart:
+    """How an asset was started.
+
+    Attributes
+    ----------
+    parameters : dict of str to float, str or list
+        Parameters by the binding's names.
+    health : dict of str to float or list
+        Health that was set before the initialisation.
+    index : int
+        Number of steps before the start.
+    inputs : bytes
+        Inputs during the initialisation, as doubles; empty if there were none.
+    """
+
+    parameters: dict[str, PlainValue]
+    health: dict[str, PlainValue]
+    index: int
+    inputs: bytes
+
+
 class SavedState(PackedState):
     """A saved state of one FMU.
 
@@ -111,9 +134,26 @@ class SavedState(PackedState):
     outputs: bytes
 
     @property
+    def start(self) -> AssetStart:
+        """The last start before the state."""
+        return AssetStart(self.parameters, self.health, self.first_index, self.start_inputs)
+
+    @property
     def steps_since_start(self) -> int:
         """Number of steps since the last start."""
         return self.index - self.first_index
+
+    def is_sound(self, method: StateMethod, bytes_of_inputs: int) -> bool:
+        """Return whether the lengths fit each other and an asset of so many bytes of inputs."""
+        return (
+            self.method == method
+            and len(self.inputs) == bytes_of_inputs
+            and len(self.start_inputs) in (0, bytes_of_inputs)
+            and self.first_index <= self.index
+            and not (
+                method == "replay" and len(self.body) != bytes_of_inputs * self.steps_since_start
+            )
+        )
 
     def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
         """Refuse a restored FMU whose outputs differ from those at the time of saving.

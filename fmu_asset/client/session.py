@@ -1,22 +1,36 @@
 """`FmiAsset`: the one client of any FMU. It knows FMI and roles of variables, not wings."""
 
-from typing import Self
+import os
+from array import array
+from copy import copy
+from typing import Self, Unpack
 
 import numpy as np
 
-from fmu_asset.errors import FmuError, FmuStateError
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.errors import FmuError
+from reporting.progress import Progress, reporter
 
-from .opened_fmu import HEAD_BYTES
-from .saved_state import SavedState
-from .stepped_fmu import SteppedFmu
-
-_REPLAY_INSTEAD = (
-    'If it cannot save and restore its state, though it declares so, write `state = "replay"` into '
-    "[binding] of its binding."
+from .binding import Binding, load_binding
+from .blocks import HEAD_BYTES, Blocks
+from .health_at_start import split_where_health_changes
+from .instance_host import Host, InstanceHost, worker_limits
+from .observations import Observation, ObservationHistory, joined_histories
+from .running_fmu import RunningFmu
+from .saved_state import AssetStart, SavedState
+from .values import (
+    Histories,
+    Inputs,
+    InputsByRole,
+    PlainValue,
+    Values,
+    inputs_by_role,
+    plain_values,
 )
 
 
-class FmiAsset(SteppedFmu):
+class FmiAsset:
     """An FMU that is simulated step by step through a binding.
 
     The FMU runs in a worker process of its own unless `isolated` is False: only the worker provides
@@ -47,8 +61,6 @@ class FmiAsset(SteppedFmu):
         Declarations of the FMU.
     binding : Binding
         The binding, with arrays that are observed or recorded as their elements.
-    step_index : int
-        Number of steps since the last reset.
     state_method : {"serialised", "replay"}
         How `save_state` keeps the state: serialised by the FMU, or as the inputs of all steps.
     reset_trial : ResetTrial
@@ -67,6 +79,466 @@ class FmiAsset(SteppedFmu):
         If a parameter lies outside its range.
     """
 
+    def __init__(
+        self,
+        fmu_path: str | os.PathLike[str] | FmuDescription,
+        binding: Binding | str | os.PathLike[str],
+        *,
+        isolated: bool = True,
+        step_timeout: float | None = None,
+        load_timeout: float | None = None,
+        memory_limit: float | None = None,
+        parameters: Values | None = None,
+    ) -> None:
+        if not isinstance(binding, Binding):
+            binding = load_binding(binding)
+        limits = worker_limits(binding, step_timeout, load_timeout, memory_limit)
+        if isinstance(fmu_path, FmuDescription):
+            description = fmu_path
+        else:
+            description = read_fmu(fmu_path, binding.binding.interface)
+        blocks = Blocks(description, binding)
+        host = InstanceHost(blocks.description, blocks.plan, limits, isolated=isolated)
+        self._compose(blocks, host, parameters or {})
+
+    def _compose(self, blocks: Blocks, host: Host, parameters: Values) -> None:
+        """Make an asset, not yet started, of its blocks and of what runs the FMU."""
+        self._blocks = blocks
+        self._running = RunningFmu(blocks, host)
+        self.description = blocks.description
+        self.binding = blocks.binding
+        self.recorded_units = blocks.reply.extra_units
+        self.reset_trial = host.reset_trial
+        self.state_method = self._running.state_method
+        self._set_parameters(parameters)
+
+    # ------------------------------------------------------------------ properties
+
+    @property
+    def step_index(self) -> int:
+        """Number of steps since the last reset."""
+        return self._running.step_index
+
+    @property
+    def time(self) -> float:
+        """Time of the asset [s]: start + i * interval, never accumulated."""
+        return self._running.time
+
+    @property
+    def log(self) -> tuple[tuple[str, str], ...]:
+        """Status and text of the last messages of the FMU, the oldest first."""
+        return self._running.host.log
+
+    @property
+    def worker_process_id(self) -> int | None:
+        """Process number of the worker; None without one."""
+        worker = self._running.host.worker
+        return None if worker is None else worker.process_id
+
+    @property
+    def worker_memory(self) -> int | None:
+        """Resident memory of the worker [bytes]; None without one."""
+        worker = self._running.host.worker
+        return None if worker is None else worker.memory
+
+    def input_range(self, role: str, name: str) -> tuple[float, float]:
+        """Return the least and the largest value of an input, in the unit of the binding.
+
+        The binding, a file, connects names and units of the twin with variables of the FMU. If both
+        binding and FMU limit the input, both limits are observed.
+
+        Parameters
+        ----------
+        role : str
+            The role of the input in the binding, such as "control" or "load".
+        name : str
+            The name of the input in the binding.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such input.
+        """
+        bound_input = self._blocks.bound_input(role, name)
+        limits = (bound_input.low, bound_input.high)
+        # A negative factor of the conversion exchanges the limits, so they are sorted.
+        low, high = sorted(bound_input.conversion.from_fmu(limit) for limit in limits)
+        return low, high
+
+    def check_parameters(self, parameters: Values) -> None:
+        """Check that parameters could be set, without setting them.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float
+            Parameters by the binding's names.
+
+        Raises
+        ------
+        BindingError
+            If one is neither in the binding nor a parameter of the FMU.
+        FmuInputError
+            If a value is not finite, not whole or outside its range.
+        """
+        self._blocks.settings(parameters)
+
+    # ------------------------------------------------------------------ opening and closing
+
+    def __enter__(self) -> Self:
+        if self._running.phase != "ready":
+            self.reset()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the worker and remove its files; `reset` opens the asset again."""
+        self._running.close()
+
+    def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
+        """Go back to the start.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; those of the constructor if absent. They stay for
+            later resets.
+        **inputs : mapping of str to float, optional
+            `control`, `health`, `load` and `port`: inputs that hold already during the
+            initialisation. If none is given, the FMU's start values hold.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or outside its range.
+        BindingError
+            If a name is not in the binding.
+        FmuCallError, FmuWorkerError, FmuTimeoutError
+            If the FMU or its worker fails.
+        """
+        by_role = inputs_by_role(inputs)
+        if parameters is not None:
+            self._set_parameters(parameters)
+        self._restart(by_role)
+
+    def renew(self, **inputs: Unpack[Inputs]) -> None:
+        """Replace the FMU's instance by a new one in the same process, and start it.
+
+        The method `reset` also starts the FMU again, but by the FMU's own function for this. Call
+        `renew` where that function is not trusted.
+
+        Parameters
+        ----------
+        **inputs : mapping of str to float, optional
+            `control`, `health`, `load` and `port`, as for `reset`.
+
+        Raises
+        ------
+        FmuInputError, BindingError
+            If an input does not fit.
+        FmuError
+            If the FMU fails.
+        """
+        by_role = inputs_by_role(inputs)
+        try:
+            self._running.host.renew()
+        except FmuError as error:
+            self._running.raise_located(error, "making a new instance")
+        self._restart(by_role, renewed=True)
+
+    def sibling(self, parameters: Values | None = None) -> Self:
+        """Return an independent asset of the same FMU, binding and limits.
+
+        The FMU is not extracted again, and the new asset has not been started.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float, optional
+            Parameters in the binding's units; by default those of this asset.
+
+        Raises
+        ------
+        BindingError, FmuInputError
+            If a parameter is unknown or lies outside its range.
+        """
+        sibling = copy(self)
+        sibling._compose(
+            self._blocks,
+            self._running.host.sibling(),
+            self._parameters if parameters is None else parameters,
+        )
+        return sibling
+
+    # ------------------------------------------------------------------ starts
+
+    def _set_parameters(self, parameters: Values) -> None:
+        """Set the parameters of later starts, in the binding's units."""
+        self._settings = self._blocks.settings(parameters, self._running.last_start.health)
+        self._parameters = plain_values(parameters)
+
+    def _restart(self, inputs: InputsByRole, *, renewed: bool = False) -> None:
+        """Start the FMU again with inputs that hold during the initialisation.
+
+        Parameters
+        ----------
+        inputs : mapping of str to mapping
+            Inputs by role and name.
+        renewed : bool
+            Whether the instance is new, so that it needs no reset.
+        """
+        health = self._running.last_start.health
+        if self._blocks.health_at_start:
+            inputs, health_values = self._blocks.initial_values.split_inputs(inputs)
+            self._settings = self._blocks.settings(self._parameters, health_values)
+            health = plain_values(health_values)
+        request = self._blocks.request.start_values(inputs)
+        with_inputs = self._blocks.request.write(request, inputs)
+        self._start(request, health, with_inputs=with_inputs, renewed=renewed)
+
+    def _restart_if_health_changes(self, inputs: InputsByRole) -> InputsByRole:
+        """Start the FMU again if inputs change its health; return the inputs without that health.
+
+        It concerns health that the FMU accepts only before its initialisation. The new start is
+        made at the present time with the present inputs. States before it can no longer be
+        replayed.
+        """
+        running = self._running
+        inputs, changed_health = self._blocks.initial_values.split_inputs(inputs)
+        health = running.last_start.health | plain_values(changed_health)
+        if health == running.last_start.health:
+            return inputs
+        settings = self._blocks.settings(self._parameters, health)
+        if running.phase == "ready":
+            request = list(running.host.request)
+            self._blocks.request.write(request, inputs)
+            with_inputs = True
+        else:
+            running.refuse_closed()
+            request = self._blocks.request.start_values(inputs)
+            with_inputs = self._blocks.request.write(request, inputs)
+        self._settings = settings
+        self._start(request, health, with_inputs=with_inputs, index=self.step_index)
+        return inputs
+
+    def _start(
+        self,
+        request: list[float],
+        health: dict[str, PlainValue],
+        *,
+        with_inputs: bool,
+        renewed: bool = False,
+        index: int = 0,
+    ) -> None:
+        """Start the FMU with the present parameters.
+
+        Parameters
+        ----------
+        request : list of float
+            The request with the inputs of the start.
+        health : dict of str to float or list
+            Health that is set before the initialisation; the settings contain it already.
+        with_inputs : bool
+            Whether the inputs are set before the initialisation.
+        renewed : bool
+            Whether the instance is new, so that it needs no reset.
+        index : int
+            The number of steps that the asset has made before this start.
+        """
+        inputs = array("d", request).tobytes()[HEAD_BYTES:] if with_inputs else b""
+        start = AssetStart(self._parameters, health, index, inputs)
+        self._running.start(start, self._settings, request, renewed=renewed)
+
+    def _open(self, inputs: InputsByRole) -> None:
+        """Start the FMU at its first use.
+
+        An FMU that was closed or broken is not started again: the user must reset the asset.
+
+        Parameters
+        ----------
+        inputs : mapping of str to mapping
+            Inputs of the next step. If it sets the whole of an array that was resized, the FMU's
+            start values of this array need not fit.
+        """
+        if self._running.phase == "ready":
+            return
+        self._running.refuse_closed()
+        # under linear interpolation the first step begins at the start values, so they must fit
+        if not self.binding.binding.structural_parameters or self._running.linear_count:
+            inputs = {}
+        request = self._blocks.request.start_values(inputs)
+        self._start(request, self._running.last_start.health, with_inputs=False)
+
+    # ------------------------------------------------------------------ one step
+
+    def step(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> Observation:
+        """Make one communication step.
+
+        Inputs are given by the binding's names and in its units; one that is not given keeps its
+        last value. If the FMU refuses the step, the asset is where it was before it.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs of this step; those of a port are called `<port>.<quantity>`.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or outside the FMU's range; nothing was sent.
+        BindingError
+            If a name is not in the binding.
+        FmuCallError
+            If the FMU refused the step (Discard) or failed.
+        FmuEndedError
+            If the FMU ended its simulation; `observe` still reads its outputs.
+        FmuOutputError
+            If an output is not finite.
+        FmuWorkerError, FmuTimeoutError
+            If the worker died or took too long.
+        """
+        inputs: InputsByRole = {"control": control, "health": health, "load": load, "port": port}
+        if self._blocks.health_at_start:
+            inputs = self._restart_if_health_changes(inputs)
+        self._open(inputs)
+        self._running.step(inputs)
+        return self._observation()
+
+    def hold(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> None:
+        """Set inputs now, without a step.
+
+        Later steps keep them unless they give other values. Under linear interpolation the next
+        step begins at these values, so this is how an input can jump.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs, as for `step`.
+
+        Raises
+        ------
+        FmuInputError, BindingError
+            As `step`.
+        """
+        inputs: InputsByRole = {"control": control, "health": health, "load": load, "port": port}
+        if self._blocks.health_at_start:
+            inputs = self._restart_if_health_changes(inputs)
+        self._open(inputs)
+        self._running.hold(inputs)
+
+    def observe(self) -> Observation:
+        """Return the observation of this moment without a step, such as the initial one.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails, or an output is not finite.
+        """
+        self._open({})
+        self._running.read()
+        return self._observation()
+
+    def _observation(self) -> Observation:
+        """Return the observation in the reply; refuse values that are not finite."""
+        return self._blocks.reply.observation(self._running.finite_reply(), self._running.time)
+
+    # ------------------------------------------------------------------ many steps
+
+    def simulate(
+        self,
+        control: Histories | None = None,
+        health: Histories | None = None,
+        load: Histories | None = None,
+        port: Histories | None = None,
+        *,
+        steps: int | None = None,
+        progress: Progress | None = None,
+    ) -> ObservationHistory:
+        """Make many communication steps under prescribed inputs, from the present state on.
+
+        The result equals, bit by bit, that of as many calls of `step`. All inputs are checked
+        before the first step. If a step fails, the asset stays in the state after the step before.
+        If the FMU ends its simulation, the result ends there, and its attribute `ended` says so.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to (N,) array-like or float
+            Inputs by the binding's names and in its units: a value for each step, or one for all
+            steps. An array of n values is (N, n) or (n,). An input that is not given keeps its last
+            value.
+        steps : int, optional
+            The number of steps N; if left out, the length of the histories.
+        progress : Progress, optional
+            The display of the progress.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or out of range, or histories have different lengths; nothing
+            was sent.
+        BindingError, FmuCallError, FmuOutputError, FmuWorkerError, FmuTimeoutError
+            As `step`; the message says at which step. A worker that dies or takes too long reports
+            every 20 ms: the step named may be a little early.
+        """
+        histories: InputsByRole = {
+            "control": control,
+            "health": health,
+            "load": load,
+            "port": port,
+        }
+        if not self._blocks.health_at_start:
+            return self._simulate(histories, steps, progress)
+        # Health that an FMU takes only at its start can change only by a restart.
+        histories_of_runs = []
+        for run in split_where_health_changes(self._blocks, histories, steps):
+            self._restart_if_health_changes(run.first_inputs)
+            history = self._simulate(run.histories, run.steps, progress)
+            histories_of_runs.append(history)
+            if history.ended:
+                break
+        return joined_histories(histories_of_runs)
+
+    def _simulate(
+        self, histories: InputsByRole, steps: int | None, progress: Progress | None
+    ) -> ObservationHistory:
+        """Make many steps after one start; see `simulate`."""
+        self._open(histories)
+        running = self._running
+        first_index = running.step_index
+        requests = running.requests_of_steps(histories, steps)
+        times = running.times(len(requests))
+        replies = np.full((len(requests), len(running.host.reply)), np.nan)
+        with reporter(progress).stage("Simulating", total=len(requests), unit="steps") as stage:
+            early_end = running.run(requests, replies, stage)
+        steps_made = running.step_index - first_index
+        if early_end is None:
+            running.host.reply[:] = replies[steps_made - 1]
+            running.finite_reply(f" It was step {running.step_index - 1}.")
+            return self._blocks.reply.history(times[1:], replies)
+        if early_end.time is not None and early_end.time > times[steps_made]:
+            # The FMU ended within the next step: its last outputs, at the time at which it ended,
+            # are added.
+            steps_made += 1
+            times[steps_made] = early_end.time
+            replies[steps_made - 1] = np.frombuffer(running.present_outputs())
+        return self._blocks.reply.history(
+            times[1 : steps_made + 1], replies[:steps_made], early_end.sentence
+        )
+
+    # ------------------------------------------------------------------ states
+
     def save_state(self) -> bytes:
         """Return the state of the asset, for `restore_state` in this or another process.
 
@@ -80,31 +552,7 @@ class FmiAsset(SteppedFmu):
         FmuCallError
             If the FMU fails to save.
         """
-        if self._phase != "ready":
-            raise FmuStateError("There is no state to save before the first reset or step.")
-        return SavedState(
-            method=self.state_method,
-            fmu=self.description.sha256,
-            index=self.step_index,
-            step_size=self._interval,
-            start_time=self._start_time,
-            parameters=self._parameters,
-            health=self._health,
-            first_index=self._first_index,
-            start_inputs=self._start_inputs,
-            body=self._state_body(),
-            inputs=bytes(self._instance.request)[HEAD_BYTES:],
-            outputs=self._present_outputs(),
-        ).to_bytes()
-
-    def _state_body(self) -> bytes:
-        """Return the FMU's serialised state, or the inputs of the steps to be replayed."""
-        if self.state_method == "replay":
-            return b"".join(self._record)
-        try:
-            return self._instance.save()
-        except FmuError as error:
-            self._raise_located(_with_advice_to_replay(error), "saving the state")
+        return self._running.save_state()
 
     def restore_state(self, content: bytes) -> None:
         """Bring the asset to a state that `save_state` returned, in this or an earlier process.
@@ -123,65 +571,27 @@ class FmiAsset(SteppedFmu):
             If the FMU fails.
         """
         saved_state = SavedState.from_bytes(content)
-        self._refuse_foreign(saved_state)
-        replays = saved_state.method == "replay"
+        self._running.refuse_foreign(saved_state)
         # An instance that was started in the same way takes a serialised state as it is, which
         # makes ensembles fast.
-        if replays or not self._was_started_like(saved_state):
-            self._start_as_saved(saved_state)
-        try:
-            if replays:
-                self._replay(saved_state)
-            else:
-                self._instance.restore(saved_state.body)
-                self.step_index = saved_state.index
-            self._request.cast("B")[HEAD_BYTES:] = saved_state.inputs
-            saved_state.refuse_other_outputs(self._present_outputs(), self._exchange.output_names)
-        except FmuError as error:
-            self._phase = "broken"
-            # an `FmuStateError` gives this advice itself
-            if not replays and not isinstance(error, FmuStateError):
-                error = _with_advice_to_replay(error)
-            self._raise_located(error, "restoring the state")
+        if saved_state.method == "replay" or not self._running.was_started_as(saved_state):
+            self._start_as_saved(saved_state.start)
+        self._running.restore(saved_state)
 
-    def _was_started_like(self, saved_state: SavedState) -> bool:
-        """Return whether the instance runs and had the same start as that of a saved state."""
-        if self._phase != "ready" or self._instance.lost:
-            return False
-        return (
-            saved_state.parameters == self._parameters
-            and saved_state.start_inputs == self._start_inputs
-            and saved_state.health == self._health
-            and saved_state.first_index == self._first_index
-        )
-
-    def _start_as_saved(self, saved_state: SavedState) -> None:
-        """Start an instance with the parameters and inputs of a saved state's start."""
-        self._health = dict(saved_state.health)
-        self._set_parameters(saved_state.parameters)
-        start_inputs = saved_state.start_inputs
-        if not start_inputs and self.binding.binding.structural_parameters:
-            # The start values of resized arrays may not fit. Zeros fill the block instead; they
+    def _start_as_saved(self, start: AssetStart) -> None:
+        """Start the FMU as it was started before a state was saved."""
+        self._parameters = start.parameters
+        self._settings = self._blocks.settings(start.parameters, start.health)
+        inputs = start.inputs
+        if not inputs and self.binding.binding.structural_parameters:
+            # The start values of resized arrays may not fit. Zeros fill the request instead; they
             # are not sent to the FMU.
-            start_inputs = bytes(self._bytes_of_inputs())
-        if start_inputs:
-            request = [0.0, 0.0, *np.frombuffer(start_inputs).tolist()]
+            inputs = bytes(self._running.bytes_of_inputs)
+        if inputs:
+            request = [0.0, 0.0, *np.frombuffer(inputs).tolist()]
         else:
-            request = self._exchange.request.start_values({})
-        with_inputs = bool(saved_state.start_inputs)
-        self._start_instance(request, with_inputs=with_inputs, index=saved_state.first_index)
-
-    def _replay(self, saved_state: SavedState) -> None:
-        """Repeat the steps of a saved state from its start."""
-        bytes_per_step = self._bytes_of_inputs()
-        for index in range(saved_state.steps_since_start):
-            inputs = saved_state.body[index * bytes_per_step : (index + 1) * bytes_per_step]
-            self._request[0] = self.time
-            self._request[1] = self._step_size
-            self._request.cast("B")[HEAD_BYTES:] = inputs
-            self._instance.step()
-            self.step_index += 1
-            self._record.append(inputs)
+            request = self._blocks.request.start_values({})
+        self._running.start(start, self._settings, request)
 
     def fork(self) -> Self:
         """Return an independent asset of the same FMU in the same state, with its own worker.
@@ -203,39 +613,3 @@ class FmiAsset(SteppedFmu):
             forked_asset.close()
             raise
         return forked_asset
-
-    def _bytes_of_inputs(self) -> int:
-        """Return the size of the inputs of one step in a request block [bytes]."""
-        return 8 * self._exchange.plan.input_count
-
-    def _refuse_foreign(self, saved_state: SavedState) -> None:
-        """Refuse a saved state that another FMU or binding has made, or that is damaged."""
-        if saved_state.fmu != self.description.sha256:
-            raise FmuStateError(
-                f"The state was saved with another FMU than {self.description.label} (its hash "
-                "differs); use that one."
-            )
-        if saved_state.step_size != self._interval or saved_state.start_time != self._start_time:
-            raise FmuStateError(
-                "The state was saved with another step size or start time; use that binding."
-            )
-        bytes_of_inputs = self._bytes_of_inputs()
-        replays = saved_state.method == "replay"
-        is_sound = (
-            saved_state.method == self.state_method
-            and len(saved_state.inputs) == bytes_of_inputs
-            and len(saved_state.start_inputs) in (0, bytes_of_inputs)
-            and saved_state.first_index <= saved_state.index
-            and not (
-                replays and len(saved_state.body) != bytes_of_inputs * saved_state.steps_since_start
-            )
-        )
-        if not is_sound:
-            raise FmuStateError(
-                "The saved state is damaged, or another binding was in use; use that binding."
-            )
-
-
-def _with_advice_to_replay(error: FmuError) -> FmuError:
-    """Return an error with the advice to keep states as inputs."""
-    return type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import Literal, cast
+from typing import Literal
 
 from fmu_asset.client.binding import Binding
-from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.client.values import Values
 from fmu_asset.errors import (
@@ -94,11 +94,11 @@ class CoupledAsset(FmiAsset):
         # the system as one FMU
         sha256 = wiring_hash(wiring, binding, algorithm, iterations, tolerance)
         system = system_description(wiring, sha256)
-        exchange = _system_exchange(system, binding)
+        blocks = _system_blocks(system, binding)
         # its components
         interpolates = binding.binding.interpolation == "linear"
-        components = stepped_components(wiring, exchange, linear=interpolates)
-        system_settings = exchange.settings(parameters or {})
+        components = stepped_components(wiring, blocks, linear=interpolates)
+        system_settings = blocks.settings(parameters or {})
         parameters_of = system.settings_of_components(system_settings)
         assets = {}
         for name, component in components.items():
@@ -113,7 +113,7 @@ class CoupledAsset(FmiAsset):
         if iterations > 1:
             _check_states_can_be_saved(assets, wiring.schedule)
         fmus = CoupledFmus(
-            exchange,
+            blocks,
             wiring.schedule,
             components,
             assets,
@@ -121,22 +121,12 @@ class CoupledAsset(FmiAsset):
             iterations=iterations,
             tolerance=tolerance,
         )
-        self._set_up(exchange, fmus, parameters or {})
+        self._compose(blocks, fmus, parameters or {})
 
     @property
     def schedule(self) -> Schedule:
         """Order of the components."""
         return self._wiring.schedule
-
-    @property
-    def log(self) -> tuple[tuple[str, str], ...]:
-        """The last messages of the FMUs: status, and component with text."""
-        fmus = cast("CoupledFmus", self._host)
-        messages = []
-        for name, asset in fmus.assets.items():
-            for status, text in asset.log:
-                messages.append((status, f"{name}: {text}"))
-        return tuple(messages)
 
 
 def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) -> None:
@@ -150,8 +140,8 @@ def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) 
                 )
 
 
-def _system_exchange(system: SystemDescription, binding: Binding) -> Exchange:
-    """Return the exchange of values with a system as one FMU.
+def _system_blocks(system: SystemDescription, binding: Binding) -> Blocks:
+    """Return the request and the reply of a system as one FMU.
 
     Raises
     ------
@@ -159,15 +149,15 @@ def _system_exchange(system: SystemDescription, binding: Binding) -> Exchange:
         If the binding does not fit the system, or has a health that acts at the start only.
     """
     # Inputs are interpolated at the components, not at the system.
-    exchange = Exchange(system, binding.with_header(interpolation="zero-order"))
-    if exchange.health_slots:
-        names = ", ".join(exchange.health_slots)
+    blocks = Blocks(system, binding.with_header(interpolation="zero-order"))
+    if blocks.health_at_start:
+        names = ", ".join(blocks.health_at_start)
         raise BindingError(
             f"The binding {binding.name} has the health {names}, which the system "
             f"{system.model_name} takes at its start only; in a system a health must be an input "
             "or, in co-simulation, a tunable parameter."
         )
-    return exchange
+    return blocks
 
 
 def _check_algorithm(algorithm: str, iterations: int, tolerance: float) -> None:

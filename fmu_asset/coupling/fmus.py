@@ -1,12 +1,12 @@
-"""Several FMUs as one instance: what they exchange in a step, and their state.
+"""Several FMUs as one: what they exchange in a step, and their state.
 
-To `CoupledAsset`, which is an `FmiAsset`, `CoupledFmus` looks like the instance of one FMU: a
-request block with the inputs, a step, a reply block with the outputs.
+To `CoupledAsset`, which is an `FmiAsset`, `CoupledFmus` looks like one FMU: a request with the
+inputs, a step, a reply with the outputs.
 """
 
-import ctypes
 import math
-from collections.abc import Collection, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from itertools import accumulate, pairwise
@@ -15,8 +15,8 @@ from typing import NamedTuple, Self, cast
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.client.exchange import Exchange
-from fmu_asset.client.instance_host import InstanceHost
+from fmu_asset.client.blocks import REQUEST_HEAD, Blocks
+from fmu_asset.client.instance_host import Host
 from fmu_asset.client.reset_trial import InstanceStart, ResetTrial
 from fmu_asset.client.saved_state import PackedState
 from fmu_asset.client.session import FmiAsset
@@ -26,7 +26,7 @@ from fmu_asset.errors import (
     FmuStateError,
     IterationError,
 )
-from fmu_asset.instances.plan import REPORT_PERIOD, InitialValues, Instance
+from fmu_asset.instances.plan import run_steps
 from reporting.words import comma_list
 
 from .outputs import OutputSelection
@@ -37,9 +37,6 @@ from .system import (
     SystemDescription,
 )
 from .wiring import ConnectedVariable
-
-_REQUEST_HEAD = 2
-"""Values of a request block before its inputs: time and step size."""
 
 
 class CoupledState(PackedState):
@@ -73,7 +70,7 @@ class CoupledState(PackedState):
 
 
 class _SystemInput(NamedTuple):
-    """An input of the system: its position in the request block, and where it goes."""
+    """An input of the system: its position in the request, and where it goes."""
 
     position: int
     port: ConnectedVariable
@@ -91,12 +88,12 @@ def errors_of_component(component: str) -> Iterator[None]:
         raise type(error)(sentence, error.messages, time) from error
 
 
-class CoupledFmus(InstanceHost):
-    """Several FMUs as one instance, and as its own housing, as `FmiAsset` needs them.
+class CoupledFmus(Host):
+    """Several FMUs that run as one.
 
     Parameters
     ----------
-    exchange : Exchange
+    blocks : Blocks
         The request and reply of the system as one FMU.
     order : Schedule
         The order of the components.
@@ -112,12 +109,9 @@ class CoupledFmus(InstanceHost):
         The relative change at which the values in a circle have settled.
     """
 
-    lost = False
-    report_period = REPORT_PERIOD
-
     def __init__(
         self,
-        exchange: Exchange,
+        blocks: Blocks,
         order: Schedule,
         components: dict[str, SteppedComponent],
         assets: dict[str, FmiAsset],
@@ -126,8 +120,8 @@ class CoupledFmus(InstanceHost):
         iterations: int,
         tolerance: float,
     ) -> None:
-        self._exchange = exchange
-        self._system = cast("SystemDescription", exchange.description)
+        self._blocks = blocks
+        self._system = cast("SystemDescription", blocks.description)
         self._schedule = order
         self._components = components
         self._jacobi = jacobi
@@ -136,7 +130,7 @@ class CoupledFmus(InstanceHost):
         self.reset_trial = ResetTrial(comparable=False)
         # where each input of the request goes
         self._inputs: list[_SystemInput] = []
-        for position, variable in enumerate(exchange.sent, start=_REQUEST_HEAD):
+        for position, variable in enumerate(blocks.request.layout.variables, start=REQUEST_HEAD):
             for port in self._system.ends[variable.name]:
                 self._inputs.append(_SystemInput(position, port))
         # all outputs that are read, one component after the other
@@ -152,17 +146,17 @@ class CoupledFmus(InstanceHost):
             name: OutputSelection(component.fed.values(), position_of_end)
             for name, component in components.items()
         }
-        shown_ports = [self._system.ends[variable.name][0] for variable in exchange.read]
+        read_variables = blocks.reply.layout.variables
+        shown_ports = [self._system.ends[variable.name][0] for variable in read_variables]
         self._shown_outputs = OutputSelection(shown_ports, position_of_end)
         self._begin(assets)
 
     def _begin(self, assets: dict[str, FmiAsset]) -> None:
         """Take FMUs that have not exchanged anything yet."""
-        self.instance: Instance | None = self
         self.assets = assets
-        self.request = (ctypes.c_double * (_REQUEST_HEAD + len(self._exchange.sent)))()
-        self.reply = (ctypes.c_double * len(self._exchange.read))()
-        self._reply_array = np.frombuffer(memoryview(self.reply).cast("B"))
+        value_count = REQUEST_HEAD + len(self._blocks.request.layout.variables)
+        self._request = memoryview(bytearray(8 * value_count)).cast("d")
+        self._reply = np.zeros(len(self._blocks.reply.layout.variables))
         self._held_inputs: dict[str, dict[str, float]] = {}
         # outputs now, at the beginning of the last step, and at the beginning of the step before it
         self._outputs = np.zeros(len(self._output_ends))
@@ -173,23 +167,42 @@ class CoupledFmus(InstanceHost):
 
     # ------------------------------------------------------------------ life
 
-    def start(self, start: InstanceStart, *, renewed: bool = False) -> Self:
-        """Bring the components to their start."""
-        start.initialise(self)
-        return self
+    @property
+    def request(self) -> "memoryview[float]":
+        """Time, step size and inputs of the system."""
+        return self._request
 
-    def replace_if_contradicted(self, request: bytes, reply: FloatArray) -> None:
-        """Leave it to the components whether they began where they should."""
+    @property
+    def reply(self) -> FloatArray:
+        """The outputs of the system that are read."""
+        return self._reply
 
-    def renew(self) -> Instance:
+    @property
+    def lost(self) -> bool:
+        """False: a component replaces what it has lost."""
+        return False
+
+    @property
+    def log(self) -> tuple[tuple[str, str], ...]:
+        """The last messages of the FMUs: status, and component with text."""
+        messages = []
+        for name, asset in self.assets.items():
+            for status, text in asset.log:
+                messages.append((status, f"{name}: {text}"))
+        return tuple(messages)
+
+    def note_errors(self, messages: Iterable[str]) -> None:
+        """Leave the log to the components, which have noted their errors."""
+
+    @property
+    def worker(self) -> None:
+        """None: each component has its own worker."""
+
+    def renew(self) -> None:
         """End the workers; the next start has new ones."""
         self.close()
-        return self
 
-    def reset(self) -> None:
-        """Leave it to `initialise`, which resets the components."""
-
-    def sibling(self) -> "CoupledFmus":
+    def sibling(self) -> Self:
         """Return the same system with FMUs of its own."""
         sibling = copy(self)
         sibling._begin({name: asset.sibling() for name, asset in self.assets.items()})
@@ -200,28 +213,18 @@ class CoupledFmus(InstanceHost):
         for asset in self.assets.values():
             asset.close()
 
-    # ------------------------------------------------------------------ the interface of an
-    # instance
-
-    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
         """Initialise the components in order, each with the initial outputs of its predecessors.
 
-        An input whose source comes later starts at the FMU's own start value.
-
-        Parameters
-        ----------
-        start_time : float
-            Ignored: the components have it from their bindings.
-        parameters : InitialValues
-            Parameters of the system, by value reference.
-        with_inputs : bool
-            Whether the inputs in the request block hold already.
+        An input whose source comes later starts at the FMU's own start value. The components have
+        the start time from their bindings, and decide themselves whether they need new instances.
         """
-        parameters_of = self._system.settings_of_components(parameters)
+        self._request[:] = array("d", start.request)
+        parameters_of = self._system.settings_of_components(start.settings)
         self._held_inputs = {
             name: dict(component.constants) for name, component in self._components.items()
         }
-        if with_inputs:
+        if start.with_inputs:
             self._take_inputs()
         self._at_different_times = True
         initialised: set[str] = set()
@@ -242,7 +245,7 @@ class CoupledFmus(InstanceHost):
         self._at_different_times = False
 
     def step(self) -> None:
-        """Make the step that the request block describes."""
+        """Make the step that the request describes."""
         if self._at_different_times:
             raise FmuStateError(
                 "A step or a restoration failed, and the FMUs no longer stand at the same time; "
@@ -261,11 +264,16 @@ class CoupledFmus(InstanceHost):
         self._at_different_times = False
         self.read()
 
-    run = Instance.run
+    def run(
+        self, requests: FloatArray, replies: FloatArray, report: Callable[[int], object]
+    ) -> None:
+        """Make many steps; stop after one whose outputs are not all finite."""
+        request = np.asarray(self._request)
+        run_steps(self.step, requests, replies, report, request=request, reply=self._reply)
 
     def read(self) -> None:
-        """Put the current outputs into the reply block."""
-        self._reply_array[:] = self._shown_outputs.values(self._outputs, self._outputs_before)
+        """Put the current outputs into the reply."""
+        self._reply[:] = self._shown_outputs.values(self._outputs, self._outputs_before)
 
     def save(self) -> bytes:
         """Return the states of the components and the values that they had exchanged."""
@@ -295,16 +303,12 @@ class CoupledFmus(InstanceHost):
         self._outputs_before = np.array(saved_state.before)
         self._at_different_times = False
 
-    def take_log(self) -> list[tuple[int, str]]:
-        """Return no messages: each component keeps its own log."""
-        return []
-
     # ------------------------------------------------------------------ stepping
 
     def _take_inputs(self) -> None:
-        """Hand on the inputs in the request block; NaN stands for one that nobody has given."""
+        """Hand on the inputs in the request; NaN stands for one that nobody has given."""
         for position, port in self._inputs:
-            value = self.request[position]
+            value = self._request[position]
             if not math.isnan(value):
                 inputs = self._held_inputs[port.end.component]
                 inputs[port.end.variable] = port.conversion.to_fmu(value)
@@ -412,7 +416,7 @@ class CoupledFmus(InstanceHost):
                 return
         worst = int(np.argmax(change))
         worst_end = self._output_ends[exchanged[worst]]
-        time = self.request[0]
+        time = self._request[0]
         raise IterationError(
             f"The components {comma_list(group)} did not settle in {self.iterations} iterations of "
             f"the step from t = {time:g} s ({worst_end} still changes by {change[worst]:.3g}); "

@@ -13,8 +13,8 @@ from typing import NamedTuple, cast
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.client.binding import Binding, BindingHeader
+from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding
-from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError
 from fmu_asset.instances.plan import InitialValues
@@ -260,7 +260,7 @@ class SteppedComponent:
 
 
 def stepped_components(
-    wiring: Wiring, exchange: Exchange, *, linear: bool = False
+    wiring: Wiring, blocks: Blocks, *, linear: bool = False
 ) -> dict[str, SteppedComponent]:
     """Return the components of a system, ready to be stepped, by name.
 
@@ -268,8 +268,8 @@ def stepped_components(
     ----------
     wiring : Wiring
         The components of the system, and the connections between them.
-    exchange : Exchange
-        A binding of its description.
+    blocks : Blocks
+        The request and the reply of the system as one FMU.
     linear : bool
         Whether inputs move in straight lines where they can.
 
@@ -282,19 +282,19 @@ def stepped_components(
     """
     components = {}
     for component in wiring.structure.components:
-        components[component.name] = _stepped_component(wiring, exchange, component, linear=linear)
+        components[component.name] = _stepped_component(wiring, blocks, component, linear=linear)
     if linear and not any(component.linear for component in components.values()):
         raise BindingError(
-            f"The binding {exchange.binding.name} asks for linear interpolation of inputs, but no "
+            f"The binding {blocks.binding.name} asks for linear interpolation of inputs, but no "
             f"component of the system {wiring.structure.name} has a continuous input of which it "
-            "accepts the derivative (`canInterpolateInputs`, or model exchange): leave "
+            "accepts the derivative (`canInterpolateInputs`, or model blocks): leave "
             "`interpolation` out."
         )
     return components
 
 
 def _stepped_component(
-    wiring: Wiring, exchange: Exchange, component: Component, *, linear: bool
+    wiring: Wiring, blocks: Blocks, component: Component, *, linear: bool
 ) -> SteppedComponent:
     """Return one component of a system, ready to be stepped; see `stepped_components`."""
     name = component.name
@@ -303,12 +303,12 @@ def _stepped_component(
     for target, port in wiring.feeds.items():
         if target.component == name:
             fed[target.variable] = port
-    output_ends = _read_outputs(wiring, exchange, name)
+    output_ends = _read_outputs(wiring, blocks, name)
     # variables of the system that the binding sets, at this component
-    sent_names = [variable.name for variable in exchange.sent]
-    sent_inputs = [end.variable for end in _ends_at(exchange, name, sent_names)]
-    parameter_names = [parameter.variable for parameter in exchange.binding.parameter.values()]
-    tuned_parameters = [end.variable for end in _ends_at(exchange, name, parameter_names)]
+    sent_names = [variable.name for variable in blocks.request.layout.variables]
+    sent_inputs = [end.variable for end in _ends_at(blocks, name, sent_names)]
+    parameter_names = [parameter.variable for parameter in blocks.binding.parameter.values()]
+    tuned_parameters = [end.variable for end in _ends_at(blocks, name, parameter_names)]
     # inputs that move in straight lines
     moving = []
     for variable, port in fed.items():
@@ -327,8 +327,8 @@ def _stepped_component(
             settings[variable] = value
     units = {info.name: info.unit or "1" for info in infos.values()}
     binding = Binding(
-        binding=_component_header(exchange.binding, component, is_linear=is_linear),
-        limits=exchange.binding.limits,
+        binding=_component_header(blocks.binding, component, is_linear=is_linear),
+        limits=blocks.binding.limits,
         load={
             variable: InputBinding(variable=variable, unit=units[variable])
             for variable in (*fed, *sent_inputs, *constants)
@@ -369,9 +369,9 @@ def _component_header(binding: Binding, component: Component, *, is_linear: bool
     )
 
 
-def _ends_at(exchange: Exchange, component: str, variables: Iterable[str]) -> list[Endpoint]:
+def _ends_at(blocks: Blocks, component: str, variables: Iterable[str]) -> list[Endpoint]:
     """Return the ends at a component of variables of the system, in their order."""
-    description = cast("SystemDescription", exchange.description)
+    description = cast("SystemDescription", blocks.description)
     ends = []
     for variable in variables:
         for port in description.ends[variable]:
@@ -380,7 +380,7 @@ def _ends_at(exchange: Exchange, component: str, variables: Iterable[str]) -> li
     return ends
 
 
-def _read_outputs(wiring: Wiring, exchange: Exchange, component: str) -> tuple[Endpoint, ...]:
+def _read_outputs(wiring: Wiring, blocks: Blocks, component: str) -> tuple[Endpoint, ...]:
     """Return the outputs of a component that are read by others or by the binding; at least one.
 
     Raises
@@ -389,8 +389,8 @@ def _read_outputs(wiring: Wiring, exchange: Exchange, component: str) -> tuple[E
         If it has no output of a single number.
     """
     ends = [port.end for port in wiring.feeds.values() if port.end.component == component]
-    read_names = [variable.name for variable in exchange.read]
-    ends += _ends_at(exchange, component, read_names)
+    read_names = [variable.name for variable in blocks.reply.layout.variables]
+    ends += _ends_at(blocks, component, read_names)
     if ends:
         return tuple(dict.fromkeys(ends))
     for info in wiring.declared[component].variables:

@@ -331,6 +331,49 @@ class LinearInputs:
             self._present_moving[:] = self._at_begin + change
 
 
+def run_steps(
+    step: Callable[[], object],
+    requests: Float,
+    replies: Float,
+    report: Callable[[int], object],
+    *,
+    request: Float,
+    reply: Float,
+    report_period: float = REPORT_PERIOD,
+) -> None:
+    """Make many steps one by one; stop after one whose outputs are not all finite.
+
+    Parameters
+    ----------
+    step : callable
+        Makes the step of `request`, and puts its outputs into `reply`.
+    requests, replies, report
+        As for `Instance.run`.
+    request, reply : ndarray
+        The request and the reply of one step.
+    report_period : float
+        Seconds between reports; at 0 each step is reported.
+    """
+    sum_of_squares = reply.dot
+    now = time.monotonic
+    steps_done = 0
+    next_report = now() + report_period
+    try:
+        for request_row, reply_row in zip(requests, replies, strict=True):
+            request[:] = request_row
+            step()
+            reply_row[:] = reply
+            steps_done += 1
+            # a fast test first: the sum of squares can be infinite for large values, too
+            if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
+                return
+            if now() >= next_report:
+                report(steps_done)
+                next_report = now() + report_period
+    finally:
+        report(steps_done)
+
+
 class Instance(Protocol):
     """An instance of an FMU: in this process, in a worker process, or of several coupled FMUs.
 
@@ -409,29 +452,15 @@ class Instance(Protocol):
         FmuCallError, FmuWorkerError
             As `step`.
         """
-        request = values_of(self.request)
-        reply = values_of(self.reply)
-        # local names are faster in the loop
-        step = self.step
-        sum_of_squares = reply.dot
-        now = time.monotonic
-        period = self.report_period
-        steps_done = 0
-        next_report = now() + period
-        try:
-            for request_row, reply_row in zip(requests, replies, strict=True):
-                request[:] = request_row
-                step()
-                reply_row[:] = reply
-                steps_done += 1
-                # a fast test first: the sum of squares can be infinite for large values, too
-                if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
-                    return
-                if now() >= next_report:
-                    report(steps_done)
-                    next_report = now() + period
-        finally:
-            report(steps_done)
+        run_steps(
+            self.step,
+            requests,
+            replies,
+            report,
+            request=values_of(self.request),
+            reply=values_of(self.reply),
+            report_period=self.report_period,
+        )
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""

@@ -9,8 +9,8 @@ from typing import Literal
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import INPUT_ROLES, Binding, load_binding
+from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.bound_variables import ParameterBinding
-from fmu_asset.client.exchange import Exchange
 from fmu_asset.coupling.structure import (
     Component,
     ComponentSetting,
@@ -245,12 +245,12 @@ def _with_values(
     """
     # The values of the system's connectors, in the units of the system.
     system = system_description(wiring)
-    exchange = Exchange(system, binding)
-    initial_values = exchange.settings(parameters)
+    blocks = Blocks(system, binding)
+    initial_values = blocks.settings(parameters)
     for name, value in load.items():
-        slot = exchange.slot("load", name)
-        variable = slot.variable
-        numbers = slot.numbers(value).tolist()
+        bound_input = blocks.bound_input("load", name)
+        variable = bound_input.variable
+        numbers = bound_input.numbers(value).tolist()
         initial_values.append(InitialValue(variable.kind, variable.reference, numbers))
     # The same values at the components to which the connectors lead.
     values_by_component = system.settings_of_components(initial_values)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, load_binding, parse_binding
+from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.draft import bindable, draft_binding
-from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.instance_host import worker_limits
 from fmu_asset.client.session import FmiAsset
@@ -415,7 +415,7 @@ def test_any_name_survives_the_draft(names, text, causality):
 
     draft = parse_draft(description)
 
-    bound = {*Exchange(description, draft).binding.observation_variables}
+    bound = {*Blocks(description, draft).binding.observation_variables}
     bound |= {*draft.record.variables}
     for role in (draft.control, draft.health, draft.load, draft.parameter):
         bound |= {end.variable for end in role.values()}

@@ -14,7 +14,7 @@ import pytest
 
 from fmu_asset import errors
 from fmu_asset.checks.fmu_check import check_fmu
-from fmu_asset.client import stepped_fmu
+from fmu_asset.client import instance_host
 from fmu_asset.client.session import FmiAsset
 from tests.fmu_asset.client.kinds import (
     BINDINGS,
@@ -83,7 +83,7 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
 ):
     """Whatever blocks it is made in; as single steps end there."""
     three_steps = 3 * 6 * 8
-    monkeypatch.setattr(stepped_fmu, "_BLOCK_BYTES", three_steps)
+    monkeypatch.setattr(instance_host, "_BLOCK_BYTES", three_steps)
     misbehaviour = np.where(np.arange(10) == bad_step, behaviour, 0)
     is_made = behaviour == NOT_A_NUMBER  # the step, before its result is refused
     for asset in (misbehaving, well_behaved):

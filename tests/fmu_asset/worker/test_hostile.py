@@ -200,7 +200,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
     """A reply that is whole but bears another number, as one that comes late."""
     with hostile() as asset:
         asset.step()
-        instance = asset._host.instance
+        instance = asset._running.host.instance
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
         os.write(instance._outgoing, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)

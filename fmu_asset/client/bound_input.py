@@ -1,4 +1,4 @@
-"""Inputs of a binding resolved against an FMU: units, ranges and places of their values."""
+"""An input or parameter that a binding names: its values are checked and converted for the FMU."""
 
 import math
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from reporting.arrays import Float
 from .units import IDENTITY, Conversion
 
 
-class InputSlot(NamedTuple):
-    """An input or parameter of a binding: how its values are checked, converted and placed.
+class BoundInput(NamedTuple):
+    """An input or parameter of a binding: its range, unit and positions in the FMU.
 
     Attributes
     ----------
