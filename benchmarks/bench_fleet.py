@@ -13,7 +13,11 @@ from reporting.arrays import AnyArray
 from reporting.files import atomic_write_text
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
+from twin_master.fleet.evidence import (
+    TransitionFamily,
+    log_likelihood_of_twins,
+    transition_evidence,
+)
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import Fleet, ensemble
 from twin_master.fleet.store import stored_variables
@@ -42,13 +46,13 @@ def run() -> list[Measurement]:
     alone /= ALONE * scenario.mission.steps
     observations = flown.observation_rows, flown.control_index
     sensors = knowledge.sensor_model
-    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *observations)) / steps
+    likelihood = cpu_seconds(lambda: log_likelihood_of_twins(sensors, *observations)) / steps
     worsening = TransitionFamily.learnable(scenario)
-    scaled = scaled_likelihood(sensors, *observations)[0]
+    of_states = log_likelihood_of_twins(sensors, *observations)
     points = np.full((POINTS, 2), 0.1)
-    transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])
+    transition_evidence(worsening, points[:1], of_states[:1], flown.control_index[:1])
     learning = cpu_seconds(
-        lambda: transition_evidence(worsening, points, scaled, flown.control_index)
+        lambda: transition_evidence(worsening, points, of_states, flown.control_index)
     )
     with tempfile.TemporaryDirectory() as place:
         folder, text = Path(place), scenario_files()[SCENARIO].read_text(encoding="utf-8")

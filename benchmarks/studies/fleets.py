@@ -22,7 +22,12 @@ from numpy.typing import NDArray
 from fe.reduction.model_cache import reduced_model
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import TransitionFamily, grid_evidence, scaled_likelihood
+from twin_master.fleet.evidence import (
+    TransitionFamily,
+    grid_evidence,
+    log_likelihood_of_twins,
+    scaled,
+)
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.members import Member
 from twin_master.fleet.posterior import (
@@ -73,9 +78,10 @@ def flights(known: Knowledge, first: int, count: int) -> Flights:
 def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     """Return the likelihood of the probabilities to worsen."""
     worsening = TransitionFamily.learnable(known.scenario)
-    likelihood, _ = scaled_likelihood(
+    log_likelihood_of_states = log_likelihood_of_twins(
         known.sensor_model, flown.observation_rows, flown.control_index
     )
+    likelihood = scaled(log_likelihood_of_states).values
 
     def log_likelihood(axes: Axes) -> Float:
         probabilities = tuple(logistic(axis) for axis in axes)

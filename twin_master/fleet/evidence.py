@@ -17,7 +17,7 @@ from twin_master.fleet.evidence_kernels import (
     LANES_TOGETHER,
     LEAST_EVIDENCE,
     SubGrids,
-    evidence_at_points,
+    evidence_in_lanes,
     evidence_on_grid,
 )
 from twin_master.fleet.posterior import GRID_POINTS, Axes
@@ -219,10 +219,10 @@ class ScaledLikelihood(NamedTuple):
     log_scale: Float
 
 
-def scaled_likelihood(
+def log_likelihood_of_twins(
     model: GaussianSensorModel, observations: Float, control: Index
-) -> ScaledLikelihood:
-    """Return the likelihood of each state in each step, given the observations of B twins.
+) -> Float:
+    """Return log p(o_t | D_t, u_t) of the observations of B twins in T steps: (B, T, S).
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def scaled_likelihood(
     twin_count, step_count = control.shape
     all_steps = observations.reshape(-1, observations.shape[-1])
     log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
-    return scaled(log_likelihood.reshape(twin_count, step_count, -1))
+    return log_likelihood.reshape(twin_count, step_count, -1)
 
 
 def scaled(log_likelihood: Float) -> ScaledLikelihood:
@@ -246,11 +246,9 @@ def scaled(log_likelihood: Float) -> ScaledLikelihood:
 
 
 def transition_evidence(
-    family: TransitionFamily, points: Float, likelihood: Float, control: Index
+    family: TransitionFamily, points: Float, log_likelihood: Float, control: Index
 ) -> Float:
     """Return the log evidence of B twins for P values of the probabilities to worsen.
-
-    A constant of each twin is missing: the `log_scale` of its likelihood.
 
     Parameters
     ----------
@@ -258,8 +256,8 @@ def transition_evidence(
         The transitions as a function of K probabilities.
     points : (P, K) array
         The probabilities, between 0 and 1.
-    likelihood : (B, T, S) array
-        The values of `scaled_likelihood`.
+    log_likelihood : (B, T, S) array
+        log p(o_t | D_t, u_t).
     control : (B, T) array
         The control in force in each step.
 
@@ -269,8 +267,9 @@ def transition_evidence(
         The log evidence; -inf if the observations of a twin are impossible.
     """
     result = np.empty((len(control), len(points)))
-    entries = family.entries(points)
-    evidence_at_points(family.prior, family.lists, entries, control, likelihood, result)
+    entries = np.ascontiguousarray(family.entries(points).T)
+    log_density = np.ascontiguousarray(log_likelihood)[..., None]  # the same at all points
+    evidence_in_lanes(family.prior, family.lists, entries, control, log_density, result)
     return result
 
 
@@ -313,7 +312,8 @@ def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
 def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, control: Index) -> Float:
     """Return the log evidence of B twins on a tensor grid of the probabilities to worsen.
 
-    It is that of `transition_evidence` at the points of the grid, to rounding.
+    It is that of `transition_evidence` at the points of the grid, to rounding, but for a constant
+    of each twin: the `log_scale` of its likelihood.
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
     axes : tuple of (N,) array
         The values of each probability, between 0 and 1.
     likelihood : (B, T, S) array
-        The values of `scaled_likelihood`.
+        The values of `scaled`.
     control : (B, T) array
         The control in force in each step.
 
@@ -333,7 +333,7 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
         impossible.
     """
     if not axes:  # the transitions are not learnt: the grid has a single point without coordinates
-        return transition_evidence(family, np.empty((1, 0)), likelihood, control)
+        return transition_evidence(family, np.empty((1, 0)), _log(likelihood), control)
     result = np.empty((len(control), math.prod(len(axis) for axis in axes)))
     grids = sub_grids(family, axes)
     evidence_on_grid(family.prior, family.lists, grids, control, likelihood, result)
@@ -341,6 +341,12 @@ def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, contr
     if is_improbable.any():
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
         result[is_improbable] = transition_evidence(
-            family, points, likelihood[is_improbable], control[is_improbable]
+            family, points, _log(likelihood[is_improbable]), control[is_improbable]
         )
     return result
+
+
+def _log(likelihood: Float) -> Float:
+    """Return the logarithm of a likelihood; -inf where it is zero."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(likelihood))

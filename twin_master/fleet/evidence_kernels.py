@@ -1,11 +1,12 @@
-"""Compiled loops for the log evidence of twins: at many points, on grids, and at many draws.
+"""Compiled loops for the log evidence of twins: in lanes, and on grids.
 
-All are forward passes of a hidden Markov model with S joint states. `evidence_at_points` divides
-the belief by its sum in each step. The other two leave the belief as it is and compute many *lanes*
-side by side, each as it would be alone: points of a grid, or draws of a parameter. The likelihood
-of a step is at most 1, so that all that underflows adds less than T S 1e-307 to the evidence in T
-steps. The evidence is therefore exact to rounding wherever it is above `LEAST_EVIDENCE`; the caller
-computes others by `evidence_at_points`.
+Both are forward passes of a hidden Markov model with S joint states, for many *lanes* side by side,
+each as it would be alone: points of a grid, or draws of a parameter. `evidence_in_lanes` divides
+the belief when its sum becomes small. `evidence_on_grid` leaves it as it is, so that a forward and
+a backward pass can meet, each with a lane for those axes alone on which its transitions depend. Its
+likelihood of a step is at most 1, so that all that underflows adds less than T S 1e-307 to the
+evidence in T steps. The evidence is therefore exact to rounding wherever it is above
+`LEAST_EVIDENCE`; the caller computes others by `evidence_in_lanes`.
 """
 
 from functools import partial
@@ -15,77 +16,18 @@ import numpy as np
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index
-from twin_master.network.gaussian_kernels import fill_exponentials
-from twin_master.network.kernels import PredecessorLists, apply_blocks
+from twin_master.network.gaussian_kernels import LEAST_EXPONENT, fill_exponentials
+from twin_master.network.kernels import PredecessorLists
 
 LEAST_EVIDENCE = -575.0
 """Log evidence below which underflow may matter: exp(-575) is 1e-250."""
+LEAST_SUM = 1e-20
+"""A belief with a smaller sum is divided by it: terms that underflow are 1e-287 of the sum."""
 LANES_TOGETHER = 8
-"""The number of lanes is a multiple of this, so that loops leave no remainder."""
+"""The number of lanes of a grid is a multiple of this, so that loops leave no remainder."""
 
 _makes_no_arrays = partial(callable_when_compiled, makes_arrays=False, inline=True)
 """Decorator of functions that only read and fill arrays: numba does not count references."""
-
-
-@compiled
-def evidence_at_points(
-    prior: Float,
-    lists: PredecessorLists,
-    probability: Float,
-    control: Index,
-    likelihood: Float,
-    result: Float,
-) -> None:
-    """Fill `result` with the log evidence of B twins in T steps for P transition models.
-
-    In each step the belief is propagated through the transition, multiplied by the likelihood, and
-    divided by its sum; the log evidence is the sum of the logarithms of these sums.
-
-    Parameters
-    ----------
-    prior : (S,) array
-        The belief before the first step.
-    lists : PredecessorLists
-        The predecessors of the levels of each factor; their probabilities are not used.
-    probability : (P, non-zeros) array
-        The probabilities of the entries of the lists, for each of the P models.
-    control : (B, T) array
-        The control in force in each step.
-    likelihood : (B, T, S) array
-        The likelihood of the states in each step, divided by its largest value.
-    result : (B, P) array
-        To be filled: the log evidence; -inf if the observations are impossible.
-    """
-    twins, steps, state_count = likelihood.shape
-    levels, first_row, start, source, _, _ = lists
-    belief = np.empty(state_count)
-    work = np.empty(state_count)
-    for twin in range(twins):
-        for point in range(len(probability)):
-            # `apply_blocks` does not read the last field, the log probabilities, so that the
-            # probabilities can be passed in its place.
-            point_lists = levels, first_row, start, source, probability[point], probability[point]
-            belief[:] = prior
-            result[twin, point] = 0.0
-            for t in range(steps):
-                if t > 0:
-                    apply_blocks(
-                        point_lists,  # type: ignore[arg-type]  # numba takes a plain tuple, too
-                        control[twin, t - 1],
-                        belief,
-                        belief,
-                        work,
-                    )
-                predictive_probability = 0.0
-                for state in range(state_count):
-                    belief[state] *= likelihood[twin, t, state]
-                    predictive_probability += belief[state]
-                if predictive_probability <= 0.0:
-                    result[twin, point] = -np.inf
-                    break
-                result[twin, point] += np.log(predictive_probability)
-                for state in range(state_count):
-                    belief[state] /= predictive_probability
 
 
 @_makes_no_arrays
@@ -365,20 +307,83 @@ def evidence_on_grid(
             result[twin, point] = np.log(total) if total > 0.0 else -np.inf
 
 
+class _LikelihoodWork(NamedTuple):
+    """Work space of `_multiply_by_likelihood`, with an entry for each column of the densities."""
+
+    largest: Float
+    mantissa: Float
+    power_bits: Index
+
+
+@_makes_no_arrays
+def _multiply_by_likelihood(
+    log_density: Float, belief: Float, belief_sum: Float, log_evidence: Float, work: _LikelihoodWork
+) -> None:
+    """Multiply beliefs (S, L) in place by the likelihood of a step over its largest value.
+
+    Parameters
+    ----------
+    log_density : (S, L) or (S, 1) array
+        The log likelihood in each lane, or the same in all lanes.
+    belief : (S, L) array
+        The beliefs; updated in place.
+    belief_sum : (L,) array
+        To be filled: the sums of the beliefs afterwards.
+    log_evidence : (L,) array
+        The log of the largest likelihood is added in place.
+    work : _LikelihoodWork
+        Work space.
+    """
+    largest, mantissa, power_bits = work
+    power = power_bits.view(np.float64)
+    state_count, density_count = log_density.shape
+    lanes = len(belief_sum)
+    # The largest density; where no state is possible, any number serves.
+    for column in range(density_count):
+        largest[column] = log_density[0, column]
+    for state in range(1, state_count):
+        for column in range(density_count):
+            value = log_density[state, column]
+            largest[column] = value if value > largest[column] else largest[column]
+    for column in range(density_count):
+        if largest[column] == -np.inf:
+            largest[column] = 0.0
+    for lane in range(lanes):
+        log_evidence[lane] += largest[lane % density_count]
+        belief_sum[lane] = 0.0
+    # Times the likelihood, and the sum over the states.
+    for state in range(state_count):
+        density = log_density[state]
+        fill_exponentials(density, largest, mantissa, power_bits)
+        if density_count == 1:
+            underflows = density[0] - largest[0] <= LEAST_EXPONENT
+            likelihood = 0.0 if underflows else mantissa[0] * power[0]
+            for lane in range(lanes):
+                belief[state, lane] *= likelihood
+                belief_sum[lane] += belief[state, lane]
+        else:
+            for lane in range(lanes):
+                underflows = density[lane] - largest[lane] <= LEAST_EXPONENT
+                likelihood = 0.0 if underflows else mantissa[lane] * power[lane]
+                belief[state, lane] *= likelihood
+                belief_sum[lane] += belief[state, lane]
+
+
 @compiled
-def evidence_at_draws(
+def evidence_in_lanes(
     prior: Float,
     lists: PredecessorLists,
     entries: Float,
     control: Index,
     log_density: Float,
     result: Float,
-    log_scale: Float,
 ) -> None:
-    """Fill `result` with the log evidence of B twins in T steps for each of E draws.
+    """Fill `result` with the log evidence of B twins in T steps, in each of L lanes.
 
-    The likelihood of a step and draw is divided by its largest value over the states; the log
-    evidence is `result` plus `log_scale`.
+    A lane is a hidden Markov model of its own: it has transition probabilities of its own, as the
+    points of a grid have, or a likelihood of its own, as the draws of a parameter have. In each
+    step the belief is propagated through the transition and multiplied by the likelihood. Its sum
+    is the evidence so far. The belief is divided by its sum when the sum becomes small.
 
     Parameters
     ----------
@@ -387,60 +392,48 @@ def evidence_at_draws(
     lists : PredecessorLists
         The predecessors of the levels of each factor; their probabilities are not used.
     entries : (non-zeros, L) array
-        The probabilities of the entries of the lists, the same in all lanes; L is E, rounded up to
-        a multiple of `LANES_TOGETHER`.
+        The probabilities of the entries of the lists in each lane.
     control : (B, T) array
         The control in force in each step.
-    log_density : (B, T, S, E) array
-        log p(o_t | D_t, u_t, e).
-    result, log_scale : (B, E) array
-        To be filled: the log evidence of the divided likelihoods, and the sum of the logarithms of
-        their largest values.
+    log_density : (B, T, S, L) or (B, T, S, 1) array
+        log p(o_t | D_t, u_t) in each lane, or the same in all lanes.
+    result : (B, L) array
+        To be filled: the log evidence; -inf if the observations are impossible. A likelihood that
+        is exp(`LEAST_EXPONENT`) of the largest one of its step, or less, is taken as zero.
     """
-    twins, steps, state_count, draws = log_density.shape
+    twins, steps, state_count, density_count = log_density.shape
     lanes = entries.shape[1]
-    blocks = len(lists.levels)
-    current = np.zeros((state_count, lanes))
-    other = np.zeros((state_count, lanes))
-    density = np.zeros(lanes)
-    largest = np.zeros(lanes)
-    mantissa = np.zeros(lanes)
-    power_bits = np.zeros(lanes, np.int64)
-    power = power_bits.view(np.float64)
+    belief = np.empty((state_count, lanes))
+    other = np.empty((state_count, lanes))
+    belief_sum = np.empty(lanes)
+    work = _LikelihoodWork(
+        np.empty(density_count), np.empty(density_count), np.empty(density_count, np.int64)
+    )
     for twin in range(twins):
-        for draw in range(draws):
-            log_scale[twin, draw] = 0.0
+        for lane in range(lanes):
+            result[twin, lane] = 0.0
+        for state in range(state_count):
+            for lane in range(lanes):
+                belief[state, lane] = prior[state]
         for t in range(steps):
             if t > 0:
-                for block in range(blocks):
+                for block in range(len(lists.levels)):
                     _apply_block(
-                        lists, block, control[twin, t - 1], entries, (0, lanes), current, other
+                        lists, block, control[twin, t - 1], entries, (0, lanes), belief, other
                     )
-                    current, other = other, current
-            else:
+                    belief, other = other, belief
+            _multiply_by_likelihood(log_density[twin, t], belief, belief_sum, result[twin], work)
+            # Divide the beliefs whose sum is small, before their terms underflow.
+            least_sum = belief_sum[0]
+            for lane in range(1, lanes):
+                least_sum = min(least_sum, belief_sum[lane])
+            if least_sum < LEAST_SUM and t < steps - 1:
+                for lane in range(lanes):
+                    divisor = belief_sum[lane] if belief_sum[lane] < LEAST_SUM else 1.0
+                    result[twin, lane] += np.log(divisor)
+                    belief_sum[lane] = divisor if divisor > 0.0 else 1.0
                 for state in range(state_count):
                     for lane in range(lanes):
-                        current[state, lane] = prior[state]
-            # The largest density; where no state is possible, any number serves.
-            for draw in range(draws):
-                largest[draw] = log_density[twin, t, 0, draw]
-            for state in range(1, state_count):
-                for draw in range(draws):
-                    value = log_density[twin, t, state, draw]
-                    largest[draw] = value if value > largest[draw] else largest[draw]
-            for draw in range(draws):
-                if largest[draw] == -np.inf:
-                    largest[draw] = 0.0
-                log_scale[twin, draw] += largest[draw]
-            # Times the likelihood.
-            for state in range(state_count):
-                for draw in range(draws):
-                    density[draw] = log_density[twin, t, state, draw]
-                fill_exponentials(density, largest, mantissa, power_bits)
-                for lane in range(lanes):
-                    current[state, lane] *= mantissa[lane] * power[lane]
-        for draw in range(draws):
-            total = 0.0
-            for state in range(state_count):
-                total += current[state, draw]
-            result[twin, draw] = np.log(total) if total > 0.0 else -np.inf
+                        belief[state, lane] /= belief_sum[lane]
+        for lane in range(lanes):
+            result[twin, lane] += np.log(belief_sum[lane])

@@ -14,7 +14,7 @@ from twin_master.errors import FleetError
 from twin_master.fleet.checks import source_of
 from twin_master.fleet.evidence import (
     TransitionFamily,
-    scaled_likelihood,
+    log_likelihood_of_twins,
     transition_evidence,
 )
 from twin_master.fleet.evidence_tasks import with_all_transitions_possible
@@ -211,11 +211,9 @@ def _evidence_of_noise(
         model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
         for observed, control in flights.blocks():
             if nodes is None:
-                likelihood = scaled_likelihood(model, observed, control)
-                at_point = transition_evidence(
-                    family, probability[None], likelihood.values, control
-                )
-                log_evidence = at_point[:, 0] + likelihood.log_scale
+                log_likelihood = log_likelihood_of_twins(model, observed, control)
+                at_point = transition_evidence(family, probability[None], log_likelihood, control)
+                log_evidence = at_point[:, 0]
             else:
                 at_nodes = parameter_evidence(family, probability, model, observed, control)
                 log_evidence = logsumexp(at_nodes, b=nodes.prior, axis=1)

@@ -15,11 +15,11 @@ from reporting.arrays import Float, Index
 from twin_master.fleet.evidence import (
     TransitionFamily,
     grid_evidence,
+    log_likelihood_of_twins,
     scaled,
-    scaled_likelihood,
     transition_evidence,
 )
-from twin_master.fleet.evidence_kernels import LANES_TOGETHER, LEAST_EVIDENCE, evidence_at_draws
+from twin_master.fleet.evidence_kernels import evidence_in_lanes
 from twin_master.fleet.posterior import Axes
 from twin_master.network.sensor_model import GaussianSensorModel
 
@@ -187,13 +187,14 @@ def averaged_likelihood(
     control : (B, T) array
         The control in force in each step.
     """
-    likelihood, log_scale = scaled_likelihood(model, observations, control)
-    evidence = transition_evidence(family, probability[None], likelihood, control)
+    log_likelihood = log_likelihood_of_twins(model, observations, control)
+    evidence = transition_evidence(family, probability[None], log_likelihood, control)
     is_explained = np.isfinite(evidence[:, 0])
+    likelihood = scaled(log_likelihood[is_explained])
     return TwinLikelihood(
-        values=likelihood[is_explained],
+        values=likelihood.values,
         control=control[is_explained],
-        log_weight=log_scale[is_explained],
+        log_weight=likelihood.log_scale,
         first_row=np.arange(is_explained.sum()),  # each twin has a single row
     )
 
@@ -225,8 +226,7 @@ def _twins_at_nodes(
     The arguments are those of `parameter_evidence`.
     """
     twin_count, step_count = control.shape
-    lanes = model.draw_count + -model.draw_count % LANES_TOGETHER
-    entries = np.repeat(family.entries(probability[None]).T, lanes, axis=1)
+    entries = np.repeat(family.entries(probability[None]).T, model.draw_count, axis=1)
     values_of_twin = max(1, step_count * model.state_count * model.draw_count)
     twins_together = max(1, _VALUES_TOGETHER // values_of_twin)
     for first in range(0, twin_count, twins_together):
@@ -235,37 +235,5 @@ def _twins_at_nodes(
         log_density = model.log_density_of_draws(all_steps, some_control.ravel())
         log_density = log_density.reshape(-1, step_count, model.state_count, model.draw_count)
         evidence = np.empty((len(some_control), model.draw_count))
-        log_scale = np.empty_like(evidence)
-        evidence_at_draws(
-            family.prior, family.lists, entries, some_control, log_density, evidence, log_scale
-        )
-        is_improbable = ~(evidence > LEAST_EVIDENCE).all(axis=1)
-        for twin in np.flatnonzero(is_improbable).tolist():
-            evidence[twin], log_scale[twin] = _evidence_with_divided_belief(
-                family, probability, log_density[twin], some_control[twin]
-            )
-        yield _TwinsAtNodes(log_density, evidence + log_scale)
-
-
-def _evidence_with_divided_belief(
-    family: TransitionFamily, probability: Float, log_density: Float, control: Index
-) -> tuple[Float, Float]:
-    """Return what `evidence_at_draws` fills in for one twin, with a belief that is divided.
-
-    Parameters
-    ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
-    probability : (K,) array
-        The probabilities to worsen.
-    log_density : (T, S, E) array
-        log p(o_t | D_t, u_t, e).
-    control : (T,) array
-        The control in force in each step.
-    """
-    log_density_by_draw = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
-    # The E draws take the place of twins: all have the same controls.
-    likelihood = scaled(log_density_by_draw)
-    control_of_draws = np.tile(control, (len(log_density_by_draw), 1))
-    evidence = transition_evidence(family, probability[None], likelihood.values, control_of_draws)
-    return evidence[:, 0], likelihood.log_scale
+        evidence_in_lanes(family.prior, family.lists, entries, some_control, log_density, evidence)
+        yield _TwinsAtNodes(log_density, evidence)

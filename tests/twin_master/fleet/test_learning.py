@@ -21,8 +21,8 @@ from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.configuration import fleet_config, group_folder
 from twin_master.fleet.evidence import (
     TransitionFamily,
+    log_likelihood_of_twins,
     reason_transitions_are_fixed,
-    scaled_likelihood,
     transition_evidence,
 )
 from twin_master.fleet.learn import learn_fleet
@@ -93,7 +93,7 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
     likelihood = generator.random((2, 4, 9))
     control = generator.permuted(np.tile(np.arange(4 + controls) % controls, (2, 1)), axis=1)[:, :4]
     points = np.array([family.assumed, 0.5 * family.assumed + 0.3])
-    found = transition_evidence(family, points, likelihood, control)
+    found = transition_evidence(family, points, np.log(likelihood), control)
     for row, point in enumerate(points):
         value = dict(zip(family.names, point.tolist(), strict=True))
         given = {
@@ -400,8 +400,8 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     assert np.isfinite(rows[:, 0, 24:]).all()
     family = TransitionFamily.learnable(known.scenario)
     model = with_noise_factor(known.sensor_model, 1.0)  # as the lessons are learnt with
-    scaled, common = scaled_likelihood(model, rows, control)
-    found = transition_evidence(family, family.assumed[None], scaled, control)[:, 0] + common
+    log_likelihood = log_likelihood_of_twins(model, rows, control)
+    found = transition_evidence(family, family.assumed[None], log_likelihood, control)[:, 0]
     np.testing.assert_allclose(found, stored["filtered/log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
@@ -444,8 +444,8 @@ def test_the_evidence_of_table_transitions_is_that_of_the_tables():
         (),
         "transitions of the kind `independent_tables` have no probability to worsen",
     )
-    expected = transition_evidence(free, free.assumed[None], likelihood, control)
-    found = transition_evidence(fixed, fixed.assumed[None], likelihood, control)
+    expected = transition_evidence(free, free.assumed[None], np.log(likelihood), control)
+    found = transition_evidence(fixed, fixed.assumed[None], np.log(likelihood), control)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
