@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from reporting.files import atomic_write_text
-from reporting.format_tables import format_page
+from reporting.format_tables import PrintedTable, format_page, printed_tables
 from uav_twin.formats import FORMATS, FileFormat
 
 ROOT = Path(__file__).parents[1]
@@ -50,9 +50,13 @@ of a scenario may end with its unit: `levels_percent` in place of `levels`.
 def pages() -> Iterator[tuple[Path, str]]:
     """Yield the files that follow from the formats, each with its text."""
     rows = []
+    # formats that are explained together, such as a verdict and its patch, share tables
+    printed_of_topic: dict[str, list[PrintedTable]] = {}
     for file_format in FORMATS.values():
         page = FOLDER / f"{file_format.name}.md"
-        yield page, _page_of(file_format)
+        printed = printed_of_topic.setdefault(file_format.page, [])
+        yield page, _page_of(file_format, printed)
+        printed += printed_tables(file_format.schema(), file_format.notation, page.name)
         yield file_format.schema_file, file_format.schema_text()
         name = Path(file_format.page).stem.replace("_", " ")
         rows.append(
@@ -62,8 +66,8 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield FOLDER / "index.md", _INTRODUCTION + "".join(rows)
 
 
-def _page_of(file_format: FileFormat) -> str:
-    """Return the page of a format."""
+def _page_of(file_format: FileFormat, printed: list[PrintedTable]) -> str:
+    """Return the page of a format, without tables that are printed on pages before it."""
     title = file_format.title[:1].upper() + file_format.title[1:]
     name = Path(file_format.page).stem.replace("_", " ")
     head = (
@@ -72,7 +76,7 @@ def _page_of(file_format: FileFormat) -> str:
         f"{file_format.name}` prints the JSON Schema. There is a [list of all "
         "formats](index.md).\n\n"
     )
-    return head + format_page(file_format.schema(), file_format.notation)
+    return head + format_page(file_format.schema(), file_format.notation, printed)
 
 
 if __name__ == "__main__":

@@ -61,8 +61,34 @@ class KeyTable:
     places: list[str] = field(default_factory=list)
 
 
-def format_page(schema: JsonSchema, notation: Notation) -> str:
-    """Return the tables of all keys of a format as text of Markdown.
+@dataclass(frozen=True)
+class PrintedTable:
+    """A table of keys that is printed on a page.
+
+    Attributes
+    ----------
+    schema : dict
+        The JSON Schema of the table.
+    address : str
+        The page, relative to the pages of the formats, and the anchor of the table on it.
+    """
+
+    schema: JsonSchema
+    address: str
+
+
+def printed_tables(schema: JsonSchema, notation: Notation, page: str) -> list[PrintedTable]:
+    """Return the tables of a format, with their addresses on the page that prints all of them."""
+    return [
+        PrintedTable(table.schema, f"{page}#{_anchor(_heading(table))}")
+        for table in _TableFinder(schema, notation).tables
+    ]
+
+
+def format_page(
+    schema: JsonSchema, notation: Notation, printed: Sequence[PrintedTable] = ()
+) -> str:
+    """Return the tables of the keys of a format as text of Markdown.
 
     Parameters
     ----------
@@ -70,20 +96,27 @@ def format_page(schema: JsonSchema, notation: Notation) -> str:
         The JSON Schema of the format.
     notation : {"toml", "json"}
         The language of its files.
+    printed : sequence of PrintedTable
+        Tables of other pages. A table of the format that equals one of them is not printed again;
+        keys link to the other page.
     """
-    tables = _TableFinder(schema, notation).tables
-    headings = {id(table.schema): _heading(table) for table in tables}
+    all_tables = _TableFinder(schema, notation).tables
+    printed_elsewhere = [table.schema for table in printed]
+    tables = [table for table in all_tables if table.schema not in printed_elsewhere]
+    addresses = [*printed]
+    for table in tables:
+        addresses.append(PrintedTable(table.schema, f"#{_anchor(_heading(table))}"))
 
     def link(table_schema: JsonSchema) -> str:
-        heading = headings[id(table_schema)]
-        return f"[table](#{_anchor(heading)})"
+        address = next(entry.address for entry in addresses if entry.schema == table_schema)
+        return f"[table]({address})"
 
     sections = []
     for table in tables:
         rows = list(_rows(table.schema, schema, link))
         summary = table.schema.get("description", "")
         paragraphs = [
-            f"## {headings[id(table.schema)]}",
+            f"## {_heading(table)}",
             _markdown(summary),
             _markdown_table(rows),
         ]
@@ -117,7 +150,10 @@ def undocumented_keys(schema: JsonSchema) -> list[str]:
 
 
 class _TableFinder:
-    """Finds all tables of a format, each once, in the order in which a reader meets them."""
+    """Finds all tables of a format, in the order in which a reader meets them.
+
+    Tables with the same keys, such as the time windows of all laws, are one.
+    """
 
     def __init__(self, schema: JsonSchema, notation: Notation) -> None:
         self.tables: list[KeyTable] = []
@@ -146,7 +182,7 @@ class _TableFinder:
     def _add_table(self, node: JsonSchema, place: str) -> None:
         """Add a table, or a further place of a table that was found before."""
         for table in self.tables:
-            if table.schema is node:
+            if table.schema == node:
                 if place not in table.places:
                     table.places.append(place)
                 return
