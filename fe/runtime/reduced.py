@@ -206,6 +206,11 @@ class ReducedModel(ReducedArrays):
         first_mass = first_control - len(self.masses)
         return self._factor_columns(self.load_factors, first_control, first_mass)
 
+    @cached_property
+    def _term_and_load_columns(self) -> IntArray:
+        """Columns (2, T + L) of the two factors of each stiffness term, and then of each load."""
+        return np.concatenate((self._stiffness_factor_columns, self._load_factor_columns), axis=1)
+
     @staticmethod
     def _factor_columns(factors: IntArray, first: int, second: int) -> IntArray:
         """Return the columns (2, k) of the two factors of each of k terms, see `_products`.
@@ -230,11 +235,15 @@ class ReducedModel(ReducedArrays):
         The factors are taken from columns of values: column 0 is one, then come the V inputs, then
         the healthy fractions 1 - loss of the damage regions.
         """
-        ones = np.ones_like(vectors[..., :1])
-        healthy = 1.0 - vectors[..., self._loss_inputs]
-        values = np.concatenate((ones, vectors, healthy), axis=-1)
+        *cases, inputs = vectors.shape
+        first_healthy = 1 + inputs
+        values = np.empty((*cases, first_healthy + len(self.regions)))
+        values[..., 0] = 1.0
+        values[..., 1:first_healthy] = vectors
+        np.subtract(1.0, vectors[..., self._loss_inputs], out=values[..., first_healthy:])
         first, second = columns
-        return np.asarray(values[..., first] * values[..., second])
+        # `take` is three times as fast as an index array after an ellipsis
+        return np.asarray(values.take(first, axis=-1) * values.take(second, axis=-1))
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
         """Return the coefficients of the T stiffness terms at values of the V inputs: (..., T)."""
@@ -305,9 +314,11 @@ class ReducedModel(ReducedArrays):
         vector = self.vector(values, stiffness_loss, **named)
         inputs = vector.tolist()
         self.check_validity(inputs)
+        coefficients = self._products(vector, self._term_and_load_columns)
+        term_count = len(self.stiffness_factors)
         solution = self._solver.solve(
-            self.stiffness_coefficients(vector),
-            self.load_coefficients(vector) if load is None else load,
+            coefficients[:term_count],
+            coefficients[term_count:] if load is None else load,
             tuple(inputs[self._loss_inputs]),
         )
         gauges = len(self.gauges)

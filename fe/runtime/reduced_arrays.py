@@ -222,20 +222,17 @@ class _Anchor(NamedTuple):
         Each output of its functions.
     correction : (O, M, R) array
         Functions applied to the basis of the residuals.
-    residual_factor : (O, F, 1 + T M) array
-        Factors of the dual residuals, see `ReducedArrays.dual_residual`.
+    output_residual : (O, F) array
+        Factor of the dual residual for the output itself, see `ReducedArrays.dual_residual`.
+    term_residual : (O, F, T M) array
+        Factors of the dual residual for the stiffness terms times the functions.
     """
 
     stiffness: FloatArray
     output: FloatArray
     correction: FloatArray
-    residual_factor: FloatArray
-
-
-_OUTPUT = 0
-"""Column of `_Anchor.residual_factor` for the output itself."""
-_TERMS = slice(1, None)
-"""Columns of `_Anchor.residual_factor` for the stiffness terms times the functions."""
+    output_residual: FloatArray
+    term_residual: FloatArray
 
 
 class _DualSolution(NamedTuple):
@@ -291,11 +288,17 @@ class CertifiedSolver:
         flat_stiffness = term_first.reshape(anchor_count, term_count, -1)
         output_first = np.ascontiguousarray(arrays.dual_correction.swapaxes(1, 2))
         output = arrays.dual_output[..., np.newaxis]
+        output_residual = np.ascontiguousarray(arrays.dual_residual[..., 0])
+        term_residual = np.ascontiguousarray(arrays.dual_residual[..., 1:])
         self._anchors = [
-            _Anchor(*anchor)
-            for anchor in zip(
-                flat_stiffness, output, output_first, arrays.dual_residual, strict=True
+            _Anchor(
+                stiffness=flat_stiffness[number],
+                output=output[number],
+                correction=output_first[number],
+                output_residual=output_residual[number],
+                term_residual=term_residual[number],
             )
+            for number in range(anchor_count)
         ]
         self._latest_dual: tuple[tuple[bytes, Losses], _DualSolution] | None = None
 
@@ -362,12 +365,10 @@ class CertifiedSolver:
 def _one_dual_function(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     """Return the dual solutions in one function for each output, without stacks of matrices."""
     stiffness = (theta @ anchor.stiffness)[:, np.newaxis]
-    weights = anchor.output.squeeze(axis=1) / stiffness
-    by_output = anchor.residual_factor[:, :, _OUTPUT]
-    by_terms = anchor.residual_factor[:, :, _TERMS]
-    residual = by_output - weights * (by_terms @ theta)
+    weights = anchor.output[:, 0] / stiffness
+    residual = anchor.output_residual - weights * (anchor.term_residual @ theta)
     squared_norm = einsum("ij,ij->i", residual, residual)
-    correction = weights * anchor.correction.squeeze(axis=1)
+    correction = weights * anchor.correction[:, 0]
     return _DualSolution(correction, np.sqrt(squared_norm))
 
 
@@ -380,9 +381,8 @@ def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     # norms of the residuals of the dual equations
     term_weights = -theta[:, np.newaxis] * weights
     coefficients = term_weights.reshape(outputs, -1, 1)
-    by_output = anchor.residual_factor[:, :, _OUTPUT]
-    by_terms = anchor.residual_factor[:, :, _TERMS]
-    residual = by_output + np.squeeze(by_terms @ coefficients, axis=-1)
+    term_residual = np.squeeze(anchor.term_residual @ coefficients, axis=-1)
+    residual = anchor.output_residual + term_residual
     squared_norm = einsum("ij,ij->i", residual, residual)
     correction = np.squeeze(weights @ anchor.correction, axis=1)
     return _DualSolution(correction, np.sqrt(squared_norm))
