@@ -16,7 +16,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.workflow import begin_watch, resume_watch
 
 STEPS = 20_000
 REPETITIONS = 7

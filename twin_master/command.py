@@ -339,7 +339,7 @@ def _outcome_record(outcome: "RunOutcome") -> "JsonObject":
 
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run next to their reference values, and where the report is."""
-    from twin_master.store.printed_figures import printed_figures
+    from twin_master.store.writing import printed_figures
 
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []

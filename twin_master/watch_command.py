@@ -163,7 +163,7 @@ def watch(
 
     Example: `uav-twin watch watched_wing --out runs/watched`
     """
-    from twin_master.watch import broker_address, opening
+    from twin_master.watch import broker_address, workflow
 
     watches: list[Watch] = []
     is_broker = broker_address.is_broker(observations or "")
@@ -175,7 +175,7 @@ def watch(
             watches.append(watched)
             begun(watched.folder)
 
-        folder = opening.watch(
+        folder = workflow.watch(
             scenario,
             observations,
             out,

@@ -64,7 +64,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.watch.cause_search import CauseSearch as CauseSearch
     from twin_master.watch.cause_search import RunningSearch as RunningSearch
     from twin_master.watch.cause_search import SearchRequest as SearchRequest
-    from twin_master.watch.opening import open_run as open_run
+    from twin_master.watch.workflow import open_run as open_run
     from twin_master.workflow import fly as fly
     from twin_master.workflow import resume as resume
     from uav_twin.watching import watch as watch
@@ -123,7 +123,7 @@ _HOMES = {
     "CauseSearch": "twin_master.watch.cause_search",
     "RunningSearch": "twin_master.watch.cause_search",
     "SearchRequest": "twin_master.watch.cause_search",
-    "open_run": "twin_master.watch.opening",
+    "open_run": "twin_master.watch.workflow",
     "fly": "twin_master.workflow",
     "resume": "twin_master.workflow",
     "watch": "uav_twin.watching",

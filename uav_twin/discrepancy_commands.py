@@ -342,7 +342,7 @@ def _read_campaign_and_model(
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.sources.from_run import run_campaign
-    from twin_master.watch.opening import copy_of_run_until
+    from twin_master.watch.workflow import copy_of_run_until
 
     if from_run is None:
         assert campaign is not None

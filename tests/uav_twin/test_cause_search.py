@@ -10,7 +10,7 @@ import pytest
 import uav_twin
 from tests.twin_master.watch.conftest import wait_until
 from twin_master.errors import MissionInputError
-from twin_master.watch import opening
+from twin_master.watch import workflow
 from twin_master.watch.cause_search import SearchRequest
 from uav_twin import watch_command
 from uav_twin.cause_search import COMMAND, NICENESS, DiscrepancySearch, with_discrepancy_search
@@ -84,5 +84,5 @@ def test_to_teach_without_a_search_is_refused_before_a_folder_is_made(tmp_path):
     with pytest.raises(
         MissionInputError, match=r"`teach` needs a `cause_search`, as `uav_twin.watch` has it"
     ):
-        opening.watch("watched_wing", folder=tmp_path / "watch", teach=True)
+        workflow.watch("watched_wing", folder=tmp_path / "watch", teach=True)
     assert not (tmp_path / "watch").exists()

@@ -24,7 +24,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
-from twin_master.watch.opening import begin_watch
+from twin_master.watch.workflow import begin_watch
 from uav_twin import fly, load_calibration, open_run, structure_files
 
 INPUTS = Inputs(__file__)

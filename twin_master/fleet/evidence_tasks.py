@@ -28,8 +28,7 @@ from twin_master.fleet.parameter_evidence import (
 )
 from twin_master.fleet.posterior import Axes
 from twin_master.fleet.store import open_group
-from twin_master.fleet.store_layout import BLOCK_TWINS
-from twin_master.fleet.stored_observations import ObservedTwins, StoredObservations
+from twin_master.fleet.store_layout import BLOCK_TWINS, ObservedTwins, StoredObservations
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 

@@ -21,7 +21,7 @@ from twin_master.fleet.evidence_tasks import with_all_transitions_possible
 from twin_master.fleet.parameter_evidence import parameter_evidence
 from twin_master.fleet.posterior import Axes, Distribution, cell_probabilities, resolve_density
 from twin_master.fleet.reading import TwinsOfScenario
-from twin_master.fleet.stored_observations import ObservedTwins, StoredObservations
+from twin_master.fleet.store_layout import ObservedTwins, StoredObservations
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 

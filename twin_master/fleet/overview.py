@@ -13,9 +13,9 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
 from twin_master.errors import TwinMasterError
+from twin_master.fleet.asset_states import AssetStates, states_of_flown_assets
 from twin_master.fleet.outcomes import Fraction
 from twin_master.fleet.reading import ControlForecast, believed_means
-from twin_master.fleet.standing import Standing, standing_of_flown
 from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows
 from twin_master.fleet.store_layout import NOTICE_KINDS, TWIN_AXIS, row_blocks, stored_values
 
@@ -49,7 +49,7 @@ class DrawnAssets:
     state: list[Float] = field(default_factory=list)
     failed_count: int = 0
 
-    def add(self, group: "xr.DataTree", rows: slice, standing: Standing) -> None:
+    def add(self, group: "xr.DataTree", rows: slice, states: AssetStates) -> None:
         """Add those of the flown assets of a block that are shown.
 
         Parameters
@@ -58,14 +58,14 @@ class DrawnAssets:
             The stored results of the group.
         rows : slice
             The rows of the block.
-        standing : Standing
-            The standing of its flown assets.
+        states : AssetStates
+            The states of its flown assets.
         """
         status = stored_values(group, "status", rows)
         is_drawn = (np.arange(rows.start, rows.stop) % self.distance) == 0
         flown = flown_rows(status)
         drawn = flown[is_drawn[flown]]
-        self.last_mean.append(standing.mean[is_drawn[flown]])
+        self.last_mean.append(states.mean[is_drawn[flown]])
         self.mean.append(believed_means(group, rows)[drawn])
         self.state.append(stored_values(group, "truth/state", rows)[drawn])
         self.failed_count += int(np.sum(status[is_drawn] == FAILED))
@@ -88,9 +88,9 @@ class GroupOverview:
         The first step of an alarm.
     prompt_fallbacks : Fraction
         Fallbacks within `WITHIN` steps, of those that the damage called for.
-    urgent : Standing
+    urgent : AssetStates
         The assets that need attention first, in order.
-    most_damaged : Standing or None
+    most_damaged : AssetStates or None
         The most severely damaged asset; None if no asset has an estimated state.
     drawn : DrawnAssets
         The assets that figures show.
@@ -100,7 +100,7 @@ class GroupOverview:
 
     record: JsonRecord
     twin_count: int
-    urgent: Standing
+    urgent: AssetStates
     drawn: DrawnAssets
     flown_count: int = 0
     failed_count: int = 0
@@ -108,7 +108,7 @@ class GroupOverview:
     alarmed_count: int = 0
     first_alarm: int | None = None
     prompt_fallbacks: Fraction = field(default_factory=Fraction)
-    most_damaged: Standing | None = None
+    most_damaged: AssetStates | None = None
     leaving_unknown_because: str = ""
 
     def add_counts(self, group: "xr.DataTree", rows: slice) -> None:
@@ -128,14 +128,14 @@ class GroupOverview:
         delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
         self.prompt_fallbacks.add(delays_when_called_for <= WITHIN)
 
-    def add_standing(self, standing: Standing, most_assets: int) -> None:
+    def add_states(self, states: AssetStates, most_assets: int) -> None:
         """Keep the assets of a block that need attention first, and the most damaged one."""
-        candidates = self.urgent.followed_by(standing)
+        candidates = self.urgent.followed_by(states)
         self.urgent = candidates.of_assets(candidates.attention_order[:most_assets])
-        number = standing.most_damaged
+        number = states.most_damaged
         if number is None:
             return
-        block_worst = standing.of_assets(np.array([number]))
+        block_worst = states.of_assets(np.array([number]))
         if self.most_damaged is None or block_worst.severity > self.most_damaged.severity:
             self.most_damaged = block_worst
 
@@ -161,7 +161,7 @@ def overview_of_group(
     overview = GroupOverview(
         record=record,
         twin_count=twin_count,
-        urgent=standing_of_flown(record, group, no_rows),
+        urgent=states_of_flown_assets(record, group, no_rows),
         drawn=DrawnAssets(distance=-(-twin_count // DRAWN_ASSETS)),
     )
     forecast = ControlForecast(folder, record)
@@ -173,9 +173,9 @@ def overview_of_group(
                 leaving = forecast.probabilities(group, rows)
             except TwinMasterError as error:
                 overview.leaving_unknown_because = str(error)
-        standing = standing_of_flown(record, group, rows, leaving)
-        overview.add_standing(standing, most_assets)
-        overview.drawn.add(group, rows, standing)
+        states = states_of_flown_assets(record, group, rows, leaving)
+        overview.add_states(states, most_assets)
+        overview.drawn.add(group, rows, states)
     if overview.leaving_unknown_because:
         urgent = overview.urgent
         overview.urgent = replace(urgent, leaving_probability=np.full(len(urgent.names), np.nan))

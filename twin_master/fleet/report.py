@@ -19,6 +19,7 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError
+from twin_master.fleet.asset_states import AssetStates, states_of_watched_assets
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
@@ -26,7 +27,6 @@ from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.overview import GroupOverview, overview_of_group
 from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import figure_rows, group_figures, open_groups
-from twin_master.fleet.standing import Standing, standing_of_watched
 from twin_master.fleet.store import WITHIN
 from twin_master.fleet.watched_asset import read_standing, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
@@ -233,7 +233,7 @@ def _add_watched_fleet(
     _add_lessons(page, folder)
     for record in groups:
         page.add_section(f"Group {record['name']}")
-        group_standing = standing_of_watched(record, decided)
+        group_standing = states_of_watched_assets(record, decided)
         _add_map(page, group_standing.scenario, group_standing.mean, failed=0)
         urgent = group_standing.of_assets(group_standing.attention_order[:most_assets])
         has_alarms = bool(group_standing.alarms.any())
@@ -323,7 +323,7 @@ class _AttentionTable(NamedTuple):
 
 
 def _add_attention_table(
-    page: Page, urgent: Standing, asset_count: int, *, has_alarms: bool
+    page: Page, urgent: AssetStates, asset_count: int, *, has_alarms: bool
 ) -> None:
     """Add the table of the assets that need attention first, of a number of known assets."""
     if not urgent.names:
@@ -343,38 +343,38 @@ def _add_attention_table(
     )
 
 
-def _attention_table(standing: Standing, *, has_alarms: bool) -> _AttentionTable:
+def _attention_table(states: AssetStates, *, has_alarms: bool) -> _AttentionTable:
     """Return the table of some assets, in their order."""
-    factors = printed_factors(standing.scenario)
+    factors = printed_factors(states.scenario)
     columns = []
     for factor in factors:
         columns.append(number_column(factor.title, factor.unit))
     columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
     if has_alarms:
         columns.append(number_column("alarms"))
-    percentage = standing.leaving_percentage
+    percentage = states.leaving_percentage
     rows = []
-    for number in range(len(standing.names)):
-        is_leaving_known = not np.isnan(standing.leaving_probability[number])
+    for number in range(len(states.names)):
+        is_leaving_known = not np.isnan(states.leaving_probability[number])
         row = [
-            standing.names[number],
-            str(standing.step[number]),
-            *_state_cells(standing, factors, number),
-            standing.control[number],
+            states.names[number],
+            str(states.step[number]),
+            *_state_cells(states, factors, number),
+            states.control[number],
             f"{percentage[number]:.0f}" if is_leaving_known else "",
         ]
         if has_alarms:
-            row.append(str(standing.alarms[number] or ""))
+            row.append(str(states.alarms[number] or ""))
         rows.append(row)
     return _AttentionTable(columns, rows)
 
 
-def _state_cells(standing: Standing, factors: Sequence[PrintedFactor], number: int) -> list[str]:
+def _state_cells(states: AssetStates, factors: Sequence[PrintedFactor], number: int) -> list[str]:
     """Return one cell for each factor of an asset's state: mean and standard deviation, printed."""
     cells = []
     for index, factor in enumerate(factors):
-        mean = factor.scale * standing.mean[number, index]
-        deviation = factor.scale * standing.deviation[number, index]
+        mean = factor.scale * states.mean[number, index]
+        deviation = factor.scale * states.deviation[number, index]
         if np.isnan(mean):
             cells.append("not believed")
         else:

@@ -5,6 +5,7 @@ under other names, are read in the present layout.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import product
 from math import prod
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import AnyArray, Float
+from reporting.arrays import AnyArray, Float, Index
 from reporting.json_file import JsonObject
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import SCHEMA, SEVERAL_UNITS
@@ -369,3 +370,48 @@ def former_names_used(dataset: "xr.Dataset") -> Mapping[str, str]:
     }
     paths = {name: path for name, path in FORMER_PATHS.items() if name in dataset.data_vars}
     return dimensions | paths
+
+
+class ObservedTwins(NamedTuple):
+    """The observations of some twins of one scenario in T steps.
+
+    Attributes
+    ----------
+    observed : (B, T, G + I) array
+        The readings of sensors and inspections in SI units; NaN where there is none.
+    control : (B, T) array
+        The control in force in each step.
+    """
+
+    observed: Float
+    control: Index
+
+
+class StoredObservations:
+    """The observations of a group in the store, read by blocks of twins.
+
+    A fleet may have more observations than fit in memory. The last block is kept, because the twins
+    of a block may have scenarios of their own.
+    """
+
+    def __init__(self, group: "xr.DataTree", scenario: Scenario) -> None:
+        self._group = group
+        self._scenario = scenario
+        self._block = lru_cache(maxsize=1)(self._read_block)
+
+    def blocks(self, rows: Index) -> Iterator[ObservedTwins]:
+        """Yield the observations of the twins in the rows of the store (B,), in ascending order."""
+        for number in np.unique(rows // BLOCK_TWINS).tolist():
+            rows_of_block = rows[rows // BLOCK_TWINS == number] - number * BLOCK_TWINS
+            observed, control = self._block(number)
+            yield ObservedTwins(observed[rows_of_block], control[rows_of_block])
+
+    def _read_block(self, number: int) -> ObservedTwins:
+        """Return the observations of all twins of a block."""
+        rows = slice(number * BLOCK_TWINS, (number + 1) * BLOCK_TWINS)
+        control = stored_values(self._group, "observed/control_index", rows).astype(np.int64)
+        # Steps that were not flown have the control -1. They have no observations, so that the
+        # evidence does not depend on their control: the first control takes its place.
+        return ObservedTwins(
+            observation_rows(self._group, self._scenario, rows), np.maximum(control, 0)
+        )

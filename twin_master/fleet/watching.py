@@ -25,7 +25,7 @@ from twin_master.watch.broker_address import is_broker
 from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.mqtt import Topic
-from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.workflow import begin_watch, resume_watch
 
 SEARCH_SECONDS = 2.0
 """Time between two searches for new assets [s]."""

@@ -21,7 +21,7 @@ from twin_master.report.captions import MISSION_NOW, MISSION_WHOLE, NETWORK, WOR
 from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
 from twin_master.report.learnt import learnt_figure
 from twin_master.report.mission import default_now, mission_figure
-from twin_master.report.opening import opening_sentences
+from twin_master.report.opening_sentences import opening_sentences
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
 from twin_master.store.summary import truth_mismatch

@@ -18,8 +18,8 @@ from twin_master.report.learnt import (
 )
 from twin_master.report.reading import Run, moments_of
 from twin_master.store.mission_result import LearntQuantity
-from twin_master.store.printed_figures import printed_figures
 from twin_master.store.summary import Figure
+from twin_master.store.writing import printed_figures
 
 _HASH_DIGITS = 12
 _MICROSTRAIN = 1.0e6

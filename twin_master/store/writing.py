@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
@@ -14,15 +14,21 @@ from reporting.folders import restore_folder
 from reporting.json_file import JsonObject, read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from reporting.notebook import html_table
-from reporting.words import brief
+from reporting.words import brief, number, rounded
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.pictures import plot_belief
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
-from twin_master.store.printed_figures import printed_figures
 from twin_master.store.results import csv_tables, run_groups
-from twin_master.store.summary import Figure, FigureGroup, control_changes, notice_record, summarise
+from twin_master.store.summary import (
+    Figure,
+    FigureGroup,
+    FigureValue,
+    control_changes,
+    notice_record,
+    summarise,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +40,8 @@ SUMMARY_NAME = "summary.json"
 TIMING_NAME = "timing.json"
 REPORT_NAME = "report.html"
 CSV_FOLDER = "csv"
+_MEAN = "_mean"
+_STANDARD_DEVIATION = "_standard_deviation"
 
 
 def write_run(
@@ -188,6 +196,44 @@ def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int
         **learnt_record(result.learnt, scenario.observation.sensor_units),
         **notice_record(result),
     }
+
+
+class PrintedFigure(NamedTuple):
+    """The value of a figure and its reference as texts; the latter is empty without a reference."""
+
+    value: str
+    reference: str
+
+
+def printed_figures(figures: Sequence[Figure]) -> list[PrintedFigure]:
+    """Return the printed values of the figures of a mission.
+
+    A number has three significant digits. A mean whose standard deviation is a figure, too, has the
+    decimals of that deviation, so that both can be compared.
+
+    Parameters
+    ----------
+    figures : sequence of Figure
+        All figures of the mission.
+    """
+    values = {figure.key: figure.value for figure in figures}
+    figures_in_text = []
+    for figure in figures:
+        deviation = None
+        if figure.key.endswith(_MEAN):
+            deviation = values.get(figure.key.removesuffix(_MEAN) + _STANDARD_DEVIATION)
+        reference = ""
+        if figure.reference is not None:
+            reference = _printed_number(figure.reference, deviation)
+        figures_in_text.append(PrintedFigure(_printed_number(figure.value, deviation), reference))
+    return figures_in_text
+
+
+def _printed_number(value: FigureValue, deviation: FigureValue) -> str:
+    """Return a value with the decimals of its standard deviation, if that is known."""
+    if isinstance(value, float) and isinstance(deviation, float) and deviation > 0.0:
+        return rounded(value, deviation)
+    return number(value)
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.json_file import JsonObject
+from reporting.errors import DamagedFileError
+from reporting.json_file import JsonObject, read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import (
     Expectation,
@@ -33,8 +34,7 @@ from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, load_know
 from twin_master.mission.recent_parts import RecentParts
 from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict
-from twin_master.run_folder import read_scenario
-from twin_master.viewer.force_drawing import ForceDrawing, find_force_drawing
+from twin_master.run_folder import PICTURE, VERDICT, read_scenario
 
 MOST_NEW_LINES = 200
 """Largest number of lines that an update reads, so that viewers are answered in between."""
@@ -65,6 +65,48 @@ class StepBeliefs(NamedTuple):
     is_believed: NDArray[np.bool_]
     expected: Expectation
     control_probability: Float
+
+
+class ForceDrawing(NamedTuple):
+    """The drawing of the missing force that a verdict has found.
+
+    Attributes
+    ----------
+    step : int
+        The step after which the verdict came.
+    path : Path
+        The file of the drawing, SVG.
+    sentence : str
+        The sentence of the verdict.
+    """
+
+    step: int
+    path: Path
+    sentence: str
+
+
+def find_force_drawing(step: int, verdict_folder: Path) -> ForceDrawing | None:
+    """Return the drawing of a missing force in the folder of a verdict.
+
+    Parameters
+    ----------
+    step : int
+        The step after which the verdict came.
+    verdict_folder : Path
+        The folder of the verdict.
+
+    Returns
+    -------
+    ForceDrawing or None
+        None if the folder has no drawing, or no verdict that can be read.
+    """
+    drawing = verdict_folder / PICTURE
+    if not drawing.is_file():
+        return None
+    with suppress(DamagedFileError, KeyError, TypeError):
+        verdict = read_json(verdict_folder / VERDICT, DamagedFileError)["verdict"]
+        return ForceDrawing(step, drawing, str(verdict["sentence"]))
+    return None
 
 
 @dataclass

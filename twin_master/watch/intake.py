@@ -22,8 +22,8 @@ from twin_master.watch.clock import Clock
 from twin_master.watch.feed import Feed
 from twin_master.watch.lines import Position
 from twin_master.watch.message import FeedItem, Message, Refused
+from twin_master.watch.records import StepStatus
 from twin_master.watch.rejected import RejectedFile
-from twin_master.watch.step_status import StepStatus
 from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices
 
 POLL_SECONDS = 0.05

@@ -29,8 +29,7 @@ from twin_master.watch.message import (
     Refused,
 )
 from twin_master.watch.payload import PayloadReader
-from twin_master.watch.records import JournalLine
-from twin_master.watch.step_status import StepStatus
+from twin_master.watch.records import JournalLine, StepStatus
 
 _TEXT_CHARACTERS = 300
 

@@ -304,7 +304,7 @@ def numbers_of(record: Any) -> list[float]:
 
 
 def test_a_fleet_that_is_read_by_blocks_teaches_what_the_whole_teaches(grown, learnt_by_fleet, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.stored_observations.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
     record = learn_fleet(grown[1])["groups"]["growing_damage"]
     np.testing.assert_allclose(numbers_of(record), numbers_of(learnt_by_fleet[0]), rtol=1e-9)
 

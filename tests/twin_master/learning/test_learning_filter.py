@@ -12,9 +12,8 @@ from tests.costs import once
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import estimates_of
 from twin_master.learning.draw_posterior import posterior_of_draws
-from twin_master.learning.expectation import LearntExpectation
+from twin_master.learning.expectation import LearntExpectation, mixture_quantiles
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.mixture_quantiles import mixture_quantiles
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel

@@ -24,7 +24,7 @@ from twin_master.report import page as report
 from twin_master.report.calibration import true_value
 from twin_master.report.check import predictive_check
 from twin_master.report.mission import default_now, mission_figure
-from twin_master.report.opening import opening_sentences
+from twin_master.report.opening_sentences import opening_sentences
 from twin_master.report.page import lost_ranges
 from twin_master.report.reading import Run
 from twin_master.run_folder import to_json

@@ -34,8 +34,8 @@ from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.opening import begin_watch
 from twin_master.watch.result import store_watch
+from twin_master.watch.workflow import begin_watch
 
 HANGS = 600
 """After so long [s] something hangs; nothing here takes a second on a machine that is not busy."""

@@ -35,9 +35,9 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feeds import feed_of_lines, file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import copy_of_run_until, resume_watch
 from twin_master.watch.recorded_feeds import FolderFeed
 from twin_master.watch.result import notices_since, store_watch
+from twin_master.watch.workflow import copy_of_run_until, resume_watch
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 

@@ -96,7 +96,7 @@ class ShippedRecording:
     def command(self, *options: str) -> subprocess.CompletedProcess[str]:
         """Watch the recording, or resume the watch, without storing its result."""
         with pytest.MonkeyPatch.context() as patching:
-            patching.setattr("twin_master.watch.opening.store_watch", lambda *_words, **_options: None)
+            patching.setattr("twin_master.watch.workflow.store_watch", lambda *_words, **_options: None)
             if "--resume" in options:
                 return command("watch", "--out", self.folder, *options)
             return command("watch", "watched_wing", "--out", self.folder, *options)
@@ -154,7 +154,7 @@ def test_a_recording_that_was_watched_to_its_end_is_not_read_again(shipped_recor
 
 
 def test_a_decision_without_a_believed_state_is_shown_to_people(shipped_recording, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.opening.store_watch", lambda *_words, **_options: None)
+    monkeypatch.setattr("twin_master.watch.workflow.store_watch", lambda *_words, **_options: None)
     line = r"step 59: 3g, no state is believed; next 2g with .*; by none of these \(1\.00\)"
     assert re.search(line, seen("watch", "--resume", "--out", shipped_recording.folder))
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Standing:
+class AssetStates:
     """State, control and alarms of B assets of a group after their last steps.
 
     Attributes
@@ -56,8 +56,8 @@ class Standing:
     alarms: Index
     leaving_probability: Float
 
-    def of_assets(self, indices: Index) -> "Standing":
-        """Return the standing of some of the assets, in the order of the indices."""
+    def of_assets(self, indices: Index) -> "AssetStates":
+        """Return the states of some of the assets, in the order of the indices."""
         numbers = indices.tolist()
         return replace(
             self,
@@ -70,8 +70,8 @@ class Standing:
             leaving_probability=self.leaving_probability[indices],
         )
 
-    def followed_by(self, others: "Standing") -> "Standing":
-        """Return the standing of these assets and of others of the same group."""
+    def followed_by(self, others: "AssetStates") -> "AssetStates":
+        """Return the states of these assets and of others of the same group."""
         return replace(
             self,
             names=self.names + others.names,
@@ -114,12 +114,12 @@ class Standing:
         return int(np.nanargmax(self.severity))
 
 
-def standing_of_flown(
+def states_of_flown_assets(
     group_record: JsonRecord,
     group: "xr.DataTree",
     rows: slice,
     leaving_probability: Float | None = None,
-) -> Standing:
+) -> AssetStates:
     """Return state, control and alarms of the flown twins in some rows after their last steps.
 
     Parameters
@@ -143,7 +143,7 @@ def standing_of_flown(
     last_step = last_steps(group, rows)[flown]
     at_last_step = (flown, last_step)
     last_control = stored_values(group, "observed/control_index", rows)[at_last_step]
-    return Standing(
+    return AssetStates(
         group=group_record["name"],
         scenario=scenario,
         names=[members.name(first_row + distance * row) for row in flown.tolist()],
@@ -156,7 +156,7 @@ def standing_of_flown(
     )
 
 
-def standing_of_watched(group_record: JsonRecord, decided_assets: JsonRecord) -> Standing:
+def states_of_watched_assets(group_record: JsonRecord, decided_assets: JsonRecord) -> AssetStates:
     """Return state, control and alarms of the assets of a watched group after their last steps.
 
     Parameters
@@ -181,7 +181,7 @@ def standing_of_watched(group_record: JsonRecord, decided_assets: JsonRecord) ->
     alarms = [asset_record["alarms"] for asset_record in asset_records]
     # None where it is not known, which becomes NaN
     leaving_probability = [asset_record["leaving"] for asset_record in asset_records]
-    return Standing(
+    return AssetStates(
         group=group_record["name"],
         scenario=scenario,
         names=names,
