@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Figures
     from twin_master.fleet.watched_asset import WatchedAsset
-    from twin_master.watch.metrics_server import MetricsServer
+    from twin_master.watch.metrics import MetricsServer
 
 
 Standing = Mapping[str, Any]
@@ -100,7 +100,7 @@ def watch(
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
-    from twin_master.watch.metrics_server import serve_metrics
+    from twin_master.watch.metrics import serve_metrics
     from twin_master.watch.signals import call_on_end_signal
 
     fleet = load_fleet(file, seed)

@@ -1,58 +1,51 @@
-"""Figures of a watch for a monitoring system, in the text format of Prometheus."""
+"""Figures of watches for a monitoring system, served over HTTP in the text format of Prometheus."""
 
 import math
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import chain
-from typing import Literal
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import NamedTuple
 
+from prometheus_client import CollectorRegistry, generate_latest, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+from twin_master.errors import MissionInputError
 from twin_master.mission.residuals import residual_summary
 from twin_master.mission.steps import History
 from twin_master.watch.folder import Watch
 from twin_master.watch.records import Decision
 
-_PREFIX = "uav_twin_"
 ALARM = "alarm"
 """The kind of notice that is counted from the beginning on, so that its counter is never absent."""
+LOOPBACK = "127.0.0.1"
+"""The address that is served where the user names none: that of this machine alone."""
+_ADDRESS = re.compile(r"(?:(\[[\w.:]+\]|[\w.-]+):)?(\d{1,5})")
+_LARGEST_PORT = 65_535
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """A value of a metric.
 
     Attributes
     ----------
+    name : str
+        The name of the metric, without the prefix `uav_twin_`.
+    meaning : str
+        The meaning of the metric, with the unit.
     value : float
         The value.
     labels : dict of str to str
-        What distinguishes it from other values of the metric.
-    """
-
-    value: float
-    labels: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Metric:
-    """A figure with all its values.
-
-    Attributes
-    ----------
-    name : str
-        The name, without the prefix `uav_twin_`.
-    kind : str
-        "gauge" if it rises and falls; "counter" if it only rises while a process lives.
-    meaning : str
-        The meaning, with the unit.
-    samples : list of Sample
-        The values; a figure without any is left out.
+        What distinguishes the value from other values of the metric.
+    is_counter : bool
+        Whether the metric only rises while a process lives. Otherwise it is a gauge.
     """
 
     name: str
-    kind: Literal["gauge", "counter"]
     meaning: str
-    samples: list[Sample]
+    value: float
+    labels: Mapping[str, str] = {}
+    is_counter: bool = False
 
 
 class WatchMetrics:
@@ -82,87 +75,77 @@ class WatchMetrics:
         self._notice_counts = self._notice_counts + new_kinds
         self._notice_counts.setdefault(ALARM, 0)
 
-    def metrics(self) -> list[Metric]:
-        """Return all figures; none before the watch has begun to read messages."""
-        if not self.watch.has_begun:
-            return []
-        return [*self._decision_metrics(self._decision), *self._message_metrics()]
+    def samples(self) -> Iterator[Sample]:
+        """Yield all figures; none before the watch has begun to read messages."""
+        if self.watch.has_begun:
+            yield from self._decision_samples(self._decision)
+            yield from self._message_samples()
 
-    def _decision_metrics(self, decision: Decision) -> Iterator[Metric]:
+    def _decision_samples(self, decision: Decision) -> Iterator[Sample]:
         """Yield the figures of the last decision; none before the first one."""
         if "health" not in decision:
             return
-        yield Metric("step", "gauge", "Number of the last step.", [Sample(decision["step"])])
-        yield self._belief_metric("mean", "Believed mean of a state, in its unit.")
-        yield self._belief_metric(
-            "standard_deviation", "Standard deviation of the belief about a state, in its unit."
-        )
-        yield Metric(
-            "state_believed",
-            "gauge",
-            "1 if a state explains the sensors, 0 if none does.",
-            [Sample(float(decision["state_believed"]))],
-        )
-        yield self._control_metric("control", "1 for the control in force, 0 for the others.")
-        yield self._control_metric("next_control", "1 for the control decided for the next step.")
-        yield Metric(
-            "next_control_probability",
-            "gauge",
-            "Probability of the decided control.",
-            [Sample(decision["probability"])],
-        )
-        yield Metric(
-            "lost_sensors",
-            "gauge",
-            "Number of sensors without a reading in the last step.",
-            [Sample(decision["lost_sensors"])],
-        )
-        yield Metric(
-            "log_evidence",
-            "gauge",
-            "Log evidence of the readings of the last step [nats].",
-            [Sample(decision["log_evidence"])],
-        )
-        hypotheses = decision.get("hypotheses", {})
-        yield Metric(
-            "hypothesis_probability",
-            "gauge",
-            "Probability of a hypothesis about sensors and model.",
-            [Sample(value, {"hypothesis": name}) for name, value in hypotheses.items()],
-        )
-        yield Metric(
-            "residual_rms",
-            "gauge",
-            "Root mean square residual of the last step [standard deviations of the noise].",
-            self._residual_samples(),
-        )
-
-    def _belief_metric(self, moment: str, meaning: str) -> Metric:
-        """Return mean or standard deviation of each state; NaN for a state that is not believed."""
-        samples = []
-        for name, health in self._decision["health"].items():
-            value = math.nan if health[moment] is None else health[moment]
-            samples.append(Sample(value, {"state": name, "unit": health["unit"]}))
-        return Metric(f"state_{moment}", "gauge", meaning, samples)
-
-    def _control_metric(self, key: str, meaning: str) -> Metric:
-        """Return which control stands under a key of the decision, as 1, and 0 for the others."""
-        samples = []
+        figures = {
+            "step": (decision["step"], "Number of the last step."),
+            "state_believed": (
+                decision["state_believed"],
+                "1 if a state explains the sensors, 0 if none does.",
+            ),
+            "next_control_probability": (
+                decision["probability"],
+                "Probability of the decided control.",
+            ),
+            "lost_sensors": (
+                decision["lost_sensors"],
+                "Number of sensors without a reading in the last step.",
+            ),
+            "log_evidence": (
+                decision["log_evidence"],
+                "Log evidence of the readings of the last step [nats].",
+            ),
+        }
+        residual = self._rms_residual()
+        if residual is not None:
+            meaning = (
+                "Root mean square residual of the last step [standard deviations of the noise]."
+            )
+            figures["residual_rms"] = (residual, meaning)
+        for name, (value, meaning) in figures.items():
+            yield Sample(name, meaning, value)
+        for name, probability in decision.get("hypotheses", {}).items():
+            meaning = "Probability of a hypothesis about sensors and model."
+            yield Sample("hypothesis_probability", meaning, probability, {"hypothesis": name})
+        yield from self._state_samples(decision)
         for name in self.watch.scenario.control_names:
-            samples.append(Sample(float(name == self._decision[key]), {"control": name}))
-        return Metric(key, "gauge", meaning, samples)
+            labels = {"control": name}
+            meaning = "1 for the control in force, 0 for the others."
+            yield Sample("control", meaning, name == decision["control"], labels)
+            meaning = "1 for the control decided for the next step."
+            yield Sample("next_control", meaning, name == decision["next_control"], labels)
 
-    def _residual_samples(self) -> list[Sample]:
-        """Return the residual of the last step; nothing if it has no reading."""
+    def _state_samples(self, decision: Decision) -> Iterator[Sample]:
+        """Yield the belief about each state; NaN for a state that is not believed."""
+        meanings = {
+            "mean": "Believed mean of a state, in its unit.",
+            "standard_deviation": "Standard deviation of the belief about a state, in its unit.",
+        }
+        for name, health in decision["health"].items():
+            labels = {"state": name, "unit": health["unit"]}
+            for moment, meaning in meanings.items():
+                value = math.nan if health[moment] is None else health[moment]
+                yield Sample(f"state_{moment}", meaning, value, labels)
+
+    def _rms_residual(self) -> float | None:
+        """Return the residual of the last step; None if it has no reading."""
         step = self.watch.last_step
         if step is None:
-            return []
+            return None
         history = History(self.watch.twin, self.watch.scenario.observation.count, [step])
         summary = residual_summary(history, step.twin_step.step, self.watch.models)
-        residual = summary["rms_residual"]
-        return [] if residual is None else [Sample(residual)]
+        residual: float | None = summary["rms_residual"]
+        return residual
 
-    def _message_metrics(self) -> Iterator[Metric]:
+    def _message_samples(self) -> Iterator[Sample]:
         """Yield the counts of messages and notices, and the times of the watch."""
         counts = self.watch.intake.counts
         meanings = {
@@ -172,72 +155,127 @@ class WatchMetrics:
             "messages_duplicate": (counts.duplicates, "Messages that added nothing to their step."),
         }
         for name, (count, meaning) in meanings.items():
-            yield Metric(f"{name}_total", "counter", meaning, [Sample(count)])
-        yield Metric(
+            yield Sample(name, meaning, count, is_counter=True)
+        yield Sample(
             "missing_steps",
-            "gauge",
             "Steps that were predicted through because no message came.",
-            [Sample(counts.missing)],
+            counts.missing,
         )
-        notices = [Sample(count, {"kind": kind}) for kind, count in self._notice_counts.items()]
-        yield Metric("notices_total", "counter", "Notices to the operator.", notices)
-        yield Metric(
-            "seconds_since_step",
-            "gauge",
-            "Time since the last step [s].",
-            [Sample(self.watch.seconds_since_step)],
+        for kind, count in self._notice_counts.items():
+            labels = {"kind": kind}
+            yield Sample("notices", "Notices to the operator.", count, labels, is_counter=True)
+        yield Sample(
+            "seconds_since_step", "Time since the last step [s].", self.watch.seconds_since_step
         )
-        yield Metric(
+        yield Sample(
             "messages_waiting",
-            "gauge",
             "Messages that a broker has sent and that wait to be processed.",
-            [Sample(self.watch.intake.waiting_messages)],
+            self.watch.intake.waiting_messages,
         )
 
 
-def exposition(metrics_of_asset: Mapping[str, Sequence[Metric]]) -> str:
-    """Return metrics of assets in the text format of Prometheus, version 0.0.4.
-
-    The values of a metric stand together, whatever asset they are of.
+class MetricsServer:
+    """Serves the figures of watches, of each from the moment when it is attached.
 
     Parameters
     ----------
-    metrics_of_asset : dict of str to sequence of Metric
-        The metrics of each asset, by its name, which becomes the label `asset`.
+    host : str
+        The address or name of the interface to serve.
+    port : int
+        The port; 0 for any free one.
+
+    Attributes
+    ----------
+    address : str
+        The address of the page.
+
+    Raises
+    ------
+    MissionInputError
+        If nothing can be served there, for example because the port is taken.
     """
-    lines_of_metric: dict[str, list[str]] = {}
-    for asset, metrics in metrics_of_asset.items():
-        for metric in metrics:
-            if metric.samples:
-                lines = lines_of_metric.setdefault(metric.name, _heading_lines(metric))
-                lines += [_sample_line(metric, sample, asset) for sample in metric.samples]
-    all_lines = chain.from_iterable(lines_of_metric.values())
-    return "".join(f"{line}\n" for line in all_lines)
+
+    def __init__(self, host: str, port: int) -> None:
+        self._metrics_of_asset: dict[str, WatchMetrics] = {}
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+        with MissionInputError.instead_of(
+            OSError, before=f"the metrics cannot be served at {host}:{port}: ", after="."
+        ):
+            self._server, self._thread = start_http_server(port, host, self._registry)
+        self.address = f"http://{host}:{self._server.server_port}/metrics"
+
+    def attach(self, asset: str, watch: Watch) -> WatchMetrics:
+        """Serve the figures of a watch from now on, and return them.
+
+        Parameters
+        ----------
+        asset : str
+            The name of the asset, which is in all of its figures.
+        watch : Watch
+            The watch; one that takes the place of another of the asset begins to count anew.
+        """
+        metrics = self._metrics_of_asset.get(asset)
+        if metrics is None or metrics.watch is not watch:
+            metrics = WatchMetrics(watch)
+            self._metrics_of_asset[asset] = metrics
+        return metrics
+
+    def collect(self) -> Iterable[CounterMetricFamily | GaugeMetricFamily]:
+        """Return the metrics of all assets, as the registry of Prometheus asks for them.
+
+        The values of a metric stand together, whatever asset they are of. A metric without values
+        is left out.
+        """
+        families: dict[str, CounterMetricFamily | GaugeMetricFamily] = {}
+        # A copy, because the thread of the watches may attach another one meanwhile
+        for asset, metrics in self._metrics_of_asset.copy().items():
+            for sample in metrics.samples():
+                labels = {"asset": asset, **sample.labels}
+                if sample.name not in families:
+                    family = CounterMetricFamily if sample.is_counter else GaugeMetricFamily
+                    families[sample.name] = family(
+                        f"uav_twin_{sample.name}", sample.meaning, labels=list(labels)
+                    )
+                families[sample.name].add_metric(list(labels.values()), sample.value)
+        return families.values()
+
+    def text(self) -> str:
+        """Return the figures in the text format of Prometheus; empty before a watch is attached."""
+        text: str = generate_latest(self._registry).decode()
+        return text
+
+    def close(self) -> None:
+        """End the page."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
 
 
-def _heading_lines(metric: Metric) -> list[str]:
-    """Return the lines that say what a metric is."""
-    name = _PREFIX + metric.name
-    meaning = metric.meaning.replace("\\", r"\\").replace("\n", r"\n")
-    return [f"# HELP {name} {meaning}", f"# TYPE {name} {metric.kind}"]
+@contextmanager
+def serve_metrics(address: str | int | None) -> Iterator[MetricsServer | None]:
+    """Serve the figures of watches within a context; None if no address is given.
 
+    Parameters
+    ----------
+    address : str, int or None
+        A port of this machine, or ``HOST:PORT``, where the host is the interface to serve.
 
-def _sample_line(metric: Metric, sample: Sample, asset: str) -> str:
-    """Return the line of a value."""
-    labels = {"asset": asset, **sample.labels}
-    texts = [f'{label}="{_escape_label(value)}"' for label, value in labels.items()]
-    return f"{_PREFIX}{metric.name}{{{','.join(texts)}}} {_number_text(sample.value)}"
-
-
-def _escape_label(value: str) -> str:
-    """Return the value of a label with backslashes before backslash, quote and line feed."""
-    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
-
-
-def _number_text(value: float) -> str:
-    """Return a number as Prometheus writes it."""
-    if math.isnan(value):
-        return "NaN"
-    if math.isinf(value):
-        return "+Inf" if value > 0.0 else "-Inf"
-    return repr(float(value))
+    Raises
+    ------
+    MissionInputError
+        If the address has another form, or cannot be served.
+    """
+    if address is None:
+        yield None
+        return
+    match = _ADDRESS.fullmatch(str(address))
+    if match is None or int(match[2]) > _LARGEST_PORT:
+        raise MissionInputError(
+            f"metrics are served at a port such as 9100, or at HOST:PORT, but {address} was given."
+        )
+    server = MetricsServer((match[1] or LOOPBACK).strip("[]"), int(match[2]))
+    try:
+        yield server
+    finally:
+        server.close()

@@ -34,7 +34,6 @@ from twin_master.watch.feed import Feed
 from twin_master.watch.feeds import Observations, choose_feed
 from twin_master.watch.folder import GivenPatch, Watch
 from twin_master.watch.intake import Counts
-from twin_master.watch.metrics_server import MetricsServer, serve_metrics
 from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
 from twin_master.watch.recorded_feeds import RecordedFeed
@@ -45,6 +44,8 @@ from twin_master.watch.tutor import Tutor
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from twin_master.watch.metrics import MetricsServer
 
 
 @contextmanager
@@ -361,8 +362,9 @@ def watch(
     TwinMasterError, FiniteElementError, CalibrationError
         If the watch cannot go on, with one clear sentence; what was observed is kept.
     """
+    from twin_master.watch.metrics import serve_metrics  # slow to import, as its server is
+
     loaded_scenario = None if scenario is None else load_scenario(scenario)
-    overrides = as_overrides(overrides)
     progress = progress or SilentProgress()
     patch = _given_patch(model_patch, from_step, resume=resume)
     if loaded_scenario is None and (folder is None or not resume):
@@ -383,7 +385,7 @@ def watch(
     if replace:
         _check_recording_is_kept(feed, folder)
     opened = _open_watch(
-        loaded_scenario, folder, overrides, progress, resume=resume, replace=replace
+        loaded_scenario, folder, as_overrides(overrides), progress, resume=resume, replace=replace
     )
     with serve_metrics(metrics) as metrics_server, opened as watched:
         try:

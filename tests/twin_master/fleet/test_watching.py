@@ -43,7 +43,7 @@ from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import lock_run_folder
 from twin_master.watch.folder import Watch
-from twin_master.watch.metrics_server import MetricsServer
+from twin_master.watch.metrics import MetricsServer
 from uav_twin import fly_fleet, open_fleet
 
 
