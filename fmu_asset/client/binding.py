@@ -68,54 +68,41 @@ _HEADER_WORDS: Mapping[str, tuple[str | None, ...]] = {
 
 
 class BindingHeader(Section):
-    """The table `[binding]`.
-
-    Attributes
-    ----------
-    name : str
-        Name of the binding.
-    step_size : float
-        Communication step of the FMU [s].
-    decimation : int
-        Number of communication steps from one observation to the next; the inputs are held in
-        between.
-    start_time : float
-        Start of the FMU [s].
-    stop_time : float, optional
-        End of the experiment, which is passed to the FMU at its start [s]; some FMUs need one.
-        The asset itself does not stop there.
-    fmi_version : {"1.0", "2.0", "3.0"}, optional
-        Version of FMI that the FMU must have; without this key any version is allowed.
-    interface : {"co-simulation", "model-exchange"}, optional
-        Interface by which it is run; co-simulation if it offers that.
-    tolerance : float, optional
-        Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
-        that the FMU declares for its default experiment, and at most 1e-6 for ours [1].
-    interpolation : {"zero-order", "linear"}
-        Course of inputs between communication points. They are held, or they move in a straight
-        line to the value of a step and reach it at the end of the step, if the FMU supports it and
-        both ends are continuous.
-    structural_parameters : dict of str to float
-        Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow
-        [unit of the FMU].
-    state : {"auto", "serialised", "replay"}
-        How `save_state` saves the state; `auto` relies on the declarations of the FMU.
-    description : str
-        A line for people.
-    """
+    """The table `[binding]`."""
 
     name: _Text
+    """Name of the binding."""
     step_size: Positive
+    """Communication step of the FMU [s]."""
     decimation: int = Field(default=1, ge=1, le=10_000_000)
+    """Number of communication steps from one observation to the next. The inputs are held in
+    between. If the FMU refuses one of these steps, the instance is lost."""
     start_time: Number = 0.0
+    """Start of the FMU [s]."""
     stop_time: Number | None = None
+    """End of the experiment, which is passed to the FMU at its start [s]; some FMUs, such as those
+    of EnergyPlus, do not start without one. The asset itself does not stop there. `fmu simulate`
+    passes the end of what it simulates."""
     fmi_version: StandardVersion | None = None
+    """Version of FMI that the FMU must have; without this key any version is allowed."""
     interface: Interface | None = None
+    """Interface by which the FMU is run; co-simulation if the FMU offers it."""
     tolerance: Positive | None = None
+    """Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
+    that the FMU declares for its default experiment, and at most 1e-6 for ours [1]."""
     interpolation: Interpolation = "zero-order"
+    """Course of inputs between communication points. They are held, or they move in a straight
+    line to the value of a step and reach it at the end of the step, if the FMU supports it and
+    both ends are continuous."""
     structural_parameters: dict[str, Number] = Field(default_factory=dict)
+    """Structural parameters of FMI 3 for co-simulation, by their names in the FMU, such as
+    `{ n = 5 }` [unit of the FMU]. Inputs whose size changes are given as a whole at the first
+    step."""
     state: StateChoice = "auto"
+    """How `save_state` saves the state: `serialised` by the FMU, or by `replay`, which starts a new
+    instance and repeats its inputs. `auto` relies on the declarations of the FMU."""
     description: str = ""
+    """A line for people."""
 
     def checks(self) -> Iterator[Check]:
         """Yield an end that does not come after the start."""
@@ -127,38 +114,29 @@ class BindingHeader(Section):
 
 
 class Binding(Section):
-    """A whole binding file.
-
-    Attributes
-    ----------
-    binding : BindingHeader
-        Name, FMI version, step size.
-    control, health, load : dict of str to InputBinding
-        Inputs by role and by the caller's name.
-    observation : dict of str to VectorBinding
-        The measured quantities, in order.
-    parameter : dict of str to ParameterBinding
-        Parameters by the caller's name.
-    monitor : dict of str to ScalarBinding
-        Further scalars to be recorded.
-    port : dict of str to PortBinding
-        The ports at which other FMUs can be coupled.
-    record : RecordBinding
-        Further variables to be recorded, in the FMU's units.
-    limits : WorkerLimits
-        The time and memory that the worker may take, and its permissions.
-    """
+    """A whole binding file."""
 
     binding: BindingHeader
+    """Name, step size and interface."""
     control: dict[str, InputBinding] = Field(default_factory=dict)
+    """Inputs that the twin may choose, by the caller's names; they are sent at every step."""
     health: dict[str, InputBinding] = Field(default_factory=dict)
+    """Damage, by the caller's names. It is sent at every step, or set before the initialisation if
+    the FMU accepts it only there."""
     load: dict[str, InputBinding] = Field(default_factory=dict)
+    """Other inputs that are sent at every step, by the caller's names."""
     observation: dict[str, VectorBinding] = Field(default_factory=dict)
+    """The measured quantities; several tables follow one another."""
     parameter: dict[str, ParameterBinding] = Field(default_factory=dict)
+    """Parameters, by the caller's names; they are set before the first step."""
     monitor: dict[str, ScalarBinding] = Field(default_factory=dict)
+    """Further scalars to be recorded, by the caller's names."""
     port: dict[str, PortBinding] = Field(default_factory=dict)
+    """The ports at which other FMUs can be coupled."""
     record: RecordBinding = Field(default_factory=RecordBinding)
+    """Further variables to be recorded, in the FMU's units."""
     limits: WorkerLimits = Field(default_factory=WorkerLimits)
+    """The time and memory that the worker may take, and its permissions."""
     _file: str = PrivateAttr(default="")
 
     @property

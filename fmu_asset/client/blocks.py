@@ -520,6 +520,8 @@ class Blocks:
         Outputs after it.
     initial_values : InitialValueTable
         Values that are set before the initialisation.
+    health_at_start : dict of str to BoundInput
+        Health that is set before the initialisation only, by the binding's names.
     plan : Plan
         Plan of the instance; its folder is still empty.
 
@@ -548,6 +550,7 @@ class Blocks:
         observed = _observed_outputs(fmu, misfits)
         extras = _extra_outputs(fmu, ports, misfits)
         misfits.refuse()
+        self.health_at_start = self.initial_values.health
         self.request = Request(fmu, inputs)
         self.reply = Reply(fmu, observed, extras)
         self.plan = self._plan(configuration)
@@ -573,11 +576,6 @@ class Blocks:
             stop_time=header.stop_time,
             configuration=configuration,
         )
-
-    @property
-    def health_at_start(self) -> dict[str, BoundInput]:
-        """Health that is set before the initialisation only, by the binding's names."""
-        return self.initial_values.health
 
     def bound_input(self, role: str, name: str) -> BoundInput:
         """Return an input, also one that is set before the initialisation only.

@@ -71,32 +71,27 @@ _Ports = Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(stri
 class WorkerLimits(Section):
     """The table `[limits]` of a binding: limits and grants of the FMU's worker.
 
-    Attributes
-    ----------
-    step_time : float
-        Wall clock for a step, reading, saving or restoring a state [s].
-    load_time : float
-        Wall clock for loading, instantiation, initialisation and reset [s].
-    memory : float
-        Resident memory [MiB].
-    sandbox : bool
-        Whether the system keeps the FMU from the user's files, from programs and from the network.
-    read, write : tuple of str
-        Files and folders that the FMU may read or write in the sandbox; see `Grants` for paths.
-    ports : tuple of int
-        TCP ports to which the FMU may connect from the sandbox, on any host.
-    programs : bool
-        Whether the FMU may start programs in the sandbox.
+    Arguments of `FmiAsset` and `step_timeout` of a scenario take precedence.
     """
 
     step_time: Positive = 60.0
+    """Wall clock for a step, reading, saving or restoring a state [s]."""
     load_time: Positive = 60.0
+    """Wall clock for loading, instantiation, initialisation and reset [s]."""
     memory: Positive = 4096.0
+    """Resident memory [MiB]."""
     sandbox: bool = True
+    """Whether the system keeps the FMU from the user's files, from programs and from the
+    network."""
     read: _Paths = ()
+    """Files and folders that the FMU may read in the sandbox: absolute paths, `~/...`, or paths
+    relative to the extracted FMU, which is `.`."""
     write: _Paths = ()
+    """Files and folders that the FMU may write in the sandbox, by paths as in `read`."""
     ports: _Ports = ()
+    """TCP ports to which the FMU may connect from the sandbox, on any host."""
     programs: bool = False
+    """Whether the FMU may start programs in the sandbox."""
 
     @property
     def grants(self) -> Grants | None:
