@@ -56,7 +56,7 @@ def pages() -> Iterator[tuple[Path, str]]:
         page = FOLDER / f"{file_format.name}.md"
         printed = printed_of_topic.setdefault(file_format.page, [])
         yield page, _page_of(file_format, printed)
-        printed += printed_tables(file_format.schema(), file_format.notation, page.name)
+        printed += printed_tables(file_format.schema(), file_format.notation, page.name, printed)
         yield file_format.schema_file, file_format.schema_text()
         name = Path(file_format.page).stem.replace("_", " ")
         rows.append(

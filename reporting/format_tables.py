@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -77,12 +78,35 @@ class PrintedTable:
     address: str
 
 
-def printed_tables(schema: JsonSchema, notation: Notation, page: str) -> list[PrintedTable]:
-    """Return the tables of a format, with their addresses on the page that prints all of them."""
-    return [
-        PrintedTable(table.schema, f"{page}#{_anchor(_heading(table))}")
-        for table in _TableFinder(schema, notation).tables
-    ]
+def printed_tables(
+    schema: JsonSchema, notation: Notation, page: str, printed: Sequence[PrintedTable] = ()
+) -> list[PrintedTable]:
+    """Return the tables that `format_page` prints, with their addresses on the page."""
+    return _with_addresses(_own_tables(schema, notation, printed), page)
+
+
+def _own_tables(
+    schema: JsonSchema, notation: Notation, printed: Sequence[PrintedTable]
+) -> list[KeyTable]:
+    """Return the tables of a format that no other page prints."""
+    printed_elsewhere = [table.schema for table in printed]
+    tables = _TableFinder(schema, notation).tables
+    return [table for table in tables if table.schema not in printed_elsewhere]
+
+
+def _with_addresses(tables: Sequence[KeyTable], page: str) -> list[PrintedTable]:
+    """Return tables with their addresses on a page that prints them in this order.
+
+    GitHub and MyST number the anchors of equal headings, as of variants of a format.
+    """
+    counts: Counter[str] = Counter()
+    printed = []
+    for table in tables:
+        anchor = _anchor(_heading(table))
+        number = f"-{counts[anchor]}" if counts[anchor] else ""
+        counts[anchor] += 1
+        printed.append(PrintedTable(table.schema, f"{page}#{anchor}{number}"))
+    return printed
 
 
 def format_page(
@@ -100,12 +124,8 @@ def format_page(
         Tables of other pages. A table of the format that equals one of them is not printed again;
         keys link to the other page.
     """
-    all_tables = _TableFinder(schema, notation).tables
-    printed_elsewhere = [table.schema for table in printed]
-    tables = [table for table in all_tables if table.schema not in printed_elsewhere]
-    addresses = [*printed]
-    for table in tables:
-        addresses.append(PrintedTable(table.schema, f"#{_anchor(_heading(table))}"))
+    tables = _own_tables(schema, notation, printed)
+    addresses = [*printed, *_with_addresses(tables, page="")]
 
     def link(table_schema: JsonSchema) -> str:
         address = next(entry.address for entry in addresses if entry.schema == table_schema)

@@ -38,9 +38,9 @@ class Spot(tables.DesignSection):
     point: tables.Vector
     """Place of its middle [unit of length]."""
     length: float = Field(default=0.0, ge=0.0)
-    """Length along it over which the strain is averaged [unit of length]."""
+    """Length along it over which the strain is averaged, at 20 points [unit of length]."""
     width: float = Field(default=0.0, ge=0.0)
-    """Width across it over which the strain is averaged [unit of length]."""
+    """Width across it over which the strain is averaged, at 10 points [unit of length]."""
 
 
 class Gauge(tables.Named, Spot):

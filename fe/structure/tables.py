@@ -113,12 +113,15 @@ class Ranged(Named):
 
 
 class StiffnessParameter(Ranged):
-    """A factor on the stiffness of materials, to be calibrated; by default 1."""
+    """A factor on the stiffness of what names it in `scaled_by`, to be calibrated."""
 
     nominal: float = Field(default=1.0, gt=0.0, le=1e3)
     """Nominal value of the factor [1]."""
     minimum: float | None = Field(default=None, gt=0.0)
     """Least value for which the reduced model is valid; by default 0.9 times the nominal one
+    [1]."""
+    maximum: float | None = None
+    """Largest value for which the reduced model is valid; by default 1.1 times the nominal one
     [1]."""
 
     usual = (0.9, 1.1)
@@ -131,6 +134,12 @@ class LoadControl(Ranged):
     """Unit of the control."""
     nominal: float = 1.0
     """Nominal value [unit of the control]."""
+    minimum: float | None = None
+    """Least value for which the reduced model is valid; by default -10 times the nominal one, but
+    needed if that is 0 [unit of the control]."""
+    maximum: float | None = None
+    """Largest value for which the reduced model is valid; by default 10 times the nominal one, but
+    needed if that is 0 [unit of the control]."""
 
     usual = (-10.0, 10.0)
 
@@ -173,6 +182,9 @@ class ChosenMass(Ranged):
     """Whether the mass is calibrated or chosen later."""
     minimum: float | None = Field(default=None, ge=0.0)
     """Least mass for which the reduced model is valid; by default half the nominal one [kg]."""
+    maximum: float | None = None
+    """Largest mass for which the reduced model is valid; by default 1.5 times the nominal one
+    [kg]."""
 
     usual = (0.5, 1.5)
     nominal_key = "mass"
