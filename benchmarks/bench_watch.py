@@ -12,9 +12,9 @@ import numpy as np
 
 from benchmarks.measurement import Measurement
 from reporting.progress import SilentProgress
+from twin_master.feeds.feed_choice import file_feed
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.workflow import begin_watch, resume_watch
 

@@ -163,7 +163,8 @@ def watch(
 
     Example: `uav-twin watch watched_wing --out runs/watched`
     """
-    from twin_master.watch import broker_address, workflow
+    from twin_master.feeds import broker_address
+    from twin_master.watch import workflow
 
     watches: list[Watch] = []
     is_broker = broker_address.is_broker(observations or "")

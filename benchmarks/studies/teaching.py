@@ -31,9 +31,9 @@ from fe.runtime.patch import (
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
+from twin_master.feeds.feed_choice import file_feed
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch.feeds import file_feed
 from twin_master.watch.tutor import Tutor
 from twin_master.watch.workflow import begin_watch
 from uav_twin.cause_search import DiscrepancySearch

@@ -29,6 +29,7 @@ from reporting.words import listing
 from twin_master import run_folder
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
+from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.checks import check_fleet, flies_model, source_of
 from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
@@ -54,7 +55,6 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,6 +14,7 @@ from reporting.json_file import JsonObject
 from reporting.toml_file import Check, read_toml, validate
 from twin_master.assets.resolution import Overrides, OverridesOrMapping, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
+from twin_master.feeds.broker_address import is_broker
 from twin_master.fleet.members import (
     CountedMembers,
     ListedMembers,
@@ -38,7 +39,6 @@ from twin_master.scenario.section import (
     Seed,
     repeated_name_check,
 )
-from twin_master.watch.broker_address import is_broker
 
 SHARD = 256
 """Twins that are flown in one piece, unless the fleet file says otherwise."""

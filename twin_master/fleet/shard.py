@@ -23,6 +23,9 @@ from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.intake import Intake
+from twin_master.feeds.message import FeedItem
 from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.members import Member
 from twin_master.fleet.store import FAILED, stored_variables
@@ -39,9 +42,6 @@ from twin_master.mission.side_by_side import (
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feed import Feed
-from twin_master.watch.intake import Intake
-from twin_master.watch.message import FeedItem
 
 
 def flights_of_recordings(

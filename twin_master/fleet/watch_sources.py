@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Protocol
 
 from twin_master.errors import FleetError
+from twin_master.feeds.broker_address import parse_broker
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.feed_choice import file_feed
+from twin_master.feeds.mqtt_session import Session
 from twin_master.fleet.plan import Group, asset_name, recording_files
 from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.watch.broker_address import parse_broker
-from twin_master.watch.feed import Feed
-from twin_master.watch.feeds import file_feed
 from twin_master.watch.mqtt import Topic
-from twin_master.watch.mqtt_session import Session
 
 STEPS_AT_ONCE = 64
 """Largest number of steps of one asset that are processed before the next asset has its turn."""

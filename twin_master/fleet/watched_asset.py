@@ -8,8 +8,8 @@ import numpy as np
 from reporting.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import FleetError
+from twin_master.feeds.feed import Feed
 from twin_master.fleet.reading import probability_of_leaving, severity
-from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.result import notices_since
 

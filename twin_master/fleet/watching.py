@@ -15,14 +15,14 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.operating_system import allow_many_files
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
+from twin_master.feeds.broker_address import is_broker
+from twin_master.feeds.feed import Feed
 from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.watch_sources import LARGEST_FLEET, FileSource, Source, TopicSource
 from twin_master.fleet.watched_asset import STATE_NAME, WatchedAsset, read_standing
 from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.watch.broker_address import is_broker
-from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.mqtt import Topic
 from twin_master.watch.workflow import begin_watch, resume_watch

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from reporting.files import explained_write_errors
 from reporting.words import in_one_line
-from twin_master.watch.line_protocol import write_line
-from twin_master.watch.points import Point
-from twin_master.watch.records import Decision
+from twin_master.feeds.feed import Decision
+from twin_master.feeds.line_protocol import write_line
+from twin_master.feeds.points import Point
 
 MEASUREMENT = "uav_twin"
 """The measurement of a decision, and how the names of the others begin."""

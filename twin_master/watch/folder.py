@@ -16,6 +16,10 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
+from twin_master.feeds.feed import Decision, DecisionSink, Feed
+from twin_master.feeds.intake import KEPT_SNAPSHOT_STEPS, Counts, Intake
+from twin_master.feeds.recorded_feeds import JournalLine
+from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (
     JOURNAL_NAME,
@@ -41,8 +45,6 @@ from twin_master.run_folder import (
     remove_half_written_files,
 )
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feed import Feed
-from twin_master.watch.intake import KEPT_SNAPSHOT_STEPS, Counts, Intake
 from twin_master.watch.patch_trial import (
     NO_STEPS,
     ComparedSteps,
@@ -51,8 +53,7 @@ from twin_master.watch.patch_trial import (
     outcome_of_patch,
     patched_model,
 )
-from twin_master.watch.records import Decision, DecisionSink, JournalLine, ModelRecord
-from twin_master.watch.rejected import REJECTED_NAME
+from twin_master.watch.records import ModelRecord
 from twin_master.watch.signals import call_on_end_signal
 from twin_master.watch.teaching import Teaching
 

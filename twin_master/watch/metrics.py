@@ -11,10 +11,10 @@ from prometheus_client import CollectorRegistry, generate_latest, start_http_ser
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
 from twin_master.errors import MissionInputError
+from twin_master.feeds.feed import Decision
 from twin_master.mission.residuals import residual_summary
 from twin_master.mission.steps import History
 from twin_master.watch.folder import Watch
-from twin_master.watch.records import Decision
 
 ALARM = "alarm"
 """The kind of notice that is counted from the beginning on, so that its counter is never absent."""

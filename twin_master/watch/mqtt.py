@@ -8,18 +8,17 @@ from pathlib import Path
 
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import JsonObject
+from twin_master.feeds.broker_address import Broker
+from twin_master.feeds.feed import Decision, Feed
+from twin_master.feeds.lines import Position
+from twin_master.feeds.message import FeedItem, Message, Refused
+from twin_master.feeds.mqtt_session import LONGEST_RETRY_SECONDS, Session
+from twin_master.feeds.payload import PayloadReader
+from twin_master.feeds.recorded_feeds import beginning_of
 from twin_master.mission.journal import JOURNAL_NAME, last_step, records
 from twin_master.mission.recent_parts import RecentParts
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.broker_address import Broker
-from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.lines import Position
-from twin_master.watch.message import FeedItem, Message, Refused
-from twin_master.watch.mqtt_session import LONGEST_RETRY_SECONDS, Session
-from twin_master.watch.payload import PayloadReader
-from twin_master.watch.recorded_feeds import beginning_of
-from twin_master.watch.records import Decision
 
 PUBLISHED_NAME = "published"
 """The file of a watch with the size of that part of the journal whose decisions the broker has."""

@@ -1,28 +1,8 @@
-"""What a watch writes and publishes as JSON: lines of its journal, decisions, verdicts, models."""
+"""What a watch writes into its journal as JSON: verdicts and models."""
 
-from collections.abc import Callable
-from enum import IntEnum
 from typing import NotRequired, TypedDict
 
-from reporting.json_file import JsonObject, JsonRecord
-
-JournalLine = JsonRecord
-"""A line of `journal.jsonl`; `docs/reference/run_folder.md` lists its keys."""
-Decision = JsonRecord
-"""A decision as it is published; `docs/how_to/watch.md` lists its keys."""
-DecisionSink = Callable[[Decision], object]
-"""A function that is called with each decision, once its step is in the journal."""
-
-
-class StepStatus(IntEnum):
-    """Whether a message of a step has come, and with its control; journals store the numbers."""
-
-    MISSING = 0
-    """No message has come."""
-    ASSUMED_CONTROL = 1
-    """A message without a control has come: the assumed control may be corrected by a later one."""
-    WITH_CONTROL = 2
-    """A message with its control has come."""
+from reporting.json_file import JsonObject
 
 
 class VerdictRecord(TypedDict):

@@ -6,6 +6,9 @@ from itertools import takewhile
 
 from reporting.json_file import JsonObject
 from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.feeds.intake import Counts
+from twin_master.feeds.recorded_feeds import JournalLine
+from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.journal import last_step, records_backwards
 from twin_master.mission.replay import replay
 from twin_master.network.estimator import Notice
@@ -13,9 +16,6 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import FigureGroup
 from twin_master.store.writing import store_flight
 from twin_master.watch.folder import WATCHED_ASSET, Watch
-from twin_master.watch.intake import Counts
-from twin_master.watch.records import JournalLine
-from twin_master.watch.rejected import REJECTED_NAME
 
 STORED_STEPS = 1_000
 """Default number of last steps in `run.nc` and in the report; the journal has all steps."""

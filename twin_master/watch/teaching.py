@@ -11,9 +11,10 @@ from pathlib import Path
 
 from reporting.json_file import JsonObject
 from twin_master.errors import MissionInputError
+from twin_master.feeds.recorded_feeds import JournalLine
 from twin_master.mission.journal import damaged_line_error, records_backwards
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.records import JournalLine, ModelRecord, VerdictRecord
+from twin_master.watch.records import ModelRecord, VerdictRecord
 
 SETTLE_STEPS = 10
 """Number of steps after an alarm before its cause is searched; the search uses them as data."""

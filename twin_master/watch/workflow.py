@@ -22,22 +22,21 @@ from twin_master.assets.resolution import (
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.feeds.broker_address import Broker
+from twin_master.feeds.feed import Decision, DecisionSink, Feed
+from twin_master.feeds.feed_choice import Observations, choose_feed
+from twin_master.feeds.intake import Counts
+from twin_master.feeds.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
+from twin_master.feeds.recorded_feeds import RecordedFeed
 from twin_master.mission.journal import JOURNAL_NAME, last_step
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as open_stored_run
-from twin_master.watch.broker_address import Broker
 from twin_master.watch.cause_search import CauseSearch
 from twin_master.watch.decision_points import DecisionLines
-from twin_master.watch.feed import Feed
-from twin_master.watch.feeds import Observations, choose_feed
 from twin_master.watch.folder import GivenPatch, Watch
-from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
-from twin_master.watch.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
-from twin_master.watch.recorded_feeds import RecordedFeed
-from twin_master.watch.records import Decision, DecisionSink
 from twin_master.watch.result import STORED_STEPS, store_watch
 from twin_master.watch.teaching import check_teachable
 from twin_master.watch.tutor import Tutor

@@ -38,13 +38,13 @@ from tests.twin_master.runs import (
 from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
+from twin_master.feeds.message import MessageReader
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.sensor_design import add_candidate_gauges
 from twin_master.mission.steps import Plant, Truth
 from twin_master.network.identified import packed_row
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.watch.message import MessageReader
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_run, report_figures, resume, structure_files, watch
 

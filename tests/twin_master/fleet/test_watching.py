@@ -385,7 +385,7 @@ class SilentAsset:
 
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
-    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
     assets = SilentAsset(broker, tmp_path)

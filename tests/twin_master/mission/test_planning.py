@@ -17,6 +17,7 @@ from tests.costs import once
 from tests.twin_master.runs import edited, estimates_of, of_wing, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
+from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.loop import fly
@@ -36,7 +37,6 @@ from twin_master.run_folder import read_scenario
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Learning, Noticing
-from twin_master.watch.feeds import file_feed
 from uav_twin import ExactFilter, WatchfulEstimator, open_run, reduced_model
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))

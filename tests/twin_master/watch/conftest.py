@@ -22,6 +22,10 @@ from paho.mqtt import client as paho
 
 from reporting.progress import SilentProgress
 from tests.twin_master.runs import flight_of, journal, text_of
+from twin_master.feeds.broker_address import PASSWORD_VARIABLE
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.intake import Counts
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.replay import BelievedModel
@@ -29,11 +33,7 @@ from twin_master.mission.steps import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
-from twin_master.watch.broker_address import PASSWORD_VARIABLE
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feed import Feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Counts
 from twin_master.watch.result import store_watch
 from twin_master.watch.workflow import begin_watch
 

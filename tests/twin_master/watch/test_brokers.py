@@ -25,11 +25,11 @@ from tests.twin_master.watch.conftest import (
     wait_until,
 )
 from twin_master.errors import MissionInputError
+from twin_master.feeds.broker_address import PASSWORD_VARIABLE, Broker, parse_broker
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.intake import Counts
 from twin_master.mission.journal import JOURNAL_NAME, records
-from twin_master.watch.broker_address import PASSWORD_VARIABLE, Broker, parse_broker
-from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed, Topic
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches

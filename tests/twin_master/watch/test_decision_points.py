@@ -10,8 +10,8 @@ import pytest
 from reporting.errors import FileNotWrittenError
 from tests.command_line import command
 from tests.refusals import Inputs
+from twin_master.feeds.line_protocol import parse_line, write_line
 from twin_master.watch.decision_points import DecisionLines, decision_points
-from twin_master.watch.line_protocol import parse_line, write_line
 
 TIME = 1_790_000_000_000_000_000
 DECISION = {

@@ -17,9 +17,9 @@ import pytest
 from tests.twin_master.runs import belief_in_journal, journal
 from tests.twin_master.watch.conftest import ran
 from twin_master.errors import MissionInputError
-from twin_master.watch.csv_feed import CsvFeed
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.message import Message, Refused
 from twin_master.watch.folder import Watch
-from twin_master.watch.message import Message, Refused
 
 pytestmark = pytest.mark.xdist_group("watches")
 

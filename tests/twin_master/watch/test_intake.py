@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 
 from tests.refusals import Inputs
 from tests.twin_master.runs import of_library
+from twin_master.feeds import feed_choice
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.intake import Intake
+from twin_master.feeds.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
 from twin_master.scenario.tables import WatchSection
-from twin_master.watch import feeds
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feed import Feed
-from twin_master.watch.intake import Intake
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 from uav_twin import Twin, load_scenario
 
 STEPS = 60
@@ -61,7 +61,7 @@ def message(row: np.ndarray, **others: object) -> bytes:
 def intake_of(
     knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None, feed: Feed | None = None
 ) -> Intake:
-    feed = feed or feeds.feed_of_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
+    feed = feed or feed_choice.feed_of_lines(knowledge.scenario, io.BytesIO(b"".join(lines)))
     return Intake(knowledge.scenario, feed, rejected)
 
 
@@ -218,7 +218,7 @@ def test_anything_is_an_observation_or_refused(content):
 def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
     knowledge, clean, expected, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("twin_master.watch.rejected.REJECTED_KEPT", 50)
+    monkeypatch.setattr("twin_master.feeds.rejected.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
     flood = [big, deep, b"\xff\xfe{\n", b"NaN\n", b'{"step": NaN}\n', b'{"step": 1e999}\n'] * 3

@@ -14,15 +14,15 @@ import pytest
 from tests.twin_master.runs import check_same, in_format_1, journal
 from tests.twin_master.watch.conftest import HANGS, Mosquitto, begun, mosquitto, ran, wait_until, write_csv
 from tests.twin_master.watch.test_brokers import TOPIC, heard_at, where_of
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.recorded_feeds import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.recent_parts import RECENT_NAMES
 from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.mqtt import MqttFeed
-from twin_master.watch.recorded_feeds import FolderFeed
 from twin_master.watch.teaching import Teaching
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches

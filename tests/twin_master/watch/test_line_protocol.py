@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.refusals import Inputs
-from twin_master.watch.line_protocol import looks_like_line_protocol, parse_line, write_line
-from twin_master.watch.points import FieldValue, Point
+from twin_master.feeds.line_protocol import looks_like_line_protocol, parse_line, write_line
+from twin_master.feeds.points import FieldValue, Point
 
 INPUTS = Inputs(__file__)
 

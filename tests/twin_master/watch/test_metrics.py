@@ -17,7 +17,7 @@ from tests.command_line import command
 from tests.refusals import refused
 from tests.twin_master.watch.conftest import HANGS, served, wait_until
 from twin_master.errors import MissionInputError
-from twin_master.watch.csv_feed import CsvFeed
+from twin_master.feeds.csv_feed import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.metrics import WatchMetrics, serve_metrics
 from uav_twin import watch as watch_asset

@@ -11,10 +11,10 @@ import pytest
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import begun, killed_at, ran
 from tests.twin_master.watch.test_stream import EPOCH, decisions_of, kinds, line, sentence, with_section
+from twin_master.feeds.feed_choice import file_feed
+from twin_master.feeds.message import Message, MessageReader
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.message import Message, MessageReader
 
 pytestmark = pytest.mark.xdist_group("watches")
 

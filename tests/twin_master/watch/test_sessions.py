@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from tests.twin_master.watch.conftest import HANGS, Mosquitto, mosquitto, wait_until
-from twin_master.watch.broker_address import parse_broker
-from twin_master.watch.mqtt_session import Session
+from twin_master.feeds.broker_address import parse_broker
+from twin_master.feeds.mqtt_session import Session
 
 TOPIC = "wings/+"
 
@@ -69,8 +69,8 @@ def publish(broker: Mosquitto, count: int, text: str = "") -> Any:
 def test_heartbeats_come_while_messages_wait_and_say_that_the_twin_does_not_keep_up(
     broker, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 0.3)
-    monkeypatch.setattr("twin_master.watch.mqtt_session.EXCHANGE_SECONDS", 0.1)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.HEARTBEAT_SECONDS", 0.3)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.EXCHANGE_SECONDS", 0.1)
     heard: list[dict[str, Any]] = []
     broker.client("listener", heard).subscribe("wings/fleet/heartbeat")
     reader = Reader(broker, tmp_path)
@@ -85,8 +85,8 @@ def test_heartbeats_come_while_messages_wait_and_say_that_the_twin_does_not_keep
 def test_the_operator_is_told_once_that_messages_come_too_fast_and_that_it_is_over(
     broker, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 0.3)
-    monkeypatch.setattr("twin_master.watch.mqtt_session.EXCHANGE_SECONDS", 0.1)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.HEARTBEAT_SECONDS", 0.3)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.EXCHANGE_SECONDS", 0.1)
     reader = Reader(broker, tmp_path)
     publish(broker, 150)
     reader.read(150, pause=0.01)
@@ -99,8 +99,8 @@ def test_a_heartbeat_that_follows_a_connection_at_once_does_not_tell_of_too_many
     broker, tmp_path, monkeypatch
 ):
     """When a broker comes back, messages wait, and heartbeats are sent without a pause."""
-    monkeypatch.setattr("twin_master.watch.mqtt_session.HEARTBEAT_SECONDS", 1000.0)
-    monkeypatch.setattr("twin_master.watch.mqtt_session.EXCHANGE_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.HEARTBEAT_SECONDS", 1000.0)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.EXCHANGE_SECONDS", 0.0)
     heard: list[dict[str, Any]] = []
     broker.client("listener", heard).subscribe("wings/fleet/heartbeat")
     reader = Reader(broker, tmp_path)
@@ -114,8 +114,8 @@ def test_a_heartbeat_that_follows_a_connection_at_once_does_not_tell_of_too_many
 
 def test_what_waits_in_memory_is_limited_whatever_a_broker_sends(broker, tmp_path, monkeypatch):
     """Mosquitto 2.0.11 sends all that it has, once a message is acknowledged, whatever was agreed."""
-    monkeypatch.setattr("twin_master.watch.mqtt_session._UNREAD_BYTES", 300_000)
-    monkeypatch.setattr("twin_master.watch.mqtt_session.EXCHANGE_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session._UNREAD_BYTES", 300_000)
+    monkeypatch.setattr("twin_master.feeds.mqtt_session.EXCHANGE_SECONDS", 0.0)
     reader = Reader(broker, tmp_path)
     publish(broker, 3000, text="x" * 1000)
     most = 0

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from tests.twin_master.watch.conftest import HANGS, begun, journalled, ran, viewed, wait_until
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feed import Feed
-from twin_master.watch.feeds import feed_of_lines
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.feed_choice import feed_of_lines
 from twin_master.watch.folder import Watch
 from twin_master.watch.result import notices_since
 

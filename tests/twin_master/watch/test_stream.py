@@ -14,11 +14,11 @@ from tests.command_line import command
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import begun
 from twin_master.errors import ImpossibleObservation
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed_choice import feed_of_lines
+from twin_master.feeds.intake import Intake
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feeds import feed_of_lines
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Intake
 
 pytestmark = pytest.mark.xdist_group("watches")
 

@@ -16,6 +16,7 @@ from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import belief_in_journal, check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError
+from twin_master.feeds.csv_feed import CsvFeed
 from twin_master.mission.decision_record import decision_line
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import load_knowledge, save_knowledge
@@ -23,7 +24,6 @@ from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight_page import FlightPage, Request
-from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.folder import GivenPatch, Watch
 from twin_master.watch.patch_trial import (
     PatchOutcome,

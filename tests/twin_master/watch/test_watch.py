@@ -27,15 +27,15 @@ from tests.twin_master.watch.conftest import (
     write_csv,
 )
 from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed_choice import feed_of_lines, file_feed
+from twin_master.feeds.recorded_feeds import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME, record_of_line
 from twin_master.mission.recent_parts import BLOCK_STEPS
 from twin_master.mission.replay import BelievedModel
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feeds import feed_of_lines, file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.recorded_feeds import FolderFeed
 from twin_master.watch.result import notices_since, store_watch
 from twin_master.watch.workflow import copy_of_run_until, resume_watch
 
@@ -199,7 +199,7 @@ def stopped_learning(
     tables = {"learning": learning.learning, "notice": learning.notice}
     knowledge = replace(base.models[0].knowledge, scenario=base.scenario.model_copy(update=tables))
     with pytest.MonkeyPatch.context() as shorter:
-        shorter.setattr("twin_master.watch.intake.SNAPSHOT_STEPS", 8)
+        shorter.setattr("twin_master.feeds.intake.SNAPSHOT_STEPS", 8)
         return StoppedWatch(base, knowledge, recording, (5, 12, 19, 31, None), folder)
 
 
@@ -310,7 +310,7 @@ LONG_STEPS = 198
 def short_snapshots() -> Iterator[None]:
     """Write a snapshot every 8 steps, and check no more than the last bytes of a journal."""
     with pytest.MonkeyPatch.context() as patching:
-        patching.setattr("twin_master.watch.intake.SNAPSHOT_STEPS", 8)
+        patching.setattr("twin_master.feeds.intake.SNAPSHOT_STEPS", 8)
         patching.setattr("twin_master.watch.teaching.CHECKED_BYTES", 1)
         yield
 

@@ -9,15 +9,15 @@ from typing import IO
 import numpy as np
 
 from twin_master.errors import MissionInputError
+from twin_master.feeds.broker_address import Broker, is_broker, parse_broker
+from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.line_protocol import looks_like_line_protocol
+from twin_master.feeds.lines import Pipe, first_line
+from twin_master.feeds.message import FeedItem, Refused
+from twin_master.feeds.payload import PayloadReader
+from twin_master.feeds.recorded_feeds import FolderFeed, LinesFeed, RunFeed, beginning_of
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.broker_address import Broker, is_broker, parse_broker
-from twin_master.watch.csv_feed import CsvFeed
-from twin_master.watch.feed import Feed
-from twin_master.watch.line_protocol import looks_like_line_protocol
-from twin_master.watch.lines import Pipe, first_line
-from twin_master.watch.message import FeedItem, Refused
-from twin_master.watch.payload import PayloadReader
-from twin_master.watch.recorded_feeds import FolderFeed, LinesFeed, RunFeed, beginning_of
 
 Observations = Iterable[Mapping[str, object]] | str | Path
 """Messages of a program, or a file, an address, or "-" for standard input."""

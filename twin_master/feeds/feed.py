@@ -1,10 +1,15 @@
 """The interface of a feed, which gives messages to a watch and takes its decisions."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
-from twin_master.watch.lines import Position
-from twin_master.watch.message import FeedItem
-from twin_master.watch.records import Decision
+from reporting.json_file import JsonRecord
+from twin_master.feeds.lines import Position
+from twin_master.feeds.message import FeedItem
+
+Decision = JsonRecord
+"""A decision as it is published; `docs/how_to/watch.md` lists its keys."""
+DecisionSink = Callable[[Decision], object]
+"""A function that is called with each decision, once its step is in the journal."""
 
 
 class Feed:

@@ -4,9 +4,9 @@ import math
 from dataclasses import asdict, dataclass
 
 from reporting.json_file import JsonObject, JsonRecord
+from twin_master.feeds.message import Refused
+from twin_master.feeds.stream import TIME_UNITS, StreamNotices
 from twin_master.scenario.tables import Between, WatchSection
-from twin_master.watch.message import Refused
-from twin_master.watch.stream import TIME_UNITS, StreamNotices
 
 LARGEST_UNCONFIRMED_GAP = 800
 """Number of steps after the only message of a stretch from which on they are not a gap.

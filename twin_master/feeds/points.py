@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from twin_master.watch.message import Refused
+from twin_master.feeds.message import Refused
 
 FieldValue = object
 """The value of a field: a number, a truth value, a text, or a list of these."""

@@ -13,18 +13,18 @@ from reporting.arrays import Float
 from reporting.json_file import JsonObject, JsonRecord
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError
+from twin_master.feeds.clock import Clock
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.lines import Position
+from twin_master.feeds.message import FeedItem, Message, Refused
+from twin_master.feeds.recorded_feeds import StepStatus
+from twin_master.feeds.rejected import RejectedFile
+from twin_master.feeds.stream import REFUSALS_IN_A_ROW, StreamNotices
 from twin_master.mission.journal import encode_state, step_record
 from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.clock import Clock
-from twin_master.watch.feed import Feed
-from twin_master.watch.lines import Position
-from twin_master.watch.message import FeedItem, Message, Refused
-from twin_master.watch.records import StepStatus
-from twin_master.watch.rejected import RejectedFile
-from twin_master.watch.stream import REFUSALS_IN_A_ROW, StreamNotices
 
 POLL_SECONDS = 0.05
 """Seconds between two looks at a feed that may go on."""

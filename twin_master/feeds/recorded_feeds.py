@@ -4,6 +4,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Sequence
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,15 +13,12 @@ import xarray as xr
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
-from reporting.json_file import JsonObject
+from reporting.json_file import JsonObject, JsonRecord
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
-from twin_master.mission.journal import JOURNAL_NAME, record_of_line
-from twin_master.mission.journal_packing import array_from_json
-from twin_master.scenario.schema import Scenario
-from twin_master.watch.feed import Feed
-from twin_master.watch.lines import GrowingFile, Position, contains, find_file
-from twin_master.watch.message import (
+from twin_master.feeds.feed import Feed
+from twin_master.feeds.lines import GrowingFile, Position, contains, find_file
+from twin_master.feeds.message import (
     LARGEST_MESSAGE,
     FeedItem,
     Message,
@@ -28,10 +26,25 @@ from twin_master.watch.message import (
     MessageReader,
     Refused,
 )
-from twin_master.watch.payload import PayloadReader
-from twin_master.watch.records import JournalLine, StepStatus
+from twin_master.feeds.payload import PayloadReader
+from twin_master.mission.journal import JOURNAL_NAME, record_of_line
+from twin_master.mission.journal_packing import array_from_json
+from twin_master.scenario.schema import Scenario
 
 _TEXT_CHARACTERS = 300
+JournalLine = JsonRecord
+"""A line of `journal.jsonl`; `docs/reference/run_folder.md` lists its keys."""
+
+
+class StepStatus(IntEnum):
+    """Whether a message of a step has come, and with its control; journals store the numbers."""
+
+    MISSING = 0
+    """No message has come."""
+    ASSUMED_CONTROL = 1
+    """A message without a control has come: the assumed control may be corrected by a later one."""
+    WITH_CONTROL = 2
+    """A message with its control has come."""
 
 
 def beginning_of(content: bytes | Refused) -> str:

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Protocol
 from reporting.files import atomic_write_text
 from reporting.json_file import JsonObject
 from twin_master.errors import MissionInputError
-from twin_master.watch.broker_address import PASSWORD_VARIABLE, Broker
-from twin_master.watch.message import LARGEST_MESSAGE
-from twin_master.watch.records import Decision
+from twin_master.feeds.broker_address import PASSWORD_VARIABLE, Broker
+from twin_master.feeds.feed import Decision
+from twin_master.feeds.message import LARGEST_MESSAGE
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, TypedDict, cast
 
 from reporting.operating_system import ReadableStream, is_same_beginning, polled_pieces
-from twin_master.watch.message import LARGEST_MESSAGE, Refused
+from twin_master.feeds.message import LARGEST_MESSAGE, Refused
 
 
 class Position(TypedDict):

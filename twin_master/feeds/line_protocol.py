@@ -11,7 +11,7 @@ line that begins with ``#`` is a comment. (InfluxData, *Line protocol reference*
 import re
 from collections.abc import Mapping
 
-from twin_master.watch.points import FieldValue, Point
+from twin_master.feeds.points import FieldValue, Point
 
 # No character is taken back once it is matched (`++`), so that an escaped one never separates
 _MEASUREMENT = re.compile(r"(?:\\[, ]|[^, \n])++")
