@@ -89,6 +89,7 @@ def simulate(
     """
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.client.binding import load_binding
+    from fmu_asset.client.binding_remarks import undeclared_units_sentence, unset_inputs_sentence
     from fmu_asset.client.experiment import (
         default_experiment,
         ending_with_histories,
@@ -97,8 +98,6 @@ def simulate(
     )
     from fmu_asset.client.history_files import read_histories
     from fmu_asset.client.session import FmiAsset
-    from fmu_asset.client.undeclared_units import undeclared_units_sentence
-    from fmu_asset.client.unset_inputs import unset_inputs_sentence
 
     _refuse_unwritable_files(out, plot, replace=replace)
     has_experiment_options = stop_time is not None or step_size is not None or bool(values)

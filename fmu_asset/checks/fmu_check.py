@@ -7,8 +7,8 @@ from pathlib import Path
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.binding_remarks import unset_inputs_sentence
 from fmu_asset.client.experiment import whole_binding
-from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import BindingError, FmuError, visible
 from reporting.progress import Progress, reporter
 

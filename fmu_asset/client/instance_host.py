@@ -15,9 +15,8 @@ from fmu_asset.archive.fmu_file import extract_fmu
 from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.base import FmuInstance
-from fmu_asset.instances.opening import open_instance
+from fmu_asset.instances.opening import forget_modules, open_instance
 from fmu_asset.instances.plan import Instance, Plan, values_of
-from fmu_asset.instances.python_modules import forget_modules
 from fmu_asset.instances.statuses import status_name
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import struct
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from reporting.log import module_logger
 from reporting.progress import stage
 
 from .compiler import COMMON_FLAGS, Compiler
-from .mach_o import fat_library
 from .platforms import Target, suffix_of
 
 _logger = module_logger(__name__)
@@ -117,3 +117,48 @@ def zig_environment() -> Iterator[dict[str, str]]:
             "ZIG_GLOBAL_CACHE_DIR": str(cache),
             "ZIG_LOCAL_CACHE_DIR": str(Path(scratch) / "objects"),
         }
+
+
+FAT_MAGIC = 0xCAFEBABE
+THIN_MAGIC = 0xFEEDFACF
+"""Begins a 64-bit library for one processor; of little endian, as those of macOS are."""
+
+_ALIGNMENT_EXPONENT = 14  # pages of macOS on Arm have 2**14 bytes
+_FAT_HEADER = struct.Struct(">II")  # magic, number of libraries
+_FAT_ENTRY = struct.Struct(">iiIII")  # processor, its subtype, offset, size, alignment exponent
+_THIN_HEADER = struct.Struct("<Iii")  # magic, processor, its subtype
+
+
+def fat_library(libraries: Sequence[bytes]) -> bytes:
+    """Return one Mach-O file that holds the libraries of several processors.
+
+    The system loads the library for its own processor. The file is laid out as in `fat.h` of
+    macOS: header, an entry for each library, and the libraries at multiples of 2^14 bytes.
+
+    Parameters
+    ----------
+    libraries : sequence of bytes
+        64-bit Mach-O libraries, each for a different processor.
+
+    Raises
+    ------
+    FmuBuildError
+        If one of them is not a 64-bit Mach-O file.
+    """
+    alignment = 2**_ALIGNMENT_EXPONENT
+    header = _FAT_HEADER.pack(FAT_MAGIC, len(libraries))
+    # zeros take the place of the header until it is known
+    content = bytes(_FAT_HEADER.size + len(libraries) * _FAT_ENTRY.size)
+    for library in libraries:
+        if library[:4] != struct.pack("<I", THIN_MAGIC):
+            raise FmuBuildError(
+                "A 64-bit Mach-O library was expected of the compiler for macOS, but its file "
+                f"begins with {library[:4].hex() or 'nothing'}: try another version of ziglang."
+            )
+        _, processor, subtype = _THIN_HEADER.unpack_from(library)
+        content += bytes(-len(content) % alignment)
+        header += _FAT_ENTRY.pack(
+            processor, subtype, len(content), len(library), _ALIGNMENT_EXPONENT
+        )
+        content += library
+    return header + content[len(header) :]

@@ -6,7 +6,7 @@ inputs, a step, a reply with the outputs.
 
 import math
 from array import array
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from itertools import accumulate, pairwise
@@ -20,6 +20,7 @@ from fmu_asset.client.instance_host import Host
 from fmu_asset.client.reset_trial import InstanceStart, ResetTrial
 from fmu_asset.client.saved_state import PackedState
 from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import (
     FmuEndedError,
     FmuError,
@@ -29,7 +30,6 @@ from fmu_asset.errors import (
 from fmu_asset.instances.plan import run_steps
 from reporting.words import comma_list
 
-from .outputs import OutputSelection
 from .schedule import Schedule
 from .structure import Endpoint
 from .system import (
@@ -86,6 +86,52 @@ def errors_of_component(component: str) -> Iterator[None]:
         time = None if isinstance(error, FmuEndedError) else error.time
         sentence = f"component {component}: {error.sentence}"
         raise type(error)(sentence, error.messages, time) from error
+
+
+class OutputSelection:
+    """Selects some of all outputs of a system, and converts them to the units of their reader.
+
+    Parameters
+    ----------
+    ports : iterable of ConnectedVariable
+        The selected outputs, in order.
+    position : mapping of Endpoint to int
+        The position of each output among all outputs that are read.
+    """
+
+    def __init__(
+        self, ports: Iterable[ConnectedVariable], position: Mapping[Endpoint, int]
+    ) -> None:
+        # Delayed outputs are taken from a second copy of all outputs, behind the first.
+        output_count = len(position)
+        indices = []
+        factors = []
+        offsets = []
+        is_identity = True
+        for port in ports:
+            index = position[port.end]
+            indices.append(index + output_count if port.delayed else index)
+            factors.append(port.conversion.factor)
+            offsets.append(port.conversion.offset)
+            is_identity = is_identity and port.conversion == IDENTITY
+        self._indices = np.array(indices, np.intp)
+        self._factors = np.array(factors)
+        self._offsets = np.array(offsets)
+        self._is_identity = is_identity
+
+    def values(self, outputs: FloatArray, outputs_before: FloatArray) -> FloatArray:
+        """Return the selected outputs in the reader's units.
+
+        Parameters
+        ----------
+        outputs, outputs_before : (O,) array
+            All outputs, now and at the beginning of the step.
+        """
+        values: FloatArray = np.concatenate((outputs, outputs_before))[self._indices]
+        if self._is_identity:
+            return values
+        converted: FloatArray = self._factors * values + self._offsets
+        return converted
 
 
 class CoupledFmus(Host):

@@ -10,9 +10,8 @@ import os
 import struct
 import sys
 from errno import EACCES
+from functools import cache
 from typing import NamedTuple
-
-from .system_calls import checked, libc
 
 _PR_SET_SECCOMP = 22
 _SECCOMP_MODE_FILTER = 2
@@ -303,3 +302,23 @@ def _require(argument: int, values: tuple[int, ...], bits: int = _ALL_BITS) -> b
         instructions_to_skip = len(values) - position
         code += _INSTRUCTION.pack(_JUMP_IF_EQUAL, instructions_to_skip, 0, value)
     return code + _DENY
+
+
+@cache
+def libc() -> ctypes.CDLL:
+    """Return the C library of this process."""
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def checked(result: int) -> int:
+    """Return the result of a call of the C library.
+
+    Raises
+    ------
+    OSError
+        If it is negative.
+    """
+    if result < 0:
+        error = ctypes.get_errno()
+        raise OSError(error, f"the sandbox: {os.strerror(error)}")
+    return result

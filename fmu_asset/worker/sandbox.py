@@ -13,8 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
-from .call_filter import filter_calls
-from .system_calls import checked, libc
+from .call_filter import checked, filter_calls, libc
 
 # numbers of the system calls of Landlock, the same on every processor
 _CREATE_RULESET = 444

@@ -10,9 +10,8 @@ from pydantic import Field
 
 from fmu_asset.archive.fmu_file import packed_design_hash
 from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.binding_remarks import undeclared_units_sentence, unset_inputs_sentence
 from fmu_asset.client.session import FmiAsset
-from fmu_asset.client.undeclared_units import undeclared_units_sentence
-from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float

@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, load_binding, parse_binding
+from fmu_asset.client.binding_remarks import undeclared_units_sentence, unset_inputs_sentence
 from fmu_asset.client.blocks import Blocks
 from fmu_asset.client.draft import bindable, draft_binding
 from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.instance_host import worker_limits
 from fmu_asset.client.session import FmiAsset
-from fmu_asset.client.undeclared_units import undeclared_units_sentence
 from fmu_asset.client.units import Conversion, contradictions, conversion, same_dimension
-from fmu_asset.client.unset_inputs import unset_inputs_sentence
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units

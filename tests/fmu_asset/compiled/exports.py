@@ -2,7 +2,7 @@
 
 import struct
 
-from fmu_asset.compiled.mach_o import FAT_MAGIC, THIN_MAGIC
+from fmu_asset.compiled.cross_compiler import FAT_MAGIC, THIN_MAGIC
 
 _DYNAMIC_SYMBOLS = 11
 """Type of the section of an ELF file with the symbols that are looked up when it is loaded."""

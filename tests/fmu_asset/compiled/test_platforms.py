@@ -16,10 +16,10 @@ from fmpy.validation import validate_fmu
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled.cross_compiler import (
     cross_compile_library,
+    fat_library,
     find_cross_compiler,
     zig_environment,
 )
-from fmu_asset.compiled.mach_o import fat_library
 from fmu_asset.compiled.platforms import targets_by_folder
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import check_form, recorded_content_hash
