@@ -13,16 +13,16 @@ from reporting.arrays import AnyArray
 from reporting.files import atomic_write_text
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import (
+from twin_master.fleet.flight import fly_fleet
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     log_likelihood_of_twins,
     transition_evidence,
 )
-from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import Fleet, ensemble
-from twin_master.fleet.store import stored_variables
-from twin_master.fleet.store_address import StoreAddress
-from twin_master.fleet.store_writing import GroupWriter, create_store
+from twin_master.fleet.storage.store import stored_variables
+from twin_master.fleet.storage.store_address import StoreAddress
+from twin_master.fleet.storage.store_writing import GroupWriter, create_store
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import fly_one_by_one, fly_side_by_side
 from twin_master.scenario.reading import load_scenario

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -88,8 +88,7 @@ def compiled(
         return _plain_with_note(function)
     options = OPTIONS_OF_REORDERED_SUMS if reorders_sums else OPTIONS
     sources = (function, *calls, *_compiled_callees(function))
-    source_files = [inspect.getfile(source) for source in sources]
-    with _cache_named_by_sources(source_files):
+    with _cache_named_by_sources(sources):
         try:
             compiled_function = numba.njit(cache=True, **options)(function)
             compiled_function._cache = _KeptMachineCode(function)
@@ -178,17 +177,21 @@ if numba is not None:
 
 
 @contextmanager
-def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
+def _cache_named_by_sources(functions: Sequence[NumericalFunction]) -> Iterator[None]:
     """Set numba's cache folder, meanwhile, to one that is named by the content of source files.
 
     Parameters
     ----------
-    files : list of str
-        The source files, the compiled function's own first.
+    functions : sequence of callable
+        Functions of the source files, the compiled function first.
     """
     digest = hashlib.sha256()
+    files = [inspect.getfile(function) for function in functions]
     for file in sorted({*files, __file__}):  # this file generates code, too
         digest.update(Path(file).read_bytes())
+    # The kept machine code names the modules of its records: it is of no use once they have moved.
+    for module in sorted({function.__module__ for function in functions}):
+        digest.update(module.encode())
     if any(Path(file).parent.name == "laws" for file in files):
         # The numbers of installed laws depend on which of them are installed.
         from fe.runtime import laws

@@ -498,7 +498,7 @@ def view(
 
     Example: `uav-twin view runs/first --browser`
     """
-    from twin_master.fleet.view import is_fleet, serve_fleet
+    from twin_master.fleet.page.view import is_fleet, serve_fleet
     from twin_master.viewer.server import serve as serve_flight
 
     def print_address(address: str) -> None:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Figures
-    from twin_master.fleet.watched_asset import WatchedAsset
+    from twin_master.fleet.watched.watched_asset import WatchedAsset
     from twin_master.watch.metrics import MetricsServer
 
 
@@ -97,9 +97,9 @@ def watch(
 
     Example: `uav-twin fleet watch fleet.toml --follow`
     """
+    from twin_master.fleet.page.view import is_fleet, serve_fleet
     from twin_master.fleet.plan import load_fleet
-    from twin_master.fleet.view import is_fleet, serve_fleet
-    from twin_master.fleet.watching import FleetWatch
+    from twin_master.fleet.watched.watching import FleetWatch
     from twin_master.watch.metrics import serve_metrics
     from twin_master.watch.signals import call_on_end_signal
 
@@ -210,7 +210,7 @@ def _heading(standing: Standing) -> str:
     standing : mapping
         The last records of all watched assets, from `read_standing`.
     """
-    from twin_master.fleet.watched_asset import watched_fleet_counts
+    from twin_master.fleet.watched.watched_asset import watched_fleet_counts
 
     counts = watched_fleet_counts(standing)
     phrases = [
@@ -328,8 +328,8 @@ def learn(
 
     Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
     """
-    from twin_master.fleet.learn import is_worth_workers, learn_from_fleet
-    from twin_master.fleet.lessons import lesson_rows
+    from twin_master.fleet.learning.learn import is_worth_workers, learn_from_fleet
+    from twin_master.fleet.learning.lessons import lesson_rows
 
     if workers is None and cluster is None and not is_worth_workers(folder):
         workers = 0
@@ -425,7 +425,7 @@ def _print_outcome(outcome: "FleetOutcome") -> None:
 
 
 def _write_report(folder: Path) -> None:
-    from twin_master.fleet.report import write_fleet_report
+    from twin_master.fleet.page.report import write_fleet_report
 
     with terminal.progress().stage("Writing the report"):
         write_fleet_report(folder)

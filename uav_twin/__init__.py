@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
     from twin_master.fleet.engine import Engine as Engine
     from twin_master.fleet.flight import fly_fleet as fly_fleet
-    from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
+    from twin_master.fleet.learning.learn import learn_from_fleet as learn_from_fleet
     from twin_master.fleet.plan import ensemble as ensemble
     from twin_master.fleet.reading import open_fleet as open_fleet
     from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
@@ -95,7 +95,7 @@ _HOMES = {
     "ScenarioEnvironment": "twin_master.environment",
     "Engine": "twin_master.fleet.engine",
     "fly_fleet": "twin_master.fleet.flight",
-    "learn_from_fleet": "twin_master.fleet.learn",
+    "learn_from_fleet": "twin_master.fleet.learning.learn",
     "ensemble": "twin_master.fleet.plan",
     "open_fleet": "twin_master.fleet.reading",
     "WatchfulEstimator": "twin_master.learning.monitor",

@@ -21,10 +21,10 @@ from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
 from reporting.figures import to_png
 from twin_master.fleet.configuration import KIND, fleet_config
-from twin_master.fleet.page_figures import course_figure, map_figure
+from twin_master.fleet.page.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps
-from twin_master.fleet.store import FAILED, flown_rows, open_group
-from twin_master.fleet.store_layout import stored_values
+from twin_master.fleet.storage.store import FAILED, flown_rows, open_group
+from twin_master.fleet.storage.store_layout import stored_values
 from twin_master.scenario.schema import Scenario
 
 RESOLUTION = 150.0

@@ -22,22 +22,22 @@ from numpy.typing import NDArray
 from fe.reduction.model_cache import reduced_model
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     grid_evidence,
     log_likelihood_of_twins,
     scaled,
 )
-from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.members import Member
-from twin_master.fleet.posterior import (
+from twin_master.fleet.learning.learn import learn_fleet
+from twin_master.fleet.learning.posterior import (
     Axes,
     LikelihoodGrid,
     likelihood_grid,
     logistic,
     shared_posterior,
 )
-from twin_master.fleet.store import stored_variables
+from twin_master.fleet.members import Member
+from twin_master.fleet.storage.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.inference import predict

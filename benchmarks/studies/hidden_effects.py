@@ -54,7 +54,7 @@ from twin_master.assets.resolution import (
     asset_source,
     resolve_scenario,
 )
-from twin_master.fleet.store import in_credible_set
+from twin_master.fleet.storage.store import in_credible_set
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder

@@ -1,7 +1,13 @@
 """Which source files the machine code that is kept on disk depends on."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 from fe import compilation
 from twin_master.learning import exchanged_densities, fault_evidence, fault_kernels
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_machine_code_depends_on_files_that_callees_use():
@@ -12,3 +18,36 @@ def test_machine_code_depends_on_files_that_callees_use():
         getattr(value, "__module__", "") for value in vars(fault_evidence).values()
     }
     assert {exchanged_densities.__name__, fault_kernels.__name__} <= modules
+
+
+KERNEL = """
+from typing import NamedTuple
+import numpy as np
+from fe.compilation import compiled
+
+class Pair(NamedTuple):
+    values: np.ndarray
+    factor: float
+
+@compiled
+def scaled(pair):
+    return pair.values[0] * pair.factor
+"""
+
+
+def test_machine_code_of_a_module_that_has_moved_is_not_read(tmp_path):
+    """It names the module of its records, which is no more."""
+    environment = {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    for name in ("before", "after"):
+        file = tmp_path / f"{name}.py"
+        file.write_text(KERNEL)
+        call = f"import numpy; from {name} import *; print(scaled(Pair(numpy.ones(1), 2.0)))"
+        process = subprocess.run(
+            [sys.executable, "-c", call],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert process.stdout == "2.0\n"
+        file.unlink()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import AnyArray, Float
-from twin_master.fleet.store import WITHIN, flown_rows
+from twin_master.fleet.storage.store import WITHIN, flown_rows
 
 StoredRows = Callable[[str], AnyArray]
 """Returns a variable of a group of the store by its path, with a row for each twin of a block."""

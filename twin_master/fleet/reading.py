@@ -15,7 +15,7 @@ from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.outcomes import Estimated, Outcomes
-from twin_master.fleet.store import (
+from twin_master.fleet.storage.store import (
     ENDED,
     FAILED,
     FLOWN,
@@ -24,7 +24,7 @@ from twin_master.fleet.store import (
     flown_rows,
     open_group,
 )
-from twin_master.fleet.store_layout import ALL_ROWS, NOTICE_KINDS, row_blocks, stored_values
+from twin_master.fleet.storage.store_layout import ALL_ROWS, NOTICE_KINDS, row_blocks, stored_values
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.estimator import BELIEVED
 from twin_master.network.simulated_missions import leaving_probability

@@ -28,7 +28,7 @@ from twin_master.feeds.intake import Intake
 from twin_master.feeds.message import FeedItem
 from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.members import Member
-from twin_master.fleet.store import FAILED, stored_variables
+from twin_master.fleet.storage.store import FAILED, stored_variables
 from twin_master.mission.loop import operate
 from twin_master.mission.parts import TwinParts
 from twin_master.mission.preparation import Knowledge, load_knowledge

@@ -32,7 +32,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.fleet.store import in_credible_set
+from twin_master.fleet.storage.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario

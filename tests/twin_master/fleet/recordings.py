@@ -10,8 +10,8 @@ from tests.command_line import said
 from tests.twin_master.runs import text_of, written
 from tests.twin_master.watch.conftest import write_csv
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.watched_asset import WatchedAsset
-from twin_master.fleet.watching import FleetWatch
+from twin_master.fleet.watched.watched_asset import WatchedAsset
+from twin_master.fleet.watched.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 
 STEPS = 6

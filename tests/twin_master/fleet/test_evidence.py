@@ -19,15 +19,15 @@ from tests.twin_master.fleet.test_learning import tiny
 from tests.twin_master.network.decision_oracles import precise_forward_backward
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
-from twin_master.fleet import evidence_tasks
 from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning import evidence_tasks
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     grid_evidence,
     transition_evidence,
 )
-from twin_master.fleet.evidence_kernels import LEAST_EVIDENCE
-from twin_master.fleet.parameter_evidence import parameter_evidence
+from twin_master.fleet.learning.evidence_kernels import LEAST_EVIDENCE
+from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.plan import ensemble
 from twin_master.network.twin import build_graphical_model
 from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet
@@ -204,7 +204,7 @@ def test_observations_are_sent_to_workers_that_do_not_see_the_fleet(
 ):
     pool = DistantPool(flown)
     alone = lessons(flown, tmp_path)
-    monkeypatch.setattr("twin_master.fleet.learn.open_task_pool", lambda *_: nullcontext(pool))
+    monkeypatch.setattr("twin_master.fleet.learning.learn.open_task_pool", lambda *_: nullcontext(pool))
     assert lessons(flown, tmp_path) == alone
     # The first task comes back without an answer; then all tasks go with their observations.
     assert pool.answers[:2] == [False, True]

@@ -31,16 +31,16 @@ from twin_master.errors import (
 )
 from twin_master.fleet import flight
 from twin_master.fleet.engine import Engine
-from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.members import Member
 from twin_master.fleet.outcomes import Outcomes
+from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import group_figures
-from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import result_of_unflown
-from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
-from twin_master.fleet.store_address import STORE_NAME
-from twin_master.fleet.store_layout import FORMER_DIMENSIONS, FORMER_PATHS
+from twin_master.fleet.storage.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
+from twin_master.fleet.storage.store_address import STORE_NAME
+from twin_master.fleet.storage.store_layout import FORMER_DIMENSIONS, FORMER_PATHS
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge

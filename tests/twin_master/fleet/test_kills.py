@@ -84,10 +84,14 @@ def ended_by(run: Callable[[], object]) -> int:
 
 @pytest.fixture(
     params=[
-        ("twin_master.fleet.chunk_file", "_write_all", 45),  # a chunk that the index does not have yet
-        ("twin_master.fleet.chunk_file", "_write_all", 46),  # a shard of which some variables are stored
-        ("twin_master.mission.journal:JournalFile", "append", 4),  # a shard that has just been noted
-        ("twin_master.fleet.chunk_file:ChunkFile", "finish", 3),  # some files are in order, others not
+        # A chunk that the index does not have yet
+        ("twin_master.fleet.storage.chunk_file", "_write_all", 45),
+        # A shard of which some variables are stored
+        ("twin_master.fleet.storage.chunk_file", "_write_all", 46),
+        # A shard that has just been noted
+        ("twin_master.mission.journal:JournalFile", "append", 4),
+        # Some files are in order, others not
+        ("twin_master.fleet.storage.chunk_file:ChunkFile", "finish", 3),
     ],
     ids=["in a chunk", "in a shard", "after a shard", "at the end of files"],
 )

@@ -19,19 +19,16 @@ from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.configuration import fleet_config, group_folder
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     log_likelihood_of_twins,
     reason_transitions_are_fixed,
     transition_evidence,
 )
-from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.noise import with_noise_factor
-from twin_master.fleet.outcomes import Estimated, Outcomes
-from twin_master.fleet.overview import overview_of_group
-from twin_master.fleet.parameter_evidence import parameter_evidence
-from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.posterior import (
+from twin_master.fleet.learning.learn import learn_fleet
+from twin_master.fleet.learning.noise import with_noise_factor
+from twin_master.fleet.learning.parameter_evidence import parameter_evidence
+from twin_master.fleet.learning.posterior import (
     HIGHEST,
     LOWEST,
     Axes,
@@ -42,16 +39,19 @@ from twin_master.fleet.posterior import (
     population_posterior,
     shared_posterior,
 )
+from twin_master.fleet.learning.row_file import RowFile
+from twin_master.fleet.outcomes import Estimated, Outcomes
+from twin_master.fleet.page.overview import overview_of_group
+from twin_master.fleet.page.report import fleet_page, write_fleet_report
+from twin_master.fleet.page.view import ATTENTION_ROWS
+from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import (
     ControlForecast,
     outcomes_of_group,
     probability_of_leaving,
     severity,
 )
-from twin_master.fleet.report import fleet_page, write_fleet_report
-from twin_master.fleet.row_file import RowFile
-from twin_master.fleet.store_layout import ALL_ROWS, observation_rows, row_blocks
-from twin_master.fleet.view import ATTENTION_ROWS
+from twin_master.fleet.storage.store_layout import ALL_ROWS, observation_rows, row_blocks
 from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
@@ -304,7 +304,7 @@ def numbers_of(record: Any) -> list[float]:
 
 
 def test_a_fleet_that_is_read_by_blocks_teaches_what_the_whole_teaches(grown, learnt_by_fleet, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.storage.store_layout.BLOCK_TWINS", 7)
     record = learn_fleet(grown[1])["groups"]["growing_damage"]
     np.testing.assert_allclose(numbers_of(record), numbers_of(learnt_by_fleet[0]), rtol=1e-9)
 
@@ -628,8 +628,8 @@ def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let fleets be read by blocks of seven twins."""
-    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
-    monkeypatch.setattr("twin_master.fleet.store_layout._VALUES_TOGETHER", 1)
+    monkeypatch.setattr("twin_master.fleet.storage.store_layout.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.storage.store_layout._VALUES_TOGETHER", 1)
 
 
 def test_figures_of_a_fleet_that_is_read_by_blocks_are_those_of_the_whole(grown_group, small_blocks):
@@ -648,13 +648,13 @@ def flat(outcomes: Outcomes) -> list[float]:
 
 def test_the_page_of_a_fleet_that_is_read_by_blocks_is_that_of_the_whole(grown_group, monkeypatch):
     whole = fleet_page(grown_group.folder, ATTENTION_ROWS)
-    monkeypatch.setattr("twin_master.fleet.store_layout.BLOCK_TWINS", 7)
-    monkeypatch.setattr("twin_master.fleet.store_layout._VALUES_TOGETHER", 1)
+    monkeypatch.setattr("twin_master.fleet.storage.store_layout.BLOCK_TWINS", 7)
+    monkeypatch.setattr("twin_master.fleet.storage.store_layout._VALUES_TOGETHER", 1)
     assert fleet_page(grown_group.folder, ATTENTION_ROWS) == whole
 
 
 def test_the_figures_of_a_large_fleet_show_some_of_its_assets_and_say_so(grown_group, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.overview.DRAWN_ASSETS", 25)
+    monkeypatch.setattr("twin_master.fleet.page.overview.DRAWN_ASSETS", 25)
     record = fleet_config(grown_group.folder)["fleet"]["groups"][0]
     overview = overview_of_group(grown_group.folder, record, grown_group.store, 5)
     expected = grown_group.store["filtered/mean"].values[::3]

@@ -13,15 +13,15 @@ from reporting.files import TEMPORARY_SUFFIX
 from tests.twin_master.runs import written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
-from twin_master.fleet.chunk_file import ChunkFile
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
-from twin_master.fleet.learn import learn_fleet
+from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.members import ListedMembers, RecordedMembers
+from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import Fleet, Group, ensemble, load_fleet
 from twin_master.fleet.reading import group_figures, open_groups
-from twin_master.fleet.report import write_fleet_report
-from twin_master.fleet.store_writing import CHUNKS_PER_FILE, _ChunkCodec
+from twin_master.fleet.storage.chunk_file import ChunkFile
+from twin_master.fleet.storage.store_writing import CHUNKS_PER_FILE, _ChunkCodec
 from twin_master.mission.journal import JournalFile
 from uav_twin import open_fleet
 
@@ -159,7 +159,7 @@ def test_a_variable_of_a_fleet_is_one_file_for_many_chunks(whole):
 
 
 def test_a_file_has_a_limited_number_of_chunks(library_file, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.store_writing.CHUNKS_PER_FILE", 2)
+    monkeypatch.setattr("twin_master.fleet.storage.store_writing.CHUNKS_PER_FILE", 2)
     assert CHUNKS_PER_FILE == 128
     folder = fly_fleet(growing(library_file, shard=2), tmp_path / "fleet").folder
     means = sorted((folder / "fleet.zarr/growing_damage/filtered/mean/c").iterdir())

@@ -33,13 +33,13 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.conftest import HANGS, Mosquitto, mosquitto, served, wait_until
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.engine import Engine
+from twin_master.fleet.page.report import fleet_page, write_fleet_report
+from twin_master.fleet.page.view import ATTENTION_ROWS, serve_fleet
 from twin_master.fleet.plan import load_fleet
 from twin_master.fleet.reading import ControlForecast
-from twin_master.fleet.report import fleet_page, write_fleet_report
-from twin_master.fleet.store_layout import ALL_ROWS
-from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
-from twin_master.fleet.watched_asset import WatchedAsset, read_standing
-from twin_master.fleet.watching import FleetWatch
+from twin_master.fleet.storage.store_layout import ALL_ROWS
+from twin_master.fleet.watched.watched_asset import WatchedAsset, read_standing
+from twin_master.fleet.watched.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import lock_run_folder
 from twin_master.watch.folder import Watch
@@ -223,7 +223,7 @@ def lost_assets(library_file: Path, tmp_path_factory: pytest.TempPathFactory) ->
     alone = watch_alone(folder)
     with pytest.MonkeyPatch.context() as patch:
         for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
-            patch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
+            patch.setattr(f"twin_master.fleet.watched.watching.{name}", 0.0)
         make_unwell(patch, "wing-2")
         return LostAssets(folder, alone)
 
@@ -304,7 +304,7 @@ def records_without_place(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.fleet.watched.watching.SEARCH_SECONDS", 0.0)
     make_unwell(monkeypatch, "wing-0")
     watched_topics = WatchedTopics(broker, tmp_path)
     for name in ("wing-0", "wing-2"):
@@ -384,7 +384,7 @@ class SilentAsset:
 
 
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
+    monkeypatch.setattr("twin_master.fleet.watched.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.feeds.mqtt_session.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")

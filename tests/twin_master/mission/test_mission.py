@@ -31,9 +31,9 @@ from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.resolution import asset_source
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import MissionInputError, NotResumableError
+from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import ensemble
-from twin_master.fleet.report import write_fleet_report
-from twin_master.fleet.store import ENDED
+from twin_master.fleet.storage.store import ENDED
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line
 from twin_master.mission.journal_packing import pack_numbers

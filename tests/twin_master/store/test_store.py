@@ -10,7 +10,7 @@ import xarray as xr
 
 from tests.twin_master.runs import flight_of, loaded_from, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
-from twin_master.fleet.store import in_credible_set
+from twin_master.fleet.storage.store import in_credible_set
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.mission import Reference
 from twin_master.scenario.reading import load_scenario

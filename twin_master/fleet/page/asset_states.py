@@ -12,8 +12,8 @@ from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject, JsonRecord
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
-from twin_master.fleet.store import flown_rows
-from twin_master.fleet.store_layout import TWIN_AXIS, stored_values
+from twin_master.fleet.storage.store import flown_rows
+from twin_master.fleet.storage.store_layout import TWIN_AXIS, stored_values
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:

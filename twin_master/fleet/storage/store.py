@@ -14,8 +14,8 @@ from reporting.json_file import JsonObject
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.members import Member, RecordedMembers
-from twin_master.fleet.store_address import STORE_NAME, address_of
-from twin_master.fleet.store_layout import (
+from twin_master.fleet.storage.store_address import STORE_NAME, address_of
+from twin_master.fleet.storage.store_layout import (
     NOTICE_KINDS,
     TWIN_AXIS,
     former_names_used,

@@ -12,16 +12,21 @@ from reporting.progress import SilentProgress
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.checks import source_of
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     log_likelihood_of_twins,
     transition_evidence,
 )
-from twin_master.fleet.evidence_tasks import with_all_transitions_possible
-from twin_master.fleet.parameter_evidence import parameter_evidence
-from twin_master.fleet.posterior import Axes, Distribution, cell_probabilities, resolve_density
+from twin_master.fleet.learning.evidence_tasks import with_all_transitions_possible
+from twin_master.fleet.learning.parameter_evidence import parameter_evidence
+from twin_master.fleet.learning.posterior import (
+    Axes,
+    Distribution,
+    cell_probabilities,
+    resolve_density,
+)
 from twin_master.fleet.reading import TwinsOfScenario
-from twin_master.fleet.store_layout import ObservedTwins, StoredObservations
+from twin_master.fleet.storage.store_layout import ObservedTwins, StoredObservations
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 

@@ -13,7 +13,7 @@ from twin_master.feeds.feed import Feed
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.feeds.mqtt_session import Session
 from twin_master.fleet.plan import Group, asset_name, recording_files
-from twin_master.fleet.watched_asset import WatchedAsset
+from twin_master.fleet.watched.watched_asset import WatchedAsset
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.watch.mqtt import Topic
 

@@ -13,14 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from reporting.arrays import Float, Index
-from twin_master.fleet.evidence_kernels import (
+from twin_master.fleet.learning.evidence_kernels import (
     LANES_TOGETHER,
     LEAST_EVIDENCE,
     SubGrids,
     evidence_in_lanes,
     evidence_on_grid,
 )
-from twin_master.fleet.posterior import GRID_POINTS, Axes
+from twin_master.fleet.learning.posterior import GRID_POINTS, Axes
 from twin_master.network.kernels import PredecessorLists
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists

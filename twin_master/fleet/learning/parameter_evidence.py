@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from reporting.arrays import Float, Index
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     grid_evidence,
     log_likelihood_of_twins,
     scaled,
     transition_evidence,
 )
-from twin_master.fleet.evidence_kernels import evidence_in_lanes
-from twin_master.fleet.posterior import Axes
+from twin_master.fleet.learning.evidence_kernels import evidence_in_lanes
+from twin_master.fleet.learning.posterior import Axes
 from twin_master.network.sensor_model import GaussianSensorModel
 
 LEAST_POSTERIOR = 1e-4

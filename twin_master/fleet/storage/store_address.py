@@ -16,7 +16,7 @@ from reporting.words import one_line
 from twin_master.errors import FleetError, TwinMasterError
 
 if TYPE_CHECKING:
-    from twin_master.fleet.remote_store import RemoteStore
+    from twin_master.fleet.storage.remote_store import RemoteStore
 
 STORE_NAME = "fleet.zarr"
 """The folder of the store in the folder of a fleet, unless the store has an address elsewhere."""
@@ -43,7 +43,7 @@ class StoreAddress:
             return self.folder / STORE_NAME
         from zarr.storage import FsspecStore
 
-        from twin_master.fleet.remote_store import RemoteStore
+        from twin_master.fleet.storage.remote_store import RemoteStore
 
         return RemoteStore(FsspecStore.from_url(self.remote), self.explained_errors)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.configuration import KIND, WATCHED_KIND
-from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.report import fleet_page
-from twin_master.fleet.watched_asset import STATE_NAME
+from twin_master.fleet.learning.lessons import LESSONS_NAME
+from twin_master.fleet.page.report import fleet_page
+from twin_master.fleet.watched.watched_asset import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import find_config
 from twin_master.viewer.server import ServedText, package_text, serve_texts
@@ -51,7 +51,7 @@ def serve_fleet(
     texts = {
         "/": ServedText(page.html, "text/html"),
         "/version": ServedText(page.version, "text/plain"),
-        "/view.js": package_text("twin_master.fleet", "view.js", "text/javascript"),
+        "/view.js": package_text("twin_master.fleet.page", "view.js", "text/javascript"),
     }
     serve_texts(texts, port, ready, is_wanted)
 

@@ -13,11 +13,16 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
 from twin_master.errors import TwinMasterError
-from twin_master.fleet.asset_states import AssetStates, states_of_flown_assets
 from twin_master.fleet.outcomes import Fraction
+from twin_master.fleet.page.asset_states import AssetStates, states_of_flown_assets
 from twin_master.fleet.reading import ControlForecast, believed_means
-from twin_master.fleet.store import ENDED, FAILED, WITHIN, flown_rows
-from twin_master.fleet.store_layout import NOTICE_KINDS, TWIN_AXIS, row_blocks, stored_values
+from twin_master.fleet.storage.store import ENDED, FAILED, WITHIN, flown_rows
+from twin_master.fleet.storage.store_layout import (
+    NOTICE_KINDS,
+    TWIN_AXIS,
+    row_blocks,
+    stored_values,
+)
 
 if TYPE_CHECKING:
     import xarray as xr

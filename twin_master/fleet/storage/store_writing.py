@@ -13,10 +13,10 @@ import numpy as np
 
 from reporting.arrays import AnyArray
 from reporting.files import explained_write_errors
-from twin_master.fleet.chunk_file import CHUNKS_PER_FILE, ChunkFile
 from twin_master.fleet.plan import Fleet, Group
-from twin_master.fleet.store_address import STORE_NAME, StoreAddress
-from twin_master.fleet.store_layout import (
+from twin_master.fleet.storage.chunk_file import CHUNKS_PER_FILE, ChunkFile
+from twin_master.fleet.storage.store_address import STORE_NAME, StoreAddress
+from twin_master.fleet.storage.store_layout import (
     TWIN_AXIS,
     Coordinate,
     coordinates_of_groups,

@@ -19,20 +19,20 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError
-from twin_master.fleet.asset_states import AssetStates, states_of_watched_assets
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
-from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
+from twin_master.fleet.learning.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.members import RecordedMembers
-from twin_master.fleet.overview import GroupOverview, overview_of_group
-from twin_master.fleet.page_figures import course_figure, map_figure
+from twin_master.fleet.page.asset_states import AssetStates, states_of_watched_assets
+from twin_master.fleet.page.overview import GroupOverview, overview_of_group
+from twin_master.fleet.page.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import figure_rows, group_figures, open_groups
-from twin_master.fleet.store import WITHIN
-from twin_master.fleet.watched_asset import read_standing, watched_fleet_counts
+from twin_master.fleet.storage.store import WITHIN
+from twin_master.fleet.watched.watched_asset import read_standing, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
 from twin_master.scenario.schema import Scenario
 
-WORDS = Words("twin_master.fleet")
+WORDS = Words("twin_master.fleet.page")
 """The texts of the page."""
 ATTENTION_ROWS = 15
 """Rows of the table of assets that need attention next, in the report."""

@@ -20,25 +20,24 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
-from twin_master.fleet.evidence import (
+from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     reason_transitions_are_fixed,
 )
-from twin_master.fleet.evidence_tasks import (
+from twin_master.fleet.learning.evidence_tasks import (
     EvidenceKit,
     FlightsOfScenario,
     GroupEvidence,
 )
-from twin_master.fleet.lessons import LESSONS_NAME, write_learnt
-from twin_master.fleet.members import RecordedMembers
-from twin_master.fleet.noise import (
+from twin_master.fleet.learning.lessons import LESSONS_NAME, write_learnt
+from twin_master.fleet.learning.noise import (
     ParameterNodes,
     flights_by_scenario,
     noise_factor,
     parameter_nodes,
     with_noise_factor,
 )
-from twin_master.fleet.posterior import (
+from twin_master.fleet.learning.posterior import (
     Axes,
     Distribution,
     LikelihoodGrid,
@@ -48,10 +47,11 @@ from twin_master.fleet.posterior import (
     population_posterior,
     shared_posterior,
 )
+from twin_master.fleet.learning.row_file import RowFile
+from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
-from twin_master.fleet.row_file import RowFile
-from twin_master.fleet.store import check_installed, flown_rows, open_group
-from twin_master.fleet.store_layout import row_blocks, stored_values
+from twin_master.fleet.storage.store import check_installed, flown_rows, open_group
+from twin_master.fleet.storage.store_layout import row_blocks, stored_values
 from twin_master.run_folder import to_json
 from twin_master.scenario.schema import Scenario
 

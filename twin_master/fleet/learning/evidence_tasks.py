@@ -20,15 +20,15 @@ from reporting.progress import Progress
 from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import TaskPool
-from twin_master.fleet.evidence import TransitionFamily
-from twin_master.fleet.parameter_evidence import (
+from twin_master.fleet.learning.evidence import TransitionFamily
+from twin_master.fleet.learning.parameter_evidence import (
     averaged_likelihood,
     likelihood_at_nodes,
     parameter_evidence,
 )
-from twin_master.fleet.posterior import Axes
-from twin_master.fleet.store import open_group
-from twin_master.fleet.store_layout import BLOCK_TWINS, ObservedTwins, StoredObservations
+from twin_master.fleet.learning.posterior import Axes
+from twin_master.fleet.storage.store import open_group
+from twin_master.fleet.storage.store_layout import BLOCK_TWINS, ObservedTwins, StoredObservations
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 

@@ -1,0 +1,1 @@
+"""What a flown fleet teaches: evidence of shared quantities, their posterior, lessons."""

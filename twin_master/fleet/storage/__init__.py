@@ -1,0 +1,1 @@
+"""Arrays with a row for each twin: their layout, address, writing and reading."""
