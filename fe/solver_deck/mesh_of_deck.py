@@ -9,7 +9,7 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fe.structure.abaqus import KeywordBlock
-from fe.structure.deck_text import fail, real, whole
+from fe.structure.deck_text import fail, whole
 
 _NODES_OF_TYPE = {
     "B31": 2,
@@ -116,10 +116,9 @@ def _members(sets: dict[str, list[int]], text: str, where: str) -> list[int]:
 def _add_nodes(mesh: DeckMesh, block: KeywordBlock) -> None:
     """Add the nodes of a *NODE."""
     numbers = []
-    for where, values in block.data:
-        number = whole(where, values[0])
-        coordinates = (*values[1:], "", "", "")[:3]  # those left out are 0
-        mesh.points[number] = np.array([real(where, text) for text in coordinates])
+    for line in block.data:
+        number, coordinates = line.node()
+        mesh.points[number] = np.array(coordinates)
         numbers.append(number)
     if block.parameters.get("NSET"):
         mesh.node_sets.setdefault(block.parameters["NSET"].upper(), []).extend(numbers)
@@ -147,8 +146,8 @@ def _node_count(type_name: str) -> int | None:
 def _element_records(block: KeywordBlock, node_count: int | None) -> Iterator[list[int]]:
     """Yield number and nodes of each element; an element of unknown type has a line of its own."""
     record: list[int] = []
-    for where, values in block.data:
-        record += [whole(where, text) for text in values if text]
+    for line in block.data:
+        record += [whole(line.where, text) for text in line.texts]
         if node_count is None or len(record) > node_count:
             yield record
             record = []
@@ -157,22 +156,9 @@ def _element_records(block: KeywordBlock, node_count: int | None) -> Iterator[li
 def _add_members(sets: dict[str, list[int]], block: KeywordBlock) -> None:
     """Add the members of an *NSET or *ELSET, written out, as sets, or generated."""
     members = sets.setdefault(block.required(block.keyword).upper(), [])
-    for where, values in block.data:
-        texts = [value for value in values if value]
-        if "GENERATE" not in block.parameters:
-            for text in texts:
-                members.extend(_members(sets, text, where))
+    for line in block.data:
+        if "GENERATE" in block.parameters:
+            members.extend(line.generated_members())
             continue
-        first, last, step = _generation(where, texts)
-        members.extend(range(first, last + 1, step))
-
-
-def _generation(where: str, texts: list[str]) -> tuple[int, int, int]:
-    """Return first, last and step of a line of generated members; the step is 1 if left out."""
-    numbers = [whole(where, text) for text in texts]
-    if len(numbers) == 2:
-        numbers.append(1)
-    if len(numbers) != 3 or numbers[2] < 1:
-        fail(where, f"first, last and step are expected, but {', '.join(texts)} was given.")
-    first, last, step = numbers
-    return first, last, step
+        for text in line.texts:
+            members.extend(_members(sets, text, line.where))
