@@ -38,16 +38,16 @@ def scaled(pair):
 def test_machine_code_of_a_module_that_has_moved_is_not_read(tmp_path):
     """It names the module of its records, which is no more."""
     environment = {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
-    for name in ("before", "after"):
-        file = tmp_path / f"{name}.py"
+    for folder in ("before", "after"):
+        file = tmp_path / folder / "loops.py"
+        file.parent.mkdir()
         file.write_text(KERNEL)
-        call = f"import numpy; from {name} import *; print(scaled(Pair(numpy.ones(1), 2.0)))"
+        call = (
+            f"import numpy; from {folder}.loops import *; print(scaled(Pair(numpy.ones(1), 2.0)))"
+        )
+        command = [sys.executable, "-c", call]
         process = subprocess.run(
-            [sys.executable, "-c", call],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
+            command, env=environment, capture_output=True, text=True, check=True
         )
         assert process.stdout == "2.0\n"
         file.unlink()
