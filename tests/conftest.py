@@ -50,8 +50,12 @@ SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_redu
 LARGEST, COMPILING = "wing", "compiling"
 """The group of tests that takes longest, and the one that compiles loops, which takes more than a minute."""
 
-COMPILED = ("discrepancy", "benchmarks", "test_documented_python.py")
-"""Folders and a file whose tests need these loops: they come once one worker has compiled all of them."""
+COMPILED = ("benchmarks", "discrepancy", "twin_master", "uav_twin", "test_documented_python.py")
+"""Folders and a file whose tests need loops: they come once the workers of the first two groups have compiled
+them."""
+
+MACHINE_CODE = "test_machine_code.py"
+"""The file whose tests compile the loops of missions anew, and share them with all others."""
 
 LONG = "takes minutes of processor time; set UAV_TWIN_LONG_TESTS to run it"
 
@@ -70,9 +74,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Let one worker run all tests that share what is made once.
 
     That is all tests of a file, of all files that use a fixture of `SHARED`, and of all files in which a test
-    names the same group. The largest group comes first, and last those of `COMPILED`; among each of them slow
-    ones, then those with many tests that are not quick: at the end a long one would keep one worker alone.
-    Tests marked `long` are skipped unless they are asked for.
+    names the same group. The largest group comes first and begins with the tests of `MACHINE_CODE`, and last
+    come those of `COMPILED`; among each of them slow ones, then those with many tests that are not quick: at
+    the end a long one would keep one worker alone. Tests marked `long` are skipped unless they are asked for.
     """
     if not os.environ.get("UAV_TWIN_LONG_TESTS"):
         for item in items:
@@ -97,6 +101,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         key=lambda item: (
             group[item.path] != LARGEST,
             group[item.path] != COMPILING,
+            item.path.name != MACHINE_CODE,
             group[item.path] in waiting,
             group[item.path] not in slow,
             -long[group[item.path]],

@@ -8,6 +8,7 @@ import hashlib
 import os
 import pickle
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -93,6 +94,22 @@ def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:
     options = {"kind": "compiled", **options}
     inputs = (hashlib.sha256(model.to_bytes()).hexdigest(), options)
     return packed(path, lambda: build_fmu(model, path, **options), FMU, inputs)
+
+
+def share_machine_code(folder: Path) -> None:
+    """Copy compiled loops to where the tests of this run find them, so that nobody compiles them again.
+
+    numba creates the folder of a module's loops when it is imported. Only a folder that is still empty can be
+    replaced, which needs one call of the operating system; so nobody finds half of the loops.
+    """
+    shared = Path(os.environ["NUMBA_CACHE_DIR"])
+    for loops_of_module in folder.iterdir():
+        copy = shared / f"{loops_of_module.name}.{os.getpid()}"
+        shutil.copytree(loops_of_module, copy)
+        try:
+            copy.rename(shared / loops_of_module.name)
+        except OSError:  # another process has compiled loops of this module
+            shutil.rmtree(copy)
 
 
 @cache  # of a hundred files, and asked for with each thing that is kept

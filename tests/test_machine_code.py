@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 from fe import compilation
-from tests.kept import ROOT
+from tests.kept import ROOT, share_machine_code
 from tests.machine_code_cases import CASES
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.xdist_group("wing"),  # the worker that needs most of these loops
     pytest.mark.skipif(compilation.numba is None, reason="needs numba: pip install 'uav-twin[fast]'"),
 ]
 LEAST_BYTES = 400
@@ -32,6 +33,7 @@ def results(library_file, write_beam, tmp_path_factory) -> list[dict[str, Any]]:
         words = [*program, str(tmp_path_factory.mktemp(name))]
         done = subprocess.run(words, env=environment, cwd=ROOT, stdout=subprocess.PIPE, check=True)
         outputs.append(json.loads(done.stdout))
+    share_machine_code(machine_code)
     return outputs
 
 
