@@ -32,10 +32,12 @@ from discrepancy.campaign.records import (
 )
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
+from discrepancy.estimation.kernel import filter_record
+from discrepancy.estimation.steps import discretise
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.kalman import RecordFilter, discretise
+from discrepancy.missing_force.two_filters import RecordFilter
 from discrepancy.system.lumped_file import LumpedDescription
 from discrepancy.system.lumped_model import LumpedModel
 from fe.runtime.patch import PowerStiffness
@@ -217,13 +219,24 @@ def filter_beside_statsmodels() -> Measurement:
 
     record, covariance = chain_record()
     steps = np.zeros(FILTERED_SAMPLES, dtype=np.int64)
-    last = np.array([FILTERED_SAMPLES])
+    steps[0] = -1  # no step leads to the first sample
+    mean = np.zeros((len(covariance), 1))
 
     def ours() -> float:
-        state = record.filter_before(steps, 0, record.initial_state(covariance), last)
-        squares = float(state.products[-1, 0, 0])
-        constant = record.used.sum() * np.log(2.0 * np.pi)
-        return float(-0.5 * (squares + constant) - state.half_log_determinants[-1])
+        innovations, _, variances, _, _ = filter_record(
+            1,
+            steps,
+            record.transitions,
+            record.noises,
+            record.output_rows[None],
+            record.columns,
+            record.used,
+            covariance,
+            mean,
+            False,
+        )
+        squares = np.sum(innovations[:, :, 0] ** 2 / variances)
+        return float(-0.5 * np.sum(squares + np.sum(np.log(2.0 * np.pi * variances))))
 
     channels, states = record.output_rows.shape
     peer = KalmanFilter(channels, states)

@@ -68,7 +68,7 @@ def record(
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
     force, _ = strongest_pattern("record", time, values[:, None], np.ones((len(values), 1), bool))
-    return find_events(force.linear_trials, 0, force.processes[0])
+    return find_events(force.linearisation, 0, force.processes[0])
 
 
 def main() -> None:

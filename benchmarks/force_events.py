@@ -23,9 +23,9 @@ from benchmarks.open_rigs.campaigns import table
 from benchmarks.open_rigs.rigs import HEATED, STORES, Course, FloatArray, entry, port, solved
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.events import find_events
-from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.model_choice import load_model
 from discrepancy.workflow import check_and_prepare
 
@@ -311,13 +311,11 @@ def problem_of(case: Case) -> Problem:
 def found_in(case: Case) -> FloatArray:
     """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
     search = ForceSearch(problem_of(case))
-    force = search.hypothesis_with_jumps(
-        max(
-            search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence
-        )
+    force = search.estimate_with_jumps(
+        max(search.estimate_by_port, key=lambda name: search.estimate_by_port[name].log_evidence)
     )
     ((port, process),) = force.processes.items()
-    return find_events(force.linear_trials, port, process).change_times(0)
+    return find_events(force.linearisation, port, process).change_times(0)
 
 
 def counted(case: Case, found: FloatArray) -> Counter[str]:

@@ -74,7 +74,7 @@ class GapWindow:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A number with its 90 % interval: posterior median and quantiles 0.05, 0.95, in `unit`."""
 
     name: str
@@ -103,9 +103,9 @@ class NamedEffect:
     """Where it acts."""
     family: str
     """Name of its family."""
-    parameters: tuple[Estimate, ...]
+    parameters: tuple[ParameterEstimate, ...]
     """Its parameters."""
-    shape: tuple[Estimate, ...]
+    shape: tuple[ParameterEstimate, ...]
     """Its free exponents, if its family was fitted."""
     patch: Patch
     """Primitive changes of the model."""

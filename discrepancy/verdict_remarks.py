@@ -74,7 +74,7 @@ def effects_not_fitted(
         The search, with all its fits.
     """
     along_force: set[str] = set()  # fitted along the missing force
-    for fitted_force in search.force_hypotheses:
+    for fitted_force in search.force_estimates:
         along_force.update(term.effect.identifier for term in fitted_force.candidate.terms)
     fitted = search.fitted_effects() | along_force
     rows = []

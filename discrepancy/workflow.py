@@ -222,7 +222,7 @@ def investigate(
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
         with stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
-                problem, search.force_search, search.force_hypotheses, fit
+                problem, search.force_search, search.force_estimates, fit
             )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):

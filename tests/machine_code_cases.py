@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
-from discrepancy.missing_force.kalman import respond_to_inputs
+from discrepancy.estimation.steps import respond_to_inputs
 from fe.reduction.reduced_basis import reduce_structure
 from fe.structure.operators import load_and_assemble
 from tests.command_line import said
@@ -92,19 +92,22 @@ def estimator(inputs: Inputs) -> bytes:
     rows = np.tile([10.0, 0.0], (samples, 1, 1))
     readings = np.random.default_rng(5).standard_normal((samples, 1, 1))
     is_used = np.ones((samples, 1), dtype=bool)
-    means, covariances, innovations, gains, variances = filter_record(
-        substeps, transition, noise, drift, rows, readings, is_used, np.eye(2), np.zeros((2, 1))
+    kinds = np.arange(-1, steps)
+    start = np.zeros((2, 1))
+    innovations, gains, variances, means, covariances = filter_record(
+        substeps, kinds, transition, noise, rows, readings, is_used, np.eye(2), start, True
     )
     motion, variance = smooth_record(
         substeps,
+        kinds,
         transition,
         rows,
         is_used,
-        means[:, :, 0],
-        covariances,
-        innovations[:, :, 0],
+        np.ascontiguousarray(innovations[:, :, 0]),
         gains,
         variances,
+        np.ascontiguousarray(means[:, :, 0]),
+        covariances,
     )
     return motion.tobytes() + variance.tobytes()
 

@@ -55,8 +55,8 @@ LONGEST_FUNCTION = 60
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
-    "discrepancy/missing_force/backward.py:filter_backward": "One compiled loop over a record's samples.",
-    "discrepancy/missing_force/kalman.py:filter_forward": "One compiled loop over a record's samples.",
+    "discrepancy/estimation/kernel.py:filter_record": "One compiled loop over a record's samples.",
+    "discrepancy/missing_force/two_filters.py:filter_backward": "One compiled loop over a record's samples.",
 }
 """What may be longer, each with its reason."""
 

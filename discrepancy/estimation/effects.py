@@ -1,6 +1,6 @@
 """The effects of a hypothesis along a trajectory: forces at ports and errors of sensors."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -9,15 +9,15 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
-from discrepancy.missing_force.hypotheses import ColumnBuilder
-from discrepancy.missing_force.linear_trials import TrialMotion
-from discrepancy.missing_force.trial import PortedTrial
+from discrepancy.fits.problem import Problem
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .laws import LawForce, force_and_tangents
+from .laws import LawForce, force_and_tangents, holds_at_rest
+from .sensor_errors import ReadingChanges
 from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
+from .trial import PortedTrial
 
 HALF_DIFFERENCE = 0.02
 """Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
@@ -31,10 +31,12 @@ class EffectLaws:
 
     Attributes
     ----------
-    column_builder : ColumnBuilder
-        The object that computes the changes of readings by errors of sensors.
+    problem : Problem
+        The campaign and the model without its own laws, with the layout of their unknowns.
     trials : tuple of PortedTrial
         The dynamic trials as linear systems with ports.
+    trial_indices : sequence of int
+        The indices of these trials in the problem.
     candidate : Candidate
         The effects at their places.
     evaluate_model_laws : callable
@@ -43,8 +45,9 @@ class EffectLaws:
         The numbers of the shared unknowns that change the model's own laws.
     """
 
-    column_builder: ColumnBuilder
+    problem: Problem
     trials: tuple[PortedTrial, ...]
+    trial_indices: Sequence[int]
     candidate: Candidate
     evaluate_model_laws: Callable[[FloatArray], ModelPatch]
     unknowns_of_model_laws: tuple[int, ...]
@@ -53,6 +56,20 @@ class EffectLaws:
     def effect_unknown_count(self) -> int:
         """The number E of unknowns of the effects."""
         return self.candidate.parameter_count
+
+    @cached_property
+    def hold_at_rest(self) -> bool:
+        """Whether a law of the hypothesis may hold a body at rest, as dry friction does.
+
+        The exponent of a law of the speed with a free shape may become that of dry friction.
+        """
+        for term in self.candidate.terms:
+            for law in term.patch(self.problem.setting, term.start_values()):
+                if not isinstance(law, PortForce) or not type(law).depends_on_speed:
+                    continue
+                if term.free_shape or holds_at_rest(law):
+                    return True
+        return False
 
     def linearise_along_trajectory(
         self, arguments: LawArguments
@@ -77,6 +94,23 @@ class EffectLaws:
             return None
 
     # ------------------------------------------------------------ laws
+
+    def effect_forces_along_trajectory(self, arguments: LawArguments) -> dict[int, LawForce]:
+        """Return the forces of the effects' laws alone along a trajectory, by port.
+
+        Raises
+        ------
+        DiscrepancyError, InvalidPatchError
+            If an effect is not possible at these values.
+        """
+        patch = self._patch_in_trial(arguments.trial_index, arguments.effect)
+        return self._forces_of_patch(arguments, patch)
+
+    def model_forces_along_trajectory(self, arguments: LawArguments) -> dict[int, FloatArray]:
+        """Return the forces (F,) of the model's own laws along a trajectory, by port."""
+        model_laws = self.evaluate_model_laws(arguments.shared)
+        forces = self._forces_of_patch(arguments, model_laws)
+        return {port: force_at_port.force for port, force_at_port in forces.items()}
 
     def _checked_forces(self, arguments: LawArguments) -> dict[int, LawForce]:
         """Return the forces of all laws, by port; raise an error if an effect is not possible."""
@@ -149,8 +183,7 @@ class EffectLaws:
 
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
-        problem = self.column_builder.problem
-        trial = problem.trials[self._index_in_problem(trial_index)].trial
+        trial = self.problem.trials[self.trial_indices[trial_index]].trial
         patch = ModelPatch()
         for index, (term, term_values) in enumerate(self.candidate.split_by_term(effect)):
             if trial.kind in term.effect.acts_on:
@@ -170,17 +203,13 @@ class EffectLaws:
         trial.
         """
         terms = self.candidate.terms
-        setting = self.column_builder.problem.setting
+        setting = self.problem.setting
 
         @lru_cache(maxsize=MOST_KEPT_PATCHES)
         def patch_of_term(index: int, values: bytes) -> ModelPatch:
             return terms[index].patch(setting, np.frombuffer(values))
 
         return patch_of_term
-
-    def _index_in_problem(self, trial_index: int) -> int:
-        """Return the index in the problem, which has static trials too, of a dynamic trial."""
-        return self.column_builder.trial_indices[trial_index]
 
     def _forces_of_patch(self, arguments: LawArguments, patch: ModelPatch) -> dict[int, LawForce]:
         """Return the forces of a patch's laws along a trajectory, by the number of the port.
@@ -191,7 +220,7 @@ class EffectLaws:
         trial = self.trials[arguments.trial_index]
         trajectory = arguments.trajectory
         forces: dict[int, LawForce] = {}
-        for law in self.column_builder.problem.model.forces_at_ports(patch):
+        for law in self.problem.model.forces_at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
             port_number = trial.system.ports.index(law.port)
@@ -211,12 +240,10 @@ class EffectLaws:
 
     def _linearised_sensor_errors(self, arguments: LawArguments) -> LinearisedSensorErrors:
         """Return the changes of a trial's readings by errors of sensors, with their derivatives."""
-        trial_index = arguments.trial_index
-        trial = self.trials[trial_index]
-        motion = motion_for_columns(arguments.trajectory)
+        trial = self.trials[arguments.trial_index]
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
-            return self._readings_change_by_effect(trial_index, motion, term, values)
+            return self.readings_change(arguments.trial_index, arguments.trajectory, term, values)
 
         change = np.zeros_like(trial.residual)
         derivatives: dict[int, FloatArray] = {}
@@ -236,45 +263,25 @@ class EffectLaws:
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
 
-    def _readings_change_by_effect(
-        self, trial_index: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
+    def readings_change(
+        self, trial_index: int, trajectory: Trajectory, term: EffectTerm, values: FloatArray
     ) -> FloatArray:
-        """Return the change (N, C) of a trial's readings by one effect, divided by the noise.
+        """Return the change (N, C) of a trial's readings by an effect that is no force at a port.
 
         Parameters
         ----------
         trial_index : int
             The index of the trial.
-        motion : TrialMotion
+        trajectory : Trajectory
             The motion that the sensors measure.
         term : EffectTerm
             The effect at its place.
         values : array
             The values of its unknowns.
         """
-        patch = term.patch(self.column_builder.problem.setting, values)
-        column = self.column_builder.column_in_trial(
-            self.trials[trial_index],
-            motion,
-            self._index_in_problem(trial_index),
-            patch,
-            term.effect.acts_on,
-        )
-        return column.readings
-
-
-def motion_for_columns(trajectory: Trajectory) -> TrialMotion:
-    """Return a trajectory in the form in which `ColumnBuilder` takes the motion of a trial.
-
-    All that laws and missing forces add counts as explained: it is part of the trajectory, so that
-    sensors measure it.
-    """
-    return TrialMotion(
-        added_state=trajectory.added_state,
-        forces=trajectory.forces,
-        unexplained_forces={},
-        explained_state=trajectory.added_state,
-        positions=trajectory.positions,
-        speeds=trajectory.speeds,
-        deviations_by_port={},
-    )
+        trial = self.trials[trial_index]
+        index_in_problem = self.trial_indices[trial_index]
+        if self.problem.trials[index_in_problem].trial.kind not in term.effect.acts_on:
+            return np.zeros_like(trial.residual)
+        patch = term.patch(self.problem.setting, values).in_trial(trial.name)
+        return ReadingChanges(self.problem).change(trial, trajectory, index_in_problem, patch)

@@ -9,32 +9,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-from discrepancy.missing_force.filtered import Process
-
+from .estimate import Estimate
+from .force_states import Process
 from .gauss_newton import (
     LEAST_RISE,
     MOST_ITERATIONS,
     EstimatorStart,
     GaussNewton,
     HypothesisLaws,
-    Linearisation,
-    MotionEstimate,
     start_from_estimate,
 )
+from .linearisation import Linearisation
+from .process_search import Processes, scale_processes
 
-DEVIATION_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+DEVIATION_FRACTIONS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.007, 0.003, 0.001)
 """Standard deviations of the missing force that are tried in turn, divided by the one at the
 start."""
-SPEED_WINDOWS = (0.1, 0.02, 0.005)
-"""Half widths of the window of speeds over which laws of the speed are averaged, divided by the rms
-speed. The window becomes narrower from one estimate to the next, so that the jump of dry friction
-is introduced gradually."""
-NARROWEST_WINDOWS = (0.001, 0.0002)
-"""Still narrower windows, which are tried after the missing force has been lowered. In a window a
-body that sticks creeps; with a large missing force the narrow ones lead the iteration astray."""
+USUAL_WINDOW = 0.005
+"""Half width of the window of speeds over which laws of the speed are averaged, divided by the rms
+speed."""
+FIRST_WINDOWS = (0.5, 0.02)
+"""First half widths of this window for a law that holds a body at rest, such as dry friction. From
+there on the window becomes narrower together with the missing force: a narrow one leads the
+iteration astray as long as the missing force is large, and in a wide one a body that sticks
+creeps, which only a missing force can undo. Which beginning is better depends on the record."""
+NARROWEST_WINDOW = 2e-4
+"""Narrowest half width of this window."""
+ROUGH_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01)
+"""These standard deviations in a rough estimate."""
+MOST_ROUGH_ITERATIONS = 3
+"""Largest number of linearisations at each of them."""
 MOST_PASSING_ITERATIONS = 8
-"""Largest number of linearisations before the window of speeds is narrowed further, or the missing
-force lowered further."""
+"""Largest number of linearisations before the missing force is lowered further."""
 MOST_LAST_ITERATIONS = 4
 """Largest number of linearisations where all values are nearly known."""
 PATTERN_FACTORS = (3.0, 1.7, 1.3)
@@ -46,16 +52,24 @@ LAST_FACTORS = (2.5, 1.5)
 """These factors where size and time are nearly known; each is tried once."""
 MOST_REPETITIONS = 4
 """Largest number of times in a row that one factor is tried, as long as the evidence rises."""
-LARGEST_DECLINE = 12.0
-"""Difference to the largest log evidence above which still smaller missing forces are not tried
-[nat]."""
+LARGEST_DECLINE, MOST_DECLINES = 12.0, 2
+"""Difference to the largest log evidence that counts as a decline [nat], and the number of declines
+in a row after which still smaller missing forces are not tried."""
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEstimator(GaussNewton):
-    """The estimator of hypotheses on the same trials, with the most probable missing forces."""
+class MotionEstimator:
+    """The estimator of hypotheses on the same trials, with the most probable missing forces.
 
-    def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
+    Attributes
+    ----------
+    gauss_newton : GaussNewton
+        The iteration under given missing forces.
+    """
+
+    gauss_newton: GaussNewton
+
+    def estimate_from_far(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that may be far from them.
 
         Parameters
@@ -63,73 +77,88 @@ class MotionEstimator(GaussNewton):
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
-            The values and trajectories to begin with.
+            The values and trajectories to begin with, and large missing forces.
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self.follow_to_small_forces(laws, start)
-        return None if estimate is None else self.tune_processes(laws, estimate)
+        windows = FIRST_WINDOWS if laws.hold_at_rest else (USUAL_WINDOW,)
+        estimates = []
+        for speed_window in windows:
+            estimate = self._estimate_with_smaller_forces(laws, start, speed_window)
+            if estimate is not None:
+                estimates.append(estimate)
+        if not estimates:
+            return None
+        best_estimate = max(estimates, key=lambda estimate: estimate.log_evidence)
+        return self.tune_processes(laws, best_estimate, COARSE_FACTORS)
 
-    def follow_to_small_forces(
-        self, laws: HypothesisLaws, start: EstimatorStart
-    ) -> MotionEstimate | None:
-        """Return the estimate by continuation from large missing forces to small ones.
-
-        With large missing forces the trajectory follows the readings whatever the laws. They are
-        lowered step by step, and each estimate begins where the last one ended. Before that, laws
-        of the speed are smoothed over wide windows of speeds, which are narrowed step by step.
+    def estimate_roughly(
+        self, laws: HypothesisLaws, start: EstimatorStart, small_processes: Processes
+    ) -> Estimate | None:
+        """Return an estimate for a first comparison, after few steps and few missing forces.
 
         Parameters
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
-            The values and trajectories to begin with.
+            The values and trajectories to begin with, and large missing forces.
+        small_processes : mapping of int to Process
+            The missing forces that may remain beside the effects, with which another estimate
+            begins.
 
         Returns
         -------
-        MotionEstimate or None
-            The estimate; None if the laws are not possible along the trajectories.
+        Estimate or None
+            The more probable estimate; None if the laws are not possible along the trajectories.
         """
+        # a narrow window is as good as the small missing forces, a wide one as the large ones
+        narrow_window = NARROWEST_WINDOW if laws.hold_at_rest else USUAL_WINDOW
+        best_estimate = self.gauss_newton.iterate(
+            laws, replace(start, processes=small_processes), narrow_window, MOST_ROUGH_ITERATIONS
+        )
+        window = FIRST_WINDOWS[-1] if laws.hold_at_rest else USUAL_WINDOW
         current_start = start
-        # with wide windows of speeds first, so that a jump of a law does not stop the iteration
-        for speed_window in SPEED_WINDOWS[:-1]:
-            estimate = self.iterate(laws, current_start, speed_window, MOST_PASSING_ITERATIONS)
+        for fraction in ROUGH_FRACTIONS:
+            processes = scale_processes(start.processes, fraction, 1.0)
+            estimate = self.gauss_newton.iterate(
+                laws, replace(current_start, processes=processes), window, MOST_ROUGH_ITERATIONS
+            )
             if estimate is None:
-                return None
+                break
+            if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
+                best_estimate = estimate
             current_start = start_from_estimate(estimate)
-        return self._estimate_with_smaller_forces(laws, current_start, SPEED_WINDOWS[-1])
+        return best_estimate
 
-    def estimate_nearby(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
+    def estimate_nearby(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+    ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
 
-        The missing forces at the start need not be large. The windows of speeds become as narrow as
-        the evidence allows.
-
         Parameters
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
-            The values and trajectories to begin with.
+            The values and trajectories to begin with. The missing forces need not be large.
+        speed_window : float
+            The half width of the window of speeds to begin with, see `LawArguments`.
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self._estimate_with_smaller_forces(laws, start, SPEED_WINDOWS[-1])
-        if estimate is None:
-            return None
-        estimate = self.tune_processes(laws, estimate, COARSE_FACTORS)
-        return self.tune_processes(laws, self._narrow_windows(laws, estimate))
+        estimate = self._estimate_with_smaller_forces(laws, start, speed_window)
+        return None if estimate is None else self.tune_processes(laws, estimate)
 
     def polish(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
-    ) -> MotionEstimate | None:
+    ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are nearly these.
 
         The search for the most probable missing forces is short.
@@ -145,50 +174,26 @@ class MotionEstimator(GaussNewton):
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self.iterate(laws, start, speed_window, MOST_LAST_ITERATIONS)
+        estimate = self.gauss_newton.iterate(laws, start, speed_window, MOST_LAST_ITERATIONS)
         if estimate is None:
             return None
         return self.tune_processes(
             laws, estimate, LAST_FACTORS, repetitions=1, most_iterations=MOST_LAST_ITERATIONS
         )
 
-    def _narrow_windows(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
-        """Return the estimate with the narrowest window of speeds that makes it more probable.
-
-        With a narrower window a body that sticks creeps less, so that a smaller missing force may
-        be the more probable one. It is lowered again with each window.
-
-        Parameters
-        ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
-        estimate : MotionEstimate
-            The estimate with a wider window.
-        """
-        for speed_window in NARROWEST_WINDOWS:
-            narrower_estimate = self._estimate_with_smaller_forces(
-                laws, start_from_estimate(estimate), speed_window
-            )
-            if (
-                narrower_estimate is None
-                or narrower_estimate.log_evidence < estimate.log_evidence + LEAST_RISE
-            ):
-                break
-            estimate = narrower_estimate
-        return estimate
-
     def _estimate_with_smaller_forces(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
-    ) -> MotionEstimate | None:
+    ) -> Estimate | None:
         """Return the most probable of several estimates with smaller and smaller missing forces.
 
         This is a continuation. With a large missing force the trajectory follows the readings
         whatever the laws are. Then the standard deviation of the missing force is lowered, to each
         of `DEVIATION_FRACTIONS` times its value at the start. Each estimate begins with the
-        unknowns and the trajectories of the previous one.
+        unknowns and the trajectories of the previous one. If a law holds a body at rest, the window
+        of speeds becomes narrower by the same factor.
 
         Parameters
         ----------
@@ -197,45 +202,50 @@ class MotionEstimator(GaussNewton):
         start : EstimatorStart
             The unknowns, trajectories and missing forces of the first estimate.
         speed_window : float
-            The half width of the window of speeds, see `LawArguments`.
+            The half width of the first window of speeds, see `LawArguments`.
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The estimate; None if there is none even with the first missing force.
         """
-        best_estimate: MotionEstimate | None = None
+        best_estimate: Estimate | None = None
         current_start = start
+        decline_count = 0
         for fraction in DEVIATION_FRACTIONS:
             # each fraction is of the missing force at the start, not of the previous one
-            processes = {
-                port: replace(process, standard_deviation=fraction * process.standard_deviation)
-                for port, process in start.processes.items()
-            }
-            estimate = self.iterate(
-                laws,
-                replace(current_start, processes=processes),
-                speed_window,
-                MOST_PASSING_ITERATIONS,
+            processes = scale_processes(start.processes, fraction, 1.0)
+            window = speed_window
+            if laws.hold_at_rest:
+                window = max(fraction * speed_window, NARROWEST_WINDOW)
+            estimate = self.gauss_newton.iterate(
+                laws, replace(current_start, processes=processes), window, MOST_PASSING_ITERATIONS
             )
             if estimate is None:
                 break
+            # smaller forces will hardly raise an evidence this far below the best one above it
+            if (
+                best_estimate is not None
+                and estimate.log_evidence < best_estimate.log_evidence - LARGEST_DECLINE
+            ):
+                decline_count += 1
+                if decline_count == MOST_DECLINES:
+                    break
+            else:
+                decline_count = 0
             if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
                 best_estimate = estimate
-            # smaller forces will hardly raise an evidence this far below the best one above it
-            elif estimate.log_evidence < best_estimate.log_evidence - LARGEST_DECLINE:
-                break
             current_start = start_from_estimate(estimate)
         return best_estimate
 
     def tune_processes(
         self,
         laws: HypothesisLaws,
-        estimate: MotionEstimate,
+        estimate: Estimate,
         factors: Sequence[float] = PATTERN_FACTORS,
         repetitions: int = MOST_REPETITIONS,
         most_iterations: int = MOST_ITERATIONS,
-    ) -> MotionEstimate:
+    ) -> Estimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
         This is a pattern search with decreasing factors, in which the trials stay linear along one
@@ -245,7 +255,7 @@ class MotionEstimator(GaussNewton):
         ----------
         laws : HypothesisLaws
             The laws and sensor errors of the hypothesis.
-        estimate : MotionEstimate
+        estimate : Estimate
             The estimate with the present sizes and times.
         factors : sequence of float
             The factors on size and time that are tried in turn.
@@ -255,11 +265,11 @@ class MotionEstimator(GaussNewton):
             The largest number of linearisations of the last estimate.
         """
         start = start_from_estimate(estimate)
-        linearisation = self.linearise(laws, start, estimate.speed_window)
+        linearisation = self.gauss_newton.linearise(laws, start, estimate.speed_window)
         if linearisation is None:
             return estimate
         processes = dict(start.processes)
-        first_evidence = self.evidence_with_processes(linearisation, processes)
+        first_evidence = self.gauss_newton.log_evidence(linearisation, processes)
         largest_evidence = first_evidence
         for factor in factors:
             for _ in range(repetitions):
@@ -271,7 +281,7 @@ class MotionEstimator(GaussNewton):
                     break
         if largest_evidence < first_evidence + LEAST_RISE:
             return estimate
-        tuned_estimate = self.iterate(
+        tuned_estimate = self.gauss_newton.iterate(
             laws, replace(start, processes=processes), estimate.speed_window, most_iterations
         )
         if tuned_estimate is None or tuned_estimate.log_evidence <= estimate.log_evidence:
@@ -305,7 +315,7 @@ class MotionEstimator(GaussNewton):
         log_evidence : float
             Their log evidence [nat].
         """
-        shortest_time, longest_time = self.correlation_time_range
+        shortest_time, longest_time = linearisation.correlation_time_range
         for port, quantity in product(tuple(processes), ("standard_deviation", "correlation_time")):
             # the first of a larger and a smaller value that is more probable is kept
             for ratio in (factor, 1.0 / factor):
@@ -316,7 +326,7 @@ class MotionEstimator(GaussNewton):
                 changed_processes = processes | {
                     port: replace(processes[port], **{quantity: value})
                 }
-                evidence = self.evidence_with_processes(linearisation, changed_processes)
+                evidence = self.gauss_newton.log_evidence(linearisation, changed_processes)
                 if evidence > largest_evidence:
                     processes, largest_evidence = changed_processes, evidence
                     break

@@ -6,28 +6,23 @@ one, until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIA
 Laplace's approximation.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Protocol
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.missing_force.filtered import (
-    LEAST_PRECISION,
-    Process,
-    Regression,
-    Solution,
-    integrate_out_last,
-)
-from discrepancy.missing_force.process_search import prior_log_density
-from discrepancy.missing_force.trial import PortedTrial, correlation_time_range
+from discrepancy.fits.candidate import Candidate
 
+from .estimate import Estimate
 from .laws import LawForce
-from .linearised import LinearisedTrial, SmoothedTrial
+from .linearisation import Linearisation
+from .linearised import LinearisedTrial
+from .process_search import Processes, prior_log_density
 from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
+from .trial import PortedTrial
 
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
@@ -48,8 +43,12 @@ class HypothesisLaws(Protocol):
     """The laws and sensor errors of a hypothesis, as the estimator needs them."""
 
     @property
-    def effect_unknown_count(self) -> int:
-        """The number E of effect parameters, which all have a standard normal prior."""
+    def candidate(self) -> Candidate:
+        """The effects of the hypothesis; their E parameters have a standard normal prior."""
+
+    @property
+    def hold_at_rest(self) -> bool:
+        """Whether a law has a force at rest that may hold a body, as dry friction does."""
 
     def linearise_along_trajectory(
         self, arguments: LawArguments
@@ -82,131 +81,8 @@ class HypothesisLaws(Protocol):
             The forces by the number of the port; None if an effect is not possible at these values.
         """
 
-
-@dataclass(frozen=True, eq=False)
-class MotionEstimate:
-    """A hypothesis at its most probable values, estimated together with the motion of the trials.
-
-    Attributes
-    ----------
-    effect : (E,) ndarray
-        The unknowns of its effects, with standard normal prior.
-    shared : (K,) ndarray
-        The unknowns that all trials share.
-    local : tuple of (L,) ndarray
-        The unknowns of each trial alone.
-    covariance : (K + E, K + E) ndarray
-        The covariance of shared unknowns and effect parameters.
-    processes : mapping of int to Process
-        The forces that remain missing with its laws, by the numbers of their ports.
-    log_evidence : float
-        The log evidence with the priors of the processes [nat].
-    trials : tuple of SmoothedTrial
-        The motion and the missing forces of each trial.
-    converged : bool
-        Whether the last step was short enough.
-    speed_window : float
-        The half width of the window of speeds with which it was estimated, see `LawArguments`.
-    """
-
-    effect: FloatArray
-    shared: FloatArray
-    local: tuple[FloatArray, ...]
-    covariance: FloatArray
-    processes: Mapping[int, Process]
-    log_evidence: float
-    trials: tuple[SmoothedTrial, ...]
-    converged: bool
-    speed_window: float
-
-
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """All trials, linear along their trajectories.
-
-    Attributes
-    ----------
-    trials : tuple of LinearisedTrial
-        The trials, each linear about the same estimate.
-    prior_precision : (K + E,) ndarray
-        The prior precisions of the shared unknowns, and of those of the effects.
-    """
-
-    trials: tuple[LinearisedTrial, ...]
-    prior_precision: FloatArray
-
-    def solve(self) -> tuple[Solution, list[FloatArray]]:
-        """Return the most probable values of all unknowns.
-
-        Returns
-        -------
-        solution : Solution
-            The K unknowns that all trials share, then the E unknowns of the effects.
-        local_of_trials : list of (L,) array
-            The local unknowns of each trial: those that occur in this trial only.
-        """
-        solution = _solve_shared_unknowns(self.trials, self.prior_precision)
-        local_of_trials = [
-            self._most_probable_local_unknowns(linear_trial, solution.mean)
-            for linear_trial in self.trials
-        ]
-        return solution, local_of_trials
-
-    def _most_probable_local_unknowns(
-        self, linear_trial: LinearisedTrial, shared_and_effect: FloatArray
-    ) -> FloatArray:
-        """Return the most probable values (L,) of the local unknowns of one trial.
-
-        Local unknowns occur in one trial only, such as its initial state. All other unknowns of the
-        trial are fixed at given values.
-
-        Parameters
-        ----------
-        linear_trial : LinearisedTrial
-            The trial, linear about an estimate of its motion.
-        shared_and_effect : (K + E,) array
-            The values of the K unknowns that all trials share, then of the E unknowns of effects.
-        """
-        # Inner products of the whitened residual (index 0) and its derivatives by the shared and
-        # effect unknowns, then by the local unknowns.
-        products, _ = linear_trial.whitened_products
-        residual = 0
-        first_local = 1 + len(shared_and_effect)
-        fixed = slice(1, first_local)
-        local_slice = slice(first_local, None)
-        # normal equations of the local unknowns, with the fixed unknowns on the right side
-        prior_precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
-        normal_matrix = products[local_slice, local_slice] + np.diag(prior_precision)
-        by_fixed = products[local_slice, fixed] @ shared_and_effect
-        right_side = products[local_slice, residual] - by_fixed
-        return np.linalg.solve(normal_matrix, right_side)
-
-
-def _solve_shared_unknowns(
-    trials: Iterable[LinearisedTrial], prior_precision: FloatArray
-) -> Solution:
-    """Return the most probable values of the K unknowns of all trials and the E of the effects.
-
-    The local unknowns of each trial are integrated out.
-
-    Parameters
-    ----------
-    trials : iterable of LinearisedTrial
-        The trials, each linear about the same estimate.
-    prior_precision : (K + E,) array
-        The prior precisions of these unknowns.
-    """
-    sum_of_products = np.zeros((1 + len(prior_precision),) * 2)
-    half_log_determinant = 0.0
-    for trial in trials:
-        products, half_determinant = trial.whitened_products
-        products_without_local, half_determinant_without_local = integrate_out_last(
-            products, np.asarray(half_determinant), trial.trial.local_precision
-        )
-        sum_of_products += products_without_local
-        half_log_determinant += float(half_determinant_without_local)
-    regression = Regression(sum_of_products, half_log_determinant)
-    return regression.solve(range(len(prior_precision)), prior_precision)
+    def model_forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, FloatArray]:
+        """Return the forces (F,) of the model's own laws along a trajectory, by port."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +103,7 @@ class EstimatorStart:
     effect: FloatArray
     shared: FloatArray
     trajectories: tuple[Trajectory, ...]
-    processes: Mapping[int, Process]
+    processes: Processes
 
     def law_arguments(self, trial_index: int, speed_window: float) -> LawArguments:
         """Return the arguments of the laws in a trial; `speed_window` as in `LawArguments`."""
@@ -236,7 +112,7 @@ class EstimatorStart:
         )
 
 
-def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
+def start_from_estimate(estimate: Estimate) -> EstimatorStart:
     """Return the start of an estimate that continues from the result of another one."""
     return EstimatorStart(
         estimate.effect,
@@ -244,6 +120,56 @@ def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
         tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials),
         estimate.processes,
     )
+
+
+def linearise_trials(
+    laws: HypothesisLaws,
+    trials: Sequence[PortedTrial],
+    start: EstimatorStart,
+    speed_window: float,
+    shared_precision: FloatArray,
+) -> Linearisation | None:
+    """Return all trials with a hypothesis' laws, linearised along trajectories.
+
+    Parameters
+    ----------
+    laws : HypothesisLaws
+        The laws and sensor errors of the hypothesis.
+    trials : sequence of PortedTrial
+        The trials as linear systems with ports.
+    start : EstimatorStart
+        The trajectories and the values of unknowns.
+    speed_window : float
+        The half width of the window of speeds over which laws of the speed are averaged, divided by
+        the rms speed.
+    shared_precision : (K,) array
+        The prior precisions of the shared unknowns.
+
+    Returns
+    -------
+    Linearisation or None
+        The linear trials; None if the laws are not possible in one of them.
+    """
+    linear_trials = []
+    for trial_index, trial in enumerate(trials):
+        arguments = start.law_arguments(trial_index, speed_window)
+        forces_and_sensor_errors = laws.linearise_along_trajectory(arguments)
+        if forces_and_sensor_errors is None:
+            return None
+        forces, sensor_errors = forces_and_sensor_errors
+        linear_trial = LinearisedTrial(
+            trial=trial,
+            trajectory=start.trajectories[trial_index],
+            forces=forces,
+            sensor_errors=sensor_errors,
+            effect=start.effect,
+            shared=start.shared,
+            model_forces=laws.model_forces_along_trajectory(arguments),
+        )
+        linear_trials.append(linear_trial)
+    # the unknowns of effects have standard normal priors, of precision one
+    precision = np.concatenate((shared_precision, np.ones(laws.candidate.parameter_count)))
+    return Linearisation(tuple(linear_trials), precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +188,17 @@ class GaussNewton:
 
     trials: tuple[PortedTrial, ...]
     shared_precision: FloatArray
-    prior_medians: Mapping[int, Process]
+    prior_medians: Processes
+
+    def linearise(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+    ) -> Linearisation | None:
+        """Return the trials with laws along trajectories, see `linearise_trials`."""
+        return linearise_trials(laws, self.trials, start, speed_window, self.shared_precision)
+
+    def log_evidence(self, linearisation: Linearisation, processes: Processes) -> float:
+        """Return log evidence plus log prior of missing forces in linear trials [nat]."""
+        return linearisation.log_evidence_with_prior(self.prior_medians, processes)
 
     def iterate(
         self,
@@ -270,7 +206,7 @@ class GaussNewton:
         start: EstimatorStart,
         speed_window: float,
         most_iterations: int = MOST_ITERATIONS,
-    ) -> MotionEstimate | None:
+    ) -> Estimate | None:
         """Return the estimate under given missing forces, by damped Gauss-Newton steps.
 
         Parameters
@@ -287,13 +223,13 @@ class GaussNewton:
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The last estimate; None if the laws are not possible along the first trajectories, or if
             the first evidence is not finite.
         """
         current_start = start
         last_evidence = -inf
-        estimate: MotionEstimate | None = None
+        estimate: Estimate | None = None
         stagnant_iterations = 0
         largest_evidence = -inf
         for _ in range(most_iterations):
@@ -301,7 +237,7 @@ class GaussNewton:
             if linearisation is None:
                 return estimate
             new_estimate = self._estimate_of_linearisation(
-                linearisation, current_start, last_evidence, speed_window
+                laws.candidate, linearisation, current_start, last_evidence, speed_window
             )
             if new_estimate is None:
                 return estimate
@@ -322,15 +258,18 @@ class GaussNewton:
 
     def _estimate_of_linearisation(
         self,
+        candidate: Candidate,
         linearisation: Linearisation,
         start: EstimatorStart,
         last_evidence: float,
         speed_window: float,
-    ) -> MotionEstimate | None:
+    ) -> Estimate | None:
         """Return the estimate of linear trials, after a whole Gauss-Newton step from a start.
 
         Parameters
         ----------
+        candidate : Candidate
+            The effects of the hypothesis.
         linearisation : Linearisation
             The trials, linear about the start.
         start : EstimatorStart
@@ -343,101 +282,38 @@ class GaussNewton:
 
         Returns
         -------
-        MotionEstimate or None
+        Estimate or None
             The estimate; None if its evidence is not finite.
         """
-        solution, local_of_trials = linearisation.solve()
+        solution, smoothed_trials = linearisation.solve_and_smooth(start.processes)
         if not np.isfinite(solution.log_evidence):
             return None
         unknowns = solution.mean
-        smoothed_trials = tuple(
-            trial.smooth(np.concatenate((unknowns, local_unknowns)))
-            for trial, local_unknowns in zip(linearisation.trials, local_of_trials, strict=True)
-        )
-        evidence = solution.log_evidence + self._log_prior(start.processes)
+        evidence = solution.log_evidence + prior_log_density(self.prior_medians, start.processes)
         # the change of each unknown in posterior standard deviations
         last_unknowns = np.concatenate((start.shared, start.effect))
         deviations = np.sqrt(np.diag(solution.covariance))
         largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
         evidence_change = abs(evidence - last_evidence)
         shared_count = len(self.shared_precision)
-        return MotionEstimate(
+        return Estimate(
+            candidate=candidate,
             effect=unknowns[shared_count:],
             shared=unknowns[:shared_count],
-            local=tuple(local_of_trials),
-            covariance=solution.covariance,
+            conditional_covariance=solution.covariance,
             processes=start.processes,
             log_evidence=evidence,
             trials=smoothed_trials,
-            converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
+            linearisation=linearisation,
             speed_window=speed_window,
+            converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
         )
-
-    def evidence_with_processes(
-        self, linearisation: Linearisation, processes: Mapping[int, Process]
-    ) -> float:
-        """Return log evidence plus log prior of missing forces, with the linearisation kept [nat].
-
-        Parameters
-        ----------
-        linearisation : Linearisation
-            All trials, linear about the present estimate.
-        processes : mapping of int to Process
-            The missing forces, by the number of the port.
-        """
-        # made and filtered one after the other, as each filter needs tens of MB in a long record
-        changed_trials = (replace(trial, processes=processes) for trial in linearisation.trials)
-        solution = _solve_shared_unknowns(changed_trials, linearisation.prior_precision)
-        return solution.log_evidence + self._log_prior(processes)
-
-    def linearise(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
-    ) -> Linearisation | None:
-        """Return all trials with a hypothesis' laws, linearised along trajectories.
-
-        Parameters
-        ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
-        start : EstimatorStart
-            The trajectories, the values of unknowns and the missing forces.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
-
-        Returns
-        -------
-        Linearisation or None
-            The linear trials; None if the laws are not possible in one of them.
-        """
-        linear_trials = []
-        for trial_index, trial in enumerate(self.trials):
-            trajectory = start.trajectories[trial_index]
-            forces_and_sensor_errors = laws.linearise_along_trajectory(
-                start.law_arguments(trial_index, speed_window)
-            )
-            if forces_and_sensor_errors is None:
-                return None
-            forces, sensor_errors = forces_and_sensor_errors
-            linear_trial = LinearisedTrial(
-                trial=trial,
-                processes=start.processes,
-                trajectory=trajectory,
-                forces=forces,
-                sensor_errors=sensor_errors,
-                effect=start.effect,
-                shared=start.shared,
-            )
-            linear_trials.append(linear_trial)
-        # the unknowns of effects have standard normal priors, of precision one
-        precision = np.concatenate((self.shared_precision, np.ones(laws.effect_unknown_count)))
-        return Linearisation(tuple(linear_trials), precision)
 
     def _take_step(
         self,
         laws: HypothesisLaws,
         current_start: EstimatorStart,
-        estimate: MotionEstimate,
+        estimate: Estimate,
         linearisation: Linearisation,
         speed_window: float,
     ) -> EstimatorStart | None:
@@ -454,7 +330,7 @@ class GaussNewton:
             The laws and sensor errors of the hypothesis.
         current_start : EstimatorStart
             The values and trajectories before the step.
-        estimate : MotionEstimate
+        estimate : Estimate
             The values and trajectories at the end of the whole step.
         linearisation : Linearisation
             The trials, linear about `current_start`.
@@ -481,7 +357,7 @@ class GaussNewton:
                 )
             )
             stepped_start = EstimatorStart(
-                effect=current_start.effect + fraction_taken * change,
+                effect=laws.candidate.within_range(current_start.effect + fraction_taken * change),
                 shared=current_start.shared
                 + fraction_taken * (estimate.shared - current_start.shared),
                 trajectories=trajectories,
@@ -553,12 +429,3 @@ class GaussNewton:
                 error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
                 largest_ratio = max(largest_ratio, error / largest_deviation)
         return largest_ratio
-
-    @cached_property
-    def correlation_time_range(self) -> tuple[float, float]:
-        """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
-        return correlation_time_range(self.trials)
-
-    def _log_prior(self, processes: Mapping[int, Process]) -> float:
-        """Return the logarithm of the prior of missing forces [nat], up to a constant."""
-        return prior_log_density(self.prior_medians, processes)

@@ -1,22 +1,31 @@
 """Compiled loops of the estimator: substeps with laws, a Kalman filter, and its smoother.
 
-The system of a trial is linear along a trajectory and changes in time:
+The system of a trial is linear along a trajectory. Its state is the sum of two parts. The first one
+is known but for W weights: the first weight is one, and the others are the unknowns of the
+hypothesis. `respond_to_drift` computes it. The second part is random:
 
-    z[j + 1] = transition[j] z[j] + drift[j] weights + process noise,
-    columns weights = rows z + noise of variance one.
+    z[j + 1] = transition z[j] + process noise,
+    columns weights = rows z + noise of variance one,
 
-The first of the W weights is one, that of the constant part; the others are the unknowns of the
-hypothesis. The filter carries the response of the state to each weight along with the state (de
-Jong 1991, Annals of Statistics 19, 1073-1083). Unknowns that are constant in time then follow from
-one regression after one pass, and need not be states.
+where the columns are the readings minus the first part, for a unit of each weight. The filter
+whitens all columns in one pass. Unknowns that are constant in time then follow from one regression,
+and need not be states.
 
-Shapes: F fine stamps, N samples, n states, C channels, W weights, P ports with a law.
+Each fine stamp has the kind of the step that leads to it, which is an index of the transitions:
+in a system that does not change in time, steps of one length are of one kind.
+
+Shapes: F fine stamps, N samples, n states, C channels, W weights, S kinds of steps, P ports with a
+law.
 """
 
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from fe.compilation import callable_when_compiled, compiled
+
+STEADY = 1e-9
+"""Largest change of an entry of a converged covariance, over the standard deviations of its row and
+column."""
 
 
 @callable_when_compiled
@@ -179,28 +188,48 @@ def substep_matrices_with_laws(
     return transition, noise
 
 
-@callable_when_compiled
-def update_by_reading(
-    covariance: FloatArray,
-    mean: FloatArray,
-    output_row: FloatArray,
-    innovation: FloatArray,
-    gain: FloatArray,
-) -> float:
-    """Update covariance and means of the state in place by one reading, and return its variance.
+@compiled
+def respond_to_drift(
+    step_kinds: IntArray, transitions: FloatArray, drifts: FloatArray, start: FloatArray
+) -> FloatArray:
+    """Return the state (F, n, W) that each weight adds, without process noise.
 
     Parameters
     ----------
-    covariance : (n, n) ndarray
-        The covariance of the state.
-    mean : (n, W) ndarray
-        The mean of the state for a unit of each weight.
-    output_row : (n,) ndarray
-        The reading for a unit of each state.
-    innovation : (W,) ndarray
-        The reading minus its prediction, for a unit of each weight.
-    gain : (n,) ndarray
-        The gain of the reading, which is filled.
+    step_kinds : (F,) ndarray of int
+        The kind of the step that leads to each fine stamp; that of the first stamp is not used.
+    transitions : (S, n, n) ndarray
+        The transitions of the different steps.
+    drifts : (F - 1, n, W) ndarray
+        The state that a unit of each weight adds in each step.
+    start : (n, W) ndarray
+        The state at the first stamp.
+    """
+    states = np.empty((len(step_kinds), *start.shape))
+    states[0] = start
+    for j in range(1, len(step_kinds)):
+        multiply(transitions[step_kinds[j]], states[j - 1], states[j])
+        states[j] += drifts[j - 1]
+    return states
+
+
+@callable_when_compiled
+def is_steady(covariance: FloatArray, previous_covariance: FloatArray) -> bool:
+    """Return whether two covariances (n, n) differ by no more than `STEADY`, entry by entry."""
+    for i in range(len(covariance)):
+        for j in range(len(covariance)):
+            scale = STEADY * np.sqrt(covariance[i, i] * covariance[j, j])
+            if np.abs(covariance[i, j] - previous_covariance[i, j]) > scale:
+                return False
+    return True
+
+
+@callable_when_compiled
+def update_covariance(covariance: FloatArray, output_row: FloatArray, gain: FloatArray) -> float:
+    """Update a covariance (n, n) in place by one reading, and return the innovation's variance.
+
+    `output_row` (n,) is the reading for a unit of each state; its noise has variance one. `gain`
+    (n,) is filled with the Kalman gain.
     """
     states = len(output_row)
     covariance_row = np.empty(states)
@@ -224,96 +253,156 @@ def update_by_reading(
     for i in range(states):
         for j in range(states):
             covariance[i, j] += (gain[i] - covariance_row[i]) * gain[j]
-    for i in range(states):
-        for w in range(mean.shape[1]):
-            mean[i, w] += gain[i] * innovation[w]
     return float(variance)
+
+
+@callable_when_compiled
+def predict_mean(transition: FloatArray, mean: FloatArray, predicted_mean: FloatArray) -> None:
+    """Fill the means (n, W) after a step. Zeros of the transition are skipped."""
+    predicted_mean[:] = 0.0
+    for i in range(len(transition)):
+        for j in range(len(transition)):
+            coefficient = transition[i, j]
+            if coefficient != 0.0:
+                for w in range(mean.shape[1]):
+                    predicted_mean[i, w] += coefficient * mean[j, w]
+
+
+@callable_when_compiled
+def update_mean(
+    output_row: FloatArray, gain: FloatArray, innovation: FloatArray, mean: FloatArray
+) -> None:
+    """Turn the columns (W,) of a reading into its innovations, and correct the means (n, W)."""
+    for i in range(len(output_row)):
+        coefficient = output_row[i]
+        if coefficient != 0.0:
+            for w in range(len(innovation)):
+                innovation[w] -= coefficient * mean[i, w]
+    for i in range(len(output_row)):
+        coefficient = gain[i]
+        for w in range(len(innovation)):
+            mean[i, w] += coefficient * innovation[w]
 
 
 @compiled
 def filter_record(
     substeps: int,
+    step_kinds: IntArray,
     transitions: FloatArray,
     noises: FloatArray,
-    drifts: FloatArray,
     output_rows: FloatArray,
     columns: FloatArray,
     is_used: BoolArray,
     covariance: FloatArray,
     mean: FloatArray,
+    keeps_states: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the predicted state at each fine stamp, and the innovations of all readings.
+    """Return the innovations of all readings and, if asked for, the filtered state at each stamp.
+
+    Where nothing changes from one sample to the next, the covariance converges; from there on it is
+    not computed anew.
 
     Parameters
     ----------
     substeps : int
         The number of substeps between two samples.
-    transitions, noises, drifts : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
-        The matrices of each substep, see `substep_matrices_with_laws`.
-    output_rows, columns : (N, C, n), (N, C, W) ndarray
-        The readings for a unit of each state, and the residuals for a unit of each weight, divided
-        by the deviation of the noise.
+    step_kinds : (F,) ndarray of int
+        The kind of the step that leads to each fine stamp; negative if no step does, as at the
+        first stamp of a record.
+    transitions, noises : (S, n, n) ndarray
+        The transition of each kind of step, and the covariance of its process noise.
+    output_rows : (1, C, n) or (N, C, n) ndarray
+        The readings for a unit of each state, divided by the deviation of the white noise: for all
+        samples, or for each one.
+    columns : (N, C, W) ndarray
+        The readings minus the part that is known but for the weights, divided by the same.
     is_used : (N, C) ndarray of bool
         Whether each reading is compared with the model.
     covariance, mean : (n, n), (n, W) ndarray
-        The state before the first reading.
+        The state before the first step or reading.
+    keeps_states : bool
+        Whether the state at each stamp is returned.
 
     Returns
     -------
-    means, covariances : (F, n, W), (F, n, n) ndarray
-        The state at each fine stamp before the readings there.
     innovations : (N, C, W) ndarray
         The readings minus their predictions, for a unit of each weight; zero if a reading does not
         count.
     gains, variances : (N, C, n), (N, C) ndarray
-        The gain of each reading, and the variance of its innovation.
+        The gain of each reading, and the variance of its innovation. The gains have no rows if the
+        states are not kept.
+    means, covariances : (F, n, W), (F, n, n) ndarray
+        The state at each fine stamp, after the readings there; no rows if it is not kept.
     """
-    stamp_count, state_count, weight_count = len(transitions) + 1, mean.shape[0], mean.shape[1]
-    sample_count, channel_count = columns.shape[0], columns.shape[1]
-    means = np.empty((stamp_count, state_count, weight_count))
-    covariances = np.empty((stamp_count, state_count, state_count))
+    sample_count, channel_count, weight_count = columns.shape
+    state_count = len(covariance)
+    stamp_count = len(step_kinds)
     innovations = np.zeros((sample_count, channel_count, weight_count))
-    gains = np.zeros((sample_count, channel_count, state_count))
     variances = np.ones((sample_count, channel_count))
+    kept_samples, kept_stamps = (sample_count, stamp_count) if keeps_states else (0, 0)
+    all_gains = np.zeros((kept_samples, channel_count, state_count))
+    means = np.empty((kept_stamps, state_count, weight_count))
+    covariances = np.empty((kept_stamps, state_count, state_count))
+
     mean, covariance = mean.copy(), covariance.copy()
-    work = np.empty((state_count, state_count))
+    predicted_mean = np.empty((state_count, weight_count))
+    predicted_covariance, work = np.empty((2, state_count, state_count))
+    covariance_at_sample = np.empty((state_count, state_count))
+    gains = np.zeros((channel_count, state_count))
+    has_one_row = len(output_rows) == 1
+    steady = False
     for j in range(stamp_count):
-        means[j] = mean
-        covariances[j] = covariance
-        # every `substeps`-th fine stamp is a sample: process its readings
+        # a converged covariance stays so while the steps and the used readings are the same
+        if steady and (j - 1) % substeps == 0:
+            next_sample = (j - 1) // substeps + 1
+            steady = step_kinds[j] == step_kinds[j - substeps] and bool(
+                np.all(is_used[next_sample] == is_used[next_sample - 1])
+            )
+        # predict over the step
+        kind = step_kinds[j]
+        if kind >= 0:
+            predict_mean(transitions[kind], mean, predicted_mean)
+            mean, predicted_mean = predicted_mean, mean
+            if not steady:
+                propagate_covariance(transitions[kind], covariance, work, predicted_covariance)
+                covariance, predicted_covariance = predicted_covariance, covariance
+                covariance += noises[kind]
+        # update by the readings of a sample, one at a time
         if j % substeps == 0:
             k = j // substeps
+            rows = output_rows[0] if has_one_row else output_rows[k]
             for c in range(channel_count):
-                if is_used[k, c]:
-                    for w in range(weight_count):
-                        innovations[k, c, w] = columns[k, c, w]
-                        for i in range(state_count):
-                            innovations[k, c, w] -= output_rows[k, c, i] * mean[i, w]
-                    variances[k, c] = update_by_reading(
-                        covariance, mean, output_rows[k, c], innovations[k, c], gains[k, c]
-                    )
-        # predict over the substep
-        if j < stamp_count - 1:
-            filtered_mean = mean.copy()
-            multiply(transitions[j], filtered_mean, mean)
-            mean += drifts[j]
-            filtered_covariance = covariance.copy()
-            propagate_covariance(transitions[j], filtered_covariance, work, covariance)
-            covariance += noises[j]
-    return means, covariances, innovations, gains, variances
+                if not is_used[k, c]:
+                    continue
+                if steady:
+                    variances[k, c] = variances[k - 1, c]
+                else:
+                    variances[k, c] = update_covariance(covariance, rows[c], gains[c])
+                innovations[k, c] = columns[k, c]
+                update_mean(rows[c], gains[c], innovations[k, c], mean)
+                if keeps_states:
+                    all_gains[k, c] = gains[c]
+            if has_one_row and j > 0 and not steady:
+                steady = is_steady(covariance, covariance_at_sample)
+            covariance_at_sample[:] = covariance
+        if keeps_states:
+            means[j] = mean
+            covariances[j] = covariances[j - substeps] if steady and j > substeps else covariance
+    return innovations, all_gains, variances, means, covariances
 
 
 @compiled
 def smooth_record(
     substeps: int,
+    step_kinds: IntArray,
     transitions: FloatArray,
     output_rows: FloatArray,
     is_used: BoolArray,
-    states: FloatArray,
-    covariances: FloatArray,
     innovations: FloatArray,
     gains: FloatArray,
     variances: FloatArray,
+    states: FloatArray,
+    covariances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the smoothed state at each fine stamp, and its variances.
 
@@ -322,14 +411,14 @@ def smooth_record(
 
     Parameters
     ----------
-    substeps, transitions, output_rows, used
+    substeps, step_kinds, transitions, output_rows, is_used
         The arguments of `filter_record`.
-    states : (F, n) ndarray
-        The predicted states at the values of all weights.
-    covariances, gains, variances
-        The arrays that `filter_record` returns.
     innovations : (N, C) ndarray
         The innovations at the values of all weights.
+    gains, variances, covariances
+        The arrays that `filter_record` returns.
+    states : (F, n) ndarray
+        The filtered states at the values of all weights.
 
     Returns
     -------
@@ -337,7 +426,8 @@ def smooth_record(
         The state given all readings, and the variance of each of its entries.
     """
     stamp_count, state_count = states.shape
-    channel_count = output_rows.shape[1]
+    channel_count = is_used.shape[1]
+    has_one_row = len(output_rows) == 1
     smoothed_states = np.empty((stamp_count, state_count))
     variance = np.empty((stamp_count, state_count))
     adjoint = np.zeros(state_count)
@@ -345,19 +435,23 @@ def smooth_record(
     work, carried = np.empty((2, state_count, state_count))
     information_gain = np.empty(state_count)
     for j in range(stamp_count - 1, -1, -1):
-        # carry both back over the substep
-        if j < stamp_count - 1:
-            backward = np.ascontiguousarray(transitions[j].T)
-            adjoint = backward @ adjoint
-            propagate_covariance(backward, information, work, carried)
-            information[:] = carried
-        # update by the readings of a sample, in reverse order
+        # smoothed state: filtered state + C r, by the later readings; its covariance is C - C N C
+        multiply(covariances[j], information, work)
+        for i in range(state_count):
+            reduction = 0.0
+            smoothed_states[j, i] = states[j, i]
+            for m in range(state_count):
+                smoothed_states[j, i] += covariances[j, i, m] * adjoint[m]
+                reduction += work[i, m] * covariances[j, m, i]
+            variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)
+        # update both by the readings of a sample, in reverse order
         if j % substeps == 0:
             k = j // substeps
+            rows = output_rows[0] if has_one_row else output_rows[k]
             for c in range(channel_count - 1, -1, -1):
                 if not is_used[k, c]:
                     continue
-                row, gain = output_rows[k, c], gains[k, c]
+                row, gain = rows[c], gains[k, c]
                 row_information, later_correction = 1.0 / variances[k, c], 0.0
                 for i in range(state_count):
                     information_gain[i] = 0.0
@@ -374,13 +468,10 @@ def smooth_record(
                             - row[i] * information_gain[m]
                             - information_gain[i] * row[m]
                         )
-        # smoothed state: prediction + C r; its covariance is C - C N C
-        multiply(covariances[j], information, work)
-        for i in range(state_count):
-            reduction = 0.0
-            smoothed_states[j, i] = states[j, i]
-            for m in range(state_count):
-                smoothed_states[j, i] += covariances[j, i, m] * adjoint[m]
-                reduction += work[i, m] * covariances[j, m, i]
-            variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)
+        # carry both back over the substep
+        if j > 0:
+            backward = np.ascontiguousarray(transitions[step_kinds[j]].T)
+            adjoint = backward @ adjoint
+            propagate_covariance(backward, information, work, carried)
+            information[:] = carried
     return smoothed_states, variance

@@ -11,11 +11,13 @@ from fe.compilation import compiled, law_functions
 from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import POSITION_EXPONENT, steady_force
+from fe.runtime.laws.speed import EXPONENT, POSITION_EXPONENT, steady_force
 from reporting.arrays import LEAST_DIVISOR
 
 WINDOW_NODES = 8
 """Number of speeds in the window over which a law of the speed is averaged."""
+LARGEST_HOLDING_EXPONENT = 0.3
+"""Exponent of the speed below which a law may hold a body at rest."""
 RELATIVE_HALF_DIFFERENCE = 1e-4
 """Half the difference of the position in the tangent of a law of the speed, as a fraction of the
 rms position."""
@@ -155,3 +157,13 @@ def force_and_tangents(
     )
     is_acting = law.acts_at(time)
     return LawForce(force * is_acting, by_position * is_acting, by_speed * is_acting)
+
+
+def holds_at_rest(law: PortForce) -> bool:
+    """Return whether a law of the speed has a force at rest, as dry friction has.
+
+    Its force rises with a small power of the speed, below `LARGEST_HOLDING_EXPONENT`.
+    """
+    if not type(law).depends_on_speed:
+        return False
+    return float(law.parameter_row[EXPONENT]) < LARGEST_HOLDING_EXPONENT

@@ -8,23 +8,22 @@ w, it obeys
     reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise.
 
 Here x and v are the position and the speed of port p, and r is the reading of the linear model. All
-of it is linearised along a trajectory. A weight is a factor of a column of the linear model: the
-first weight is one, that of the constant part, and the others are the unknowns.
+of it is linearised along a trajectory. The state is then the sum of two parts: a known one, which
+is linear in the weights (1, unknowns) and computed here, and a random one, which the missing forces
+add (see `filtered`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, IntArray
-from discrepancy.missing_force.filtered import ForceFilter, Process
-from discrepancy.missing_force.kalman import discretise, respond_to_inputs
-from discrepancy.missing_force.trial import PortedTrial
 
-from .kernel import filter_record, smooth_record, substep_matrices_with_laws
+from .kernel import respond_to_drift, substep_matrices_with_laws
 from .trajectory import LinearisedForce, LinearisedSensorErrors, Trajectory
+from .trial import PortedTrial
 
 CONSTANT = 0
 """Number of the constant among the weights (1, unknowns)."""
@@ -32,49 +31,39 @@ CONSTANT = 0
 
 @dataclass(frozen=True, eq=False)
 class LinearisedTrial:
-    """A trial, linear along a trajectory.
+    """A trial, linear along a trajectory, with the part of its state that the weights determine.
 
     The unknowns are the K shared ones, the E ones of the hypothesis' effects, and those of the
-    trial alone, in this order. Shapes: F fine stamps, N samples, C channels, n states, W weights
-    (one, then all unknowns), L ports with a law of the hypothesis.
+    trial alone, in this order. Shapes: F fine stamps, N samples, C channels, n states of the
+    structure, W weights (one, then all unknowns), L ports with a law of the hypothesis.
 
     Attributes
     ----------
     trial : PortedTrial
         The trial with its residuals, its linear system, and the motion of its ports.
-    processes : mapping of int to Process
-        The missing forces, by the number of the port.
     trajectory : Trajectory
         The trajectory along which it is linear.
     forces : mapping of int to LinearisedForce
-        The forces of the hypothesis' laws, by port.
+        The forces of all laws, by the number of the port.
     sensor_errors : LinearisedSensorErrors
         The changes of readings by the hypothesis' effects of sensors.
     effect : (E,) ndarray
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
         The values of the shared unknowns at which they are linearised.
+    model_forces : mapping of int to (F,) ndarray
+        The forces of the model's own laws along the trajectory, which are part of `forces`.
     """
 
     trial: PortedTrial
-    processes: Mapping[int, Process]
     trajectory: Trajectory
     forces: Mapping[int, LinearisedForce]
     sensor_errors: LinearisedSensorErrors
     effect: FloatArray
     shared: FloatArray
+    model_forces: Mapping[int, FloatArray] = field(default_factory=dict)
 
     # ------------------------------------------------------------ layout
-
-    @cached_property
-    def force_filter(self) -> ForceFilter:
-        """The linear system with its missing forces, scaled so that its states are of size one."""
-        return ForceFilter(self.trial, tuple(self.processes.items()))
-
-    @property
-    def structure(self) -> slice:
-        """The indices of the structure's states, which come before missing forces and noises."""
-        return slice(0, len(self.trial.system.generator))
 
     @property
     def weight_count(self) -> int:
@@ -102,16 +91,16 @@ class LinearisedTrial:
 
     @cached_property
     def force_by_state(self) -> FloatArray:
-        """The derivatives (F, L, n) of the laws' force at each port by the scaled state."""
-        state_count = len(self.force_filter.state_space.generator)
-        derivatives = np.zeros((len(self.trial.fine_time), len(self.law_ports), state_count))
+        """The derivatives (F, L, n) of the laws' force at each port by the structure's state."""
         system = self.trial.system
-        units = self.force_filter.state_units
+        derivatives = np.zeros(
+            (len(self.trial.fine_time), len(self.law_ports), len(system.generator))
+        )
         for row, port in enumerate(self.law_ports):
             law = self.forces[port].law_force
-            derivatives[:, row, self.structure] = (
-                law.by_position[:, None] * system.positions[port] * units
-                + law.by_speed[:, None] * system.speeds[port] * units
+            derivatives[:, row] = (
+                law.by_position[:, None] * system.positions[port]
+                + law.by_speed[:, None] * system.speeds[port]
             )
         return derivatives
 
@@ -163,80 +152,96 @@ class LinearisedTrial:
 
     @cached_property
     def state_rate_by_force(self) -> FloatArray:
-        """The rate (n, L) of the scaled state by a unit force at each port with a law."""
-        state_count = len(self.force_filter.state_space.generator)
-        rates = np.zeros((state_count, len(self.law_ports)))
+        """The rate (n, L) of the structure's state by a unit force at each port with a law."""
         # a force acts against the motion: s' = A s - b force, see `PortedSystem`
-        for row, port in enumerate(self.law_ports):
-            rates[self.structure, row] = (
-                -self.trial.system.actions[port] / self.force_filter.state_units
-            )
-        return rates
+        actions = self.trial.system.actions[list(self.law_ports)]
+        return np.ascontiguousarray(-actions.T)
 
-    # ------------------------------------------------------------ steps
+    # ------------------------------------------------------------ known part of the state
 
-    def _substep_matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return transitions, process noises and drifts of all substeps, the laws included.
+    @cached_property
+    def step_kinds(self) -> IntArray:
+        """The kind (F,) of the step that leads to each fine stamp, see `kernel`.
 
-        n is the number of states, F that of fine stamps, and W that of weights: one, then the
-        unknowns.
-
-        Returns
-        -------
-        transitions, noises : (F - 1, n, n) array
-            The transition of each substep, and the covariance of its process noise.
-        drifts : (F - 1, n, W) array
-            The state that a unit of each weight adds in each substep.
+        With a law each step is of its own kind; else all steps of one length are of one kind.
         """
-        state_space = self.force_filter.state_space
-        lengths, interval_of_sample = self.trial.intervals
-        substep_lengths = lengths / self.trial.substeps
-        free_transition, free_noise = discretise(
-            state_space.generator, state_space.intensity, substep_lengths
-        )
-        _, by_input_at_begin, by_input_at_end = respond_to_inputs(
-            state_space.generator, substep_lengths
-        )
+        stamp_count = len(self.trial.fine_time)
+        if self.law_ports:
+            kinds = np.arange(-1, stamp_count - 1)
+        else:
+            kinds = self.interval_of_stamp.copy()
+            kinds[0] = -1
+        return kinds
+
+    @cached_property
+    def interval_of_stamp(self) -> IntArray:
+        """The index (F,) of the length of the interval that ends at or after each fine stamp."""
+        stamps = np.arange(len(self.trial.fine_time))
+        _, interval_of_sample = self.trial.intervals
+        return interval_of_sample[(stamps + self.trial.substeps - 1) // self.trial.substeps]
+
+    @cached_property
+    def known_states(self) -> FloatArray:
+        """The state (F, n, W) of the structure for a unit of each weight, without missing forces.
+
+        It is the response to the laws and to parameters that change the linear system.
+        """
+        trial = self.trial
+        matrices = trial.substep_matrices
         drifts = self._drift_by_system_parameters(
-            by_input_at_begin, by_input_at_end, interval_of_sample
+            matrices.by_input_at_begin, matrices.by_input_at_end
         )
-        # `drifts` is changed in place: the drift by the laws is added to it
-        transitions, noises = substep_matrices_with_laws(
-            self.trial.substeps,
-            interval_of_sample,
-            free_transition,
-            free_noise,
-            np.ascontiguousarray(by_input_at_begin @ self.state_rate_by_force),
-            np.ascontiguousarray(by_input_at_end @ self.state_rate_by_force),
-            self.force_by_state,
-            self.force_by_weight,
-            drifts,
+        transitions = matrices.transitions
+        if self.law_ports:
+            # `drifts` is changed in place: the drift by the laws is added to it
+            transitions, _ = substep_matrices_with_laws(
+                trial.substeps,
+                trial.intervals.length_of_sample,
+                transitions,
+                np.zeros_like(transitions),
+                np.ascontiguousarray(matrices.by_input_at_begin @ self.state_rate_by_force),
+                np.ascontiguousarray(matrices.by_input_at_end @ self.state_rate_by_force),
+                self.force_by_state,
+                self.force_by_weight,
+                drifts,
+            )
+        return respond_to_drift(self.step_kinds, transitions, drifts, self._known_state_at_start())
+
+    def _known_state_at_start(self) -> FloatArray:
+        """Return the state (n, W) at the first sample for a unit of each weight."""
+        start = np.zeros((len(self.trial.system.generator), self.weight_count))
+        if self.trial.begins_at_rest and self.law_ports:
+            # At rest the rate is zero under the laws. With their force T s + u and its effect B on
+            # the rate, (A + B T) s + B u = 0.
+            start = np.linalg.lstsq(
+                self.rate_matrix_at_start,
+                -self.state_rate_by_force @ self.force_by_weight[0],
+                rcond=1e-12,
+            )[0]
+        return start
+
+    @cached_property
+    def rate_matrix_at_start(self) -> FloatArray:
+        """The rate (n, n) of the state by the state at the first sample, laws included [1/s]."""
+        return np.asarray(
+            self.trial.system.generator + self.state_rate_by_force @ self.force_by_state[0]
         )
-        return transitions, noises, drifts
 
     def _drift_by_system_parameters(
-        self,
-        by_input_at_begin: FloatArray,
-        by_input_at_end: FloatArray,
-        interval_of_sample: IntArray,
+        self, by_input_at_begin: FloatArray, by_input_at_end: FloatArray
     ) -> FloatArray:
         """Return the drift (F - 1, n, W) by parameters that change the linear system itself.
 
         Parameters
         ----------
-        by_input_at_begin, by_input_at_end : (K, n, n) array
+        by_input_at_begin, by_input_at_end : (J, n, n) array
             The change of the state over a substep for a unit input at its start, or at its end,
-            for each of the K lengths of intervals.
-        interval_of_sample : (N,) array of int
-            The index of the length of the interval that ends at each sample.
+            for each of the J lengths of intervals.
         """
         trial = self.trial
-        structure = self.structure
         step_count = len(trial.fine_time) - 1
-        drift = np.zeros((step_count, len(by_input_at_begin[0]), self.weight_count))
-        by_input_at_begin = by_input_at_begin[:, :, structure]
-        by_input_at_end = by_input_at_end[:, :, structure]
-        interval_of_substep = interval_of_sample[np.arange(step_count) // trial.substeps + 1]
+        drift = np.zeros((step_count, len(trial.system.generator), self.weight_count))
+        interval_of_substep = self.interval_of_stamp[1:]
         for unknown_index, derivative in enumerate(trial.system_derivatives):
             if derivative is None:
                 continue
@@ -244,7 +249,6 @@ class LinearisedTrial:
             rate_change = self.trajectory.added_state @ derivative.generator.T
             for port, force in self.trajectory.forces.items():
                 rate_change = rate_change - np.outer(force, derivative.actions[port])
-            rate_change = rate_change / self.force_filter.state_units
             state_change = _change_over_substeps(
                 by_input_at_begin, interval_of_substep, rate_change[:-1]
             )
@@ -257,99 +261,62 @@ class LinearisedTrial:
             drift[:, :, CONSTANT] -= present_value * state_change
         return drift
 
-    def _initial_state(self) -> tuple[FloatArray, FloatArray]:
-        """Return covariance (n, n) and mean (n, W) of the state before the first reading.
-
-        The mean has one column for each weight.
-        """
-        generator = self.force_filter.state_space.generator
-        covariance = self.force_filter.state_space.initial_covariance
-        mean = np.zeros((len(generator), self.weight_count))
-        if not self.trial.begins_at_rest:
-            return covariance, mean
-        # At rest the rate of the structure's state s is zero under the laws and the missing forces
-        # f. With the laws' force T s + u and its effect B on the rate,
-        #     (A + B T) s + B u + a f = 0,  a: the column of the generator A for f.
-        # The solution for u is the mean. The first value of f is not known and has variance one, so
-        # that its solution s = h f adds h h^T to the covariance.
-        structure = self.structure
-        state_rate_by_force = self.state_rate_by_force[structure]
-        rate_matrix = (
-            generator[structure, structure]
-            + state_rate_by_force @ self.force_by_state[0][:, structure]
-        )
-        mean[structure] = np.linalg.lstsq(
-            rate_matrix, -state_rate_by_force @ self.force_by_weight[0], rcond=1e-12
-        )[0]
-        covariance = covariance.copy()
-        covariance[structure, structure] = 0.0
-        for index in self.force_filter.force_state_indices:
-            state_per_force = np.linalg.lstsq(
-                rate_matrix, -generator[structure, index], rcond=1e-12
-            )[0]
-            covariance[structure, structure] += np.outer(state_per_force, state_per_force)
-            covariance[structure, index] = state_per_force
-            covariance[index, structure] = state_per_force
-        return covariance, mean
-
     # ------------------------------------------------------------ readings
 
-    def _observations(self) -> tuple[FloatArray, FloatArray]:
-        """Return the two matrices of the observation equation of the Kalman filter.
+    @cached_property
+    def columns(self) -> FloatArray:
+        """The residuals (N, C, W) without missing forces, for a unit of each weight.
 
-        The residual is the reading minus the prediction of the model, and depends on the unknowns
-        u. The filter explains the residual by its state, which contains the missing forces, the
-        coloured noise, and the change of the structure's motion by forces:
-
-            coefficients @ (1, u) = output_rows @ state + noise.
-
-        The white part of the noise has variance one, since both sides are divided by its standard
-        deviation.
-
-        Returns
-        -------
-        output_rows : (N, C, n) array
-            The derivatives of the readings by the state, for N samples, C channels and n states.
-        coefficients : (N, C, W) array
-            First the residual at zero unknowns, then its derivatives by the W - 1 unknowns. All are
-            zero for a reading that does not count.
+        First the readings minus their prediction at zero unknowns, then minus the derivatives of
+        the prediction by the unknowns. All are divided by the noise, and zero for a reading that
+        does not count.
         """
         trial = self.trial
-        noise_scale = self.force_filter.white_noise_scale
-        constant_rows = self.force_filter.state_space.output_rows
-        output_rows = np.repeat(constant_rows[None], len(trial.residual), axis=0)
-        coefficients = np.zeros((*trial.residual.shape, self.weight_count))
+        columns = np.zeros((*trial.residual.shape, self.weight_count))
         # Errors of sensors change the readings by c0 + d (u - u0), which reduces the residual: -d
         # is added to the coefficient of the unknown u, and -c0 + d u0 to the constant.
-        coefficients[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
+        columns[:, :, CONSTANT] = trial.residual - self.sensor_errors.change
         for unknown_index, derivative in self.sensor_errors.by_unknown.items():
             present_value = self._value_of_unknown(unknown_index)
-            coefficients[:, :, 1 + unknown_index] -= derivative
-            coefficients[:, :, CONSTANT] += present_value * derivative
+            columns[:, :, 1 + unknown_index] -= derivative
+            columns[:, :, CONSTANT] += present_value * derivative
         # The response of the model needs no constant, as `trial.residual` is at zero unknowns. The
         # unknowns of this trial follow the shared ones here; in u those of effects are between.
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
         for unknown_index, derivative in enumerate(derivatives):
-            coefficients[:, :, self.weight_index(unknown_index)] -= derivative
+            columns[:, :, self.weight_index(unknown_index)] -= derivative
         # parameters and gains change the readings of a fixed state by d (u - u0)
         for unknown_index, derivative in self._readings_by_shared_unknowns().items():
             present_value = trial.linearisation_point[unknown_index]
-            coefficients[:, :, 1 + unknown_index] -= derivative
-            coefficients[:, :, CONSTANT] += present_value * derivative
-        coefficients *= noise_scale[:, None]
-        # A force at a port changes some readings at once, such as accelerations: by -e per unit of
-        # force, with e in `direct_reading`. The force of the hypothesis' laws at the port is
-        # force_by_weight @ (1, u) + force_by_state @ state. Its first term is brought to the left
-        # side of the observation equation, which turns the sign.
-        for law_index, port in enumerate(self.law_ports):
-            direct_reading = trial.system.through[port] / trial.deviation * noise_scale
-            if not np.any(direct_reading):
-                continue
-            force_by_state = self.force_by_state[:: trial.substeps, law_index]
-            force_by_weight = self.force_by_weight[:: trial.substeps, law_index]
-            output_rows = output_rows - direct_reading[:, None] * force_by_state[:, None, :]
-            coefficients += force_by_weight[:, None, :] * direct_reading[:, None]
-        return np.ascontiguousarray(output_rows), coefficients * trial.used[:, :, None]
+            columns[:, :, 1 + unknown_index] -= derivative
+            columns[:, :, CONSTANT] += present_value * derivative
+        # the known part of the state is read, and the laws' forces that a sensor shows at once
+        known_states = self.known_states[:: trial.substeps]
+        outputs_over_noise = trial.system.outputs / trial.deviation[:, None]
+        columns -= np.einsum("cn,knw->kcw", outputs_over_noise, known_states)
+        columns += self.direct_readings(self.known_forces[:: trial.substeps])
+        return columns * trial.used[:, :, None]
+
+    @cached_property
+    def known_forces(self) -> FloatArray:
+        """The laws' force (F, L, W) at each port without missing forces, for each weight."""
+        return np.asarray(self.force_by_weight + self.force_by_state @ self.known_states)
+
+    def direct_readings(self, law_forces: FloatArray) -> FloatArray:
+        """Return by how much laws' forces lower the readings at once, as those of accelerations.
+
+        Parameters
+        ----------
+        law_forces : (N, L, M) array
+            M series of forces at the samples and at the L ports with a law.
+
+        Returns
+        -------
+        (N, C, M) array
+            The decrease of the readings, divided by the noise.
+        """
+        direct = self.trial.system.through[list(self.law_ports)] / self.trial.deviation
+        return np.asarray(np.einsum("lc,klm->kcm", direct, law_forces))
 
     def _readings_by_shared_unknowns(self) -> dict[int, FloatArray]:
         """Return the derivatives (N, C) of the readings by shared unknowns at a fixed added state.
@@ -373,159 +340,6 @@ class LinearisedTrial:
                 added_readings * scale * np.eye(added_readings.shape[1])[channel]
             )
         return derivatives
-
-    # ------------------------------------------------------------ filter and smoother
-
-    @cached_property
-    def filtered_record(self) -> "FilteredRecord":
-        """The results of one pass of the Kalman filter."""
-        transitions, noises, drifts = self._substep_matrices()
-        output_rows, columns = self._observations()
-        covariance, mean = self._initial_state()
-        means, covariances, innovations, gains, variances = filter_record(
-            self.trial.substeps,
-            transitions,
-            noises,
-            drifts,
-            output_rows,
-            columns,
-            self.trial.used,
-            covariance,
-            mean,
-        )
-        return FilteredRecord(
-            transitions=transitions,
-            output_rows=output_rows,
-            means=means,
-            covariances=covariances,
-            innovations=innovations,
-            gains=gains,
-            variances=variances,
-        )
-
-    @cached_property
-    def whitened_products(self) -> tuple[FloatArray, float]:
-        """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
-
-        The columns are the residual and its derivatives by the unknowns. The determinant is that of
-        the covariance of the readings: the product of their variances, each given those before it.
-        """
-        record = self.filtered_record
-        whitened_columns = record.innovations / np.sqrt(record.variances)[:, :, None]
-        whitened_columns = whitened_columns.reshape(-1, self.weight_count)
-        # the columns of `_observations` are minus the derivatives of the readings: change the sign
-        whitened_columns[:, 1:] *= -1.0
-        is_used = self.trial.used
-        half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[is_used]))
-        # readings were multiplied by `white_noise_scale`, and their deviations with them
-        half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * is_used))
-        return whitened_columns.T @ whitened_columns, half_log_determinant
-
-    def smooth(self, unknowns: FloatArray) -> "SmoothedTrial":
-        """Return the smoothed trajectory and forces of the trial, given all readings.
-
-        Parameters
-        ----------
-        unknowns : (W - 1,) ndarray
-            The values of all unknowns.
-        """
-        trial = self.trial
-        record = self.filtered_record
-        weights = np.concatenate(([1.0], unknowns))
-        states, variance = smooth_record(
-            trial.substeps,
-            record.transitions,
-            record.output_rows,
-            trial.used,
-            record.means @ weights,
-            record.covariances,
-            record.innovations @ weights,
-            record.gains,
-            record.variances,
-        )
-        # the states of the structure and of the missing forces, in their units
-        added_state = states[:, self.structure] * self.force_filter.state_units
-        state_deviation = np.sqrt(variance[:, self.structure]) * self.force_filter.state_units
-        missing_forces: dict[int, FloatArray] = {}
-        deviations: dict[int, FloatArray] = {}
-        for (port, process), index in zip(
-            self.processes.items(), self.force_filter.force_state_indices, strict=True
-        ):
-            missing_forces[port] = states[:, index] * process.standard_deviation
-            deviations[port] = np.sqrt(variance[:, index]) * process.standard_deviation
-        # forces of the laws, at each fine stamp f by the states n there
-        law_forces: dict[int, FloatArray] = {}
-        forces = dict(missing_forces)
-        for row, port in enumerate(self.law_ports):
-            force_by_states = np.einsum("fn,fn->f", self.force_by_state[:, row], states)
-            law_forces[port] = self.force_by_weight[:, row] @ weights + force_by_states
-            forces[port] = forces.get(port, 0.0) + law_forces[port]
-        # motion of the ports
-        shared_values = unknowns[: len(self.shared)]
-        local_values = unknowns[len(self.shared) + len(self.effect) :]
-        positions, speeds = trial.port_motion(
-            np.concatenate((shared_values, local_values)), added_state
-        )
-        trajectory = Trajectory(added_state, positions, speeds, forces)
-        return SmoothedTrial(
-            trajectory=trajectory,
-            missing_forces=missing_forces,
-            law_forces=law_forces,
-            missing_force_deviations=deviations,
-            state_deviation=state_deviation,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class FilteredRecord:
-    """The results of one pass of the filter over a trial.
-
-    Attributes
-    ----------
-    transitions : (F - 1, n, n) ndarray
-        The transition of each substep.
-    output_rows : (N, C, n) ndarray
-        The readings for a unit of each state.
-    means, covariances : (F, n, W), (F, n, n) ndarray
-        The predicted state at each fine stamp; its mean is that for a unit of each weight.
-    innovations : (N, C, W) ndarray
-        The readings minus their predictions, for a unit of each weight.
-    gains, variances : (N, C, n), (N, C) ndarray
-        The gain of each reading, and the variance of its innovation.
-    """
-
-    transitions: FloatArray
-    output_rows: FloatArray
-    means: FloatArray
-    covariances: FloatArray
-    innovations: FloatArray
-    gains: FloatArray
-    variances: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class SmoothedTrial:
-    """The motion and the forces of a trial, given all of its readings.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-        The smoothed motion, and all forces at ports.
-    missing_forces : mapping of int to (F,) ndarray
-        The missing force at each port, which no law explains, by the number of the port [N or N m].
-    law_forces : mapping of int to (F,) ndarray
-        The force of the laws at each port, linear about the previous trajectory.
-    missing_force_deviations : mapping of int to (F,) ndarray
-        The posterior standard deviation of `missing_forces`.
-    state_deviation : (F, n) ndarray
-        The posterior standard deviation of the added state.
-    """
-
-    trajectory: Trajectory
-    missing_forces: Mapping[int, FloatArray]
-    law_forces: Mapping[int, FloatArray]
-    missing_force_deviations: Mapping[int, FloatArray]
-    state_deviation: FloatArray
 
 
 def _change_over_substeps(

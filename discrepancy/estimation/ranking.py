@@ -1,53 +1,54 @@
 """The ranking of hypotheses on the missing force, in two rounds if the records are long.
 
-The first round compares all effects in thinned records, and the second one estimates the leading
-hypotheses in all samples. Short records need no first round.
+A screen finds the promising effects; each is estimated roughly, the best ones in full, together
+with the motion. Then effects are added to the best hypothesis. Long records are thinned in the
+first round, and the leading hypotheses are estimated in all samples.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.linear_trials import TrialMotion
-from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
-from discrepancy.missing_force.trial import PortedTrial
+from discrepancy.fits.candidate import Candidate, CandidateKey
 
-from .estimator import SPEED_WINDOWS
-from .gauss_newton import EstimatorStart
-from .refinement import (
-    estimate_extended_hypothesis,
-    hypothesis_of_estimate,
-    laws_and_estimator,
-    refine_hypotheses,
-)
-from .trajectory import Trajectory
+from .estimate import Estimate
+from .force_search import ForceSearch
+from .screen import screen_effects
 
+FOLLOWED_COUNTS = (10, 4, 4)
+"""Numbers of effects that are estimated after the screening: as single effects, as second ones and
+as third ones of a set."""
+BEAM_WIDTHS = (4, 2, 2)
+"""Numbers of the rough estimates of each length that are estimated in full, the best first."""
+ESTIMATED_RANGE = 60.0
+"""Difference to the best score above which no hypothesis is estimated in full [nat]."""
 MOST_SAMPLES_OF_FIRST_ROUND = 3000
 """Number of samples of all trials together to which records are thinned in the first round. It is
 enough to tell laws from each other, and records that are shorter are not thinned."""
 THINNED_AT_LEAST = 2.0
 """Ratio of the number of samples to that number above which there is a first round."""
-MOST_REFINED_SETS = 2
-"""Largest number of sets of each length that are estimated with the motion in the first round."""
 LEADING_RANGE = 12.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
 samples the difference is larger by about the factor of the thinning."""
 MOST_LEADING = 3
 """Largest number of hypotheses with effects that are estimated in all samples."""
 
+OnProgress = Callable[[str], None]
+"""Called with a line for the progress display."""
+
 
 def rank_by_missing_force(
     search: ForceSearch,
     effects: Sequence[Effect],
-    on_progress: Callable[[str], None] = lambda message: None,
-) -> list[ForceHypothesis]:
-    """Return hypotheses on the missing force, the most probable first.
+    on_progress: OnProgress = lambda message: None,
+) -> list[Estimate]:
+    """Return estimates of hypotheses on the missing force, the most probable first.
 
-    The best hypotheses are estimated together with the motion. Of long records, only the leading
-    hypotheses and the one without effects are returned.
+    Of long records, only the leading hypotheses and the one without effects are returned.
 
     Parameters
     ----------
@@ -56,21 +57,19 @@ def rank_by_missing_force(
     effects : sequence of Effect
         The effects that may be missing in the model.
     on_progress : callable
-        The function that receives a line for the progress display, such as the comparison that
-        runs.
+        The function that receives a line for the progress display, such as the estimate that runs.
     """
     thinned_search = search_in_thinned_records(search)
     if thinned_search is None:
-        ranked_hypotheses = search.rank_hypotheses(effects, on_progress)
-        return refine_hypotheses(search, ranked_hypotheses, len(effects), on_progress)
-    ranked_hypotheses = _rank_in_thinned_records(thinned_search, effects, on_progress)
-    hypotheses = [search.hypothesis_of_all_ports]
-    for leading_hypothesis in _leading_hypotheses(thinned_search, ranked_hypotheses, len(effects)):
-        on_progress(f"estimating {leading_hypothesis.candidate.description} in all samples")
-        hypothesis = estimate_in_all_samples(search, leading_hypothesis)
-        if hypothesis is not None:
-            hypotheses.append(hypothesis)
-    return sorted(hypotheses, key=lambda hypothesis: -search.score(hypothesis, len(effects)))
+        return rank_hypotheses(search, effects, on_progress)
+    ranked_estimates = rank_hypotheses(thinned_search, effects, on_progress)
+    estimates = [search.estimate_without_effects]
+    for leading_estimate in _leading_estimates(thinned_search, ranked_estimates, len(effects)):
+        on_progress(f"estimating {leading_estimate.candidate.description} in all samples")
+        estimate = search.estimate_in_all_samples(leading_estimate)
+        if estimate is not None:
+            estimates.append(estimate)
+    return sorted(estimates, key=lambda estimate: -search.score(estimate, len(effects)))
 
 
 def search_in_thinned_records(search: ForceSearch) -> ForceSearch | None:
@@ -81,67 +80,241 @@ def search_in_thinned_records(search: ForceSearch) -> ForceSearch | None:
     search : ForceSearch
         The search in all samples.
     """
-    trials = search.hypothesis_of_best_port().linear_trials.trials
-    sample_count = sum(len(trial.time) for trial in trials)
+    sample_count = sum(len(trial.trial.time) for trial in search.best_port_estimate.trials)
     if sample_count < THINNED_AT_LEAST * MOST_SAMPLES_OF_FIRST_ROUND:
         return None
     thinned_search = ForceSearch(search.problem_with_laws, MOST_SAMPLES_OF_FIRST_ROUND)
-    thinned_trials = thinned_search.hypothesis_of_best_port().linear_trials.trials
-    is_thinned = any(trial.stride > 1 for trial in thinned_trials)
+    is_thinned = any(trial.trial.stride > 1 for trial in thinned_search.best_port_estimate.trials)
     return thinned_search if is_thinned else None
 
 
-def _rank_in_thinned_records(
-    search: ForceSearch, effects: Sequence[Effect], on_progress: Callable[[str], None]
-) -> list[ForceHypothesis]:
-    """Return the hypotheses of the first round, the most probable first.
+def rank_hypotheses(
+    search: ForceSearch,
+    effects: Sequence[Effect],
+    on_progress: OnProgress = lambda message: None,
+    largest_set: int | None = None,
+) -> list[Estimate]:
+    """Return estimates of hypotheses, the most probable first.
 
-    The best single effects are estimated together with the motion before others are added. Along a
-    motion that is taken as known, the errors of a single law in a long record are large, and would
-    be named as further effects.
+    Effects are added to the best hypothesis one at a time, as long as its score rises. Each time,
+    simpler forms of the best hypothesis are estimated, too.
 
     Parameters
     ----------
     search : ForceSearch
-        The search in thinned records.
+        The search for the missing force.
     effects : sequence of Effect
         The effects that may be missing in the model.
     on_progress : callable
-        The function that receives a line for the progress display, such as the comparison that
-        runs.
+        The function that receives a line for the progress display, such as the estimate that runs.
+    largest_set : int, optional
+        The largest number of effects in a set; by default that of `FOLLOWED_COUNTS`.
     """
-
-    def score(hypothesis: ForceHypothesis) -> float:
-        return search.score(hypothesis, len(effects))
-
-    single_effects = search.rank_hypotheses(effects, on_progress, largest_set=1)
-    hypotheses = refine_hypotheses(search, single_effects, len(effects), on_progress)
-    best_hypothesis = hypotheses[0]
-    for followed_count in FOLLOWED_COUNTS[1:]:
-        if not best_hypothesis.candidate.terms:
+    ranking = _Ranking(search, effects, on_progress)
+    best_estimate = search.estimate_without_effects
+    for followed_count, beam_width in list(zip(FOLLOWED_COUNTS, BEAM_WIDTHS, strict=True))[
+        :largest_set
+    ]:
+        rough_estimates = ranking.rough_estimates(best_estimate, followed_count)
+        ranking.estimate_in_full(best_estimate, rough_estimates, beam_width)
+        ranking.estimate_simpler_forms()
+        if ranking.best is best_estimate:
             break
-        extended_hypotheses = search.extend_hypothesis(
-            best_hypothesis, effects, followed_count, on_progress
-        )
-        refined_hypotheses = []
-        for hypothesis in extended_hypotheses[:MOST_REFINED_SETS]:
-            on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-            estimated_hypothesis = estimate_extended_hypothesis(search, hypothesis, best_hypothesis)
-            refined_hypotheses.append(
-                hypothesis if estimated_hypothesis is None else estimated_hypothesis
-            )
-        hypotheses += refined_hypotheses
-        best_of_sets = max(refined_hypotheses, key=score, default=best_hypothesis)
-        if score(best_of_sets) <= score(best_hypothesis):
-            break
-        best_hypothesis = best_of_sets
-    return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
+        best_estimate = ranking.best
+    return ranking.in_order()
 
 
-def _leading_hypotheses(
-    search: ForceSearch, ranked_hypotheses: Sequence[ForceHypothesis], effect_count: int
-) -> list[ForceHypothesis]:
-    """Return the hypotheses with effects that are estimated in all samples, the best first.
+class _ValuedCandidate(NamedTuple):
+    """A set of effects, and the scaled parameters (E,) with which its estimate begins."""
+
+    candidate: Candidate
+    parameters: FloatArray
+
+
+class _Ranking:
+    """The estimates of a ranking, one for each set of effects."""
+
+    def __init__(
+        self, search: ForceSearch, effects: Sequence[Effect], on_progress: OnProgress
+    ) -> None:
+        self.search = search
+        self.effects = effects
+        self.on_progress = on_progress
+        without_effects = search.estimate_without_effects
+        self.by_effects: dict[CandidateKey, Estimate] = {
+            without_effects.candidate.key: without_effects
+        }
+        self.estimated_in_full: set[CandidateKey] = {without_effects.candidate.key}
+
+    def score(self, estimate: Estimate) -> float:
+        """Return the log of evidence times prior of an estimate [nat]."""
+        return self.search.score(estimate, len(self.effects))
+
+    def in_order(self) -> list[Estimate]:
+        """Return all estimates, the most probable first."""
+        return sorted(self.by_effects.values(), key=lambda estimate: -self.score(estimate))
+
+    @property
+    def best(self) -> Estimate:
+        """The most probable estimate."""
+        return max(self.by_effects.values(), key=self.score)
+
+    def record(self, estimate: Estimate) -> None:
+        """Store an estimate unless an earlier one of the same effects is more probable."""
+        key = estimate.candidate.key
+        earlier = self.by_effects.get(key)
+        if earlier is None or estimate.log_evidence > earlier.log_evidence:
+            self.by_effects[key] = estimate
+
+    def rough_estimates(self, base: Estimate, followed_count: int) -> list[Estimate]:
+        """Return rough estimates of a base with one more effect, the most probable first.
+
+        Parameters
+        ----------
+        base : Estimate
+            The estimate to which an effect is added. Its motion and missing forces are those to
+            begin with.
+        followed_count : int
+            The number of effects that are estimated, the most promising of the screen first.
+        """
+        base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
+        self.on_progress(f"comparing all effects{base_in_words} with the missing force")
+        promising_effects = screen_effects(self.search, base, self.effects)[:followed_count]
+        rough_estimates = []
+        for number, screened_effect in enumerate(promising_effects):
+            candidate = base.candidate.with_term(screened_effect.term)
+            if candidate.key in self.by_effects:
+                continue
+            remaining_count = len(promising_effects) - number - 1
+            description = candidate.description
+            self.on_progress(f"estimating {description} roughly, {remaining_count} more")
+            estimates_of_effect = []
+            for start in screened_effect.starts:
+                effect = np.concatenate((base.effect, start.effect))
+                estimate = self.search.estimate_roughly(base, candidate, effect, start.processes)
+                if estimate is not None:
+                    estimates_of_effect.append(estimate)
+            if estimates_of_effect:
+                rough_estimates.append(
+                    max(estimates_of_effect, key=lambda estimate: estimate.log_evidence)
+                )
+        for estimate in rough_estimates:
+            self.record(estimate)
+        return sorted(rough_estimates, key=lambda estimate: -self.score(estimate))
+
+    def estimate_in_full(
+        self, base: Estimate, rough_estimates: Sequence[Estimate], beam_width: int
+    ) -> None:
+        """Estimate the best of some hypotheses in full, each from its rough estimate.
+
+        Parameters
+        ----------
+        base : Estimate
+            The estimate whose motion and missing forces are those to begin with.
+        rough_estimates : sequence of Estimate
+            The rough estimates, the most probable first.
+        beam_width : int
+            The largest number of estimates in full.
+        """
+        for rough_estimate in rough_estimates[:beam_width]:
+            if self.score(rough_estimate) < self.score(rough_estimates[0]) - ESTIMATED_RANGE:
+                break
+            candidate = rough_estimate.candidate
+            self.on_progress(f"estimating {candidate.description} together with the motion")
+            estimate = self.search.estimate_effects(base, candidate, rough_estimate.effect)
+            if estimate is not None:
+                self.record(estimate)
+            # A missing force that is large at first may take the place of a law whose force hardly
+            # changes: the estimate also begins at the smaller one of the rough estimate.
+            if self.by_effects[candidate.key] is rough_estimate:
+                self.record(self.search.estimate_about_own_values(rough_estimate))
+            self.estimated_in_full.add(candidate.key)
+
+    def estimate_simpler_forms(self) -> None:
+        """Estimate the simpler forms of the best hypothesis, as long as one of them is better.
+
+        A set may lead only because its estimate reached the right values of one effect, and the
+        estimate of that effect alone did not. The same holds for a law of free shape and the named
+        laws of its family, such as dry friction. Each simpler form is therefore estimated from the
+        motion of the best hypothesis.
+        """
+        best_estimate = self.best
+        while best_estimate.candidate.terms:
+            simpler_forms = [
+                *self._named_laws_of_family(best_estimate.candidate),
+                *_simpler_forms(best_estimate.candidate, best_estimate.effect),
+            ]
+            # the values of the best hypothesis are preferred where both have the same effects
+            form_by_effects = {form.candidate.key: form for form in simpler_forms}
+            for form in form_by_effects.values():
+                self.on_progress(
+                    f"estimating {form.candidate.description} together with the motion"
+                )
+                estimate = self.search.polish_effects(best_estimate, *form)
+                if estimate is not None:
+                    self.record(estimate)
+            if self.best is best_estimate:
+                break
+            best_estimate = self.best
+
+    def _named_laws_of_family(self, candidate: Candidate) -> list[_ValuedCandidate]:
+        """Return the sets in which named laws stand in place of the laws of free shape of a set.
+
+        They are taken from the rough estimates, with the values that these have.
+        """
+        if not candidate.has_free_shape:
+            return []
+        forms = []
+        for key, estimate in self.by_effects.items():
+            other = estimate.candidate
+            if (
+                key not in self.estimated_in_full
+                and not other.has_free_shape
+                and _families_at_places(other) == _families_at_places(candidate)
+            ):
+                forms.append(_ValuedCandidate(other, estimate.effect))
+        return forms
+
+
+def _families_at_places(candidate: Candidate) -> list[tuple[str, str]]:
+    """Return the families of a set of effects with their places, in order."""
+    return sorted((term.effect.family, term.place) for term in candidate.terms)
+
+
+def _simpler_forms(candidate: Candidate, parameters: FloatArray) -> list[_ValuedCandidate]:
+    """Return the simpler forms of a set: without one effect, or with one law in canonical shape.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        The set of effects. The only effect of a set is never left out.
+    parameters : (E,) array
+        The scaled parameters of the set, which the forms inherit.
+    """
+    forms = []
+    numbers = range(len(candidate.terms))
+    if len(numbers) > 1:
+        for left_out in numbers:
+            kept = [number for number in numbers if number != left_out]
+            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, parameters)))
+    for number, term in enumerate(candidate.terms):
+        if not term.free_shape:
+            continue
+        canonical_term = replace(term, free_shape=False)
+        terms = list(candidate.terms)
+        terms[number] = canonical_term
+        parameters_by_term = [of_term for _, of_term in candidate.split_by_term(parameters)]
+        # the parameters of the shape follow those of the canonical law
+        canonical_count = len(canonical_term.parameters)
+        parameters_by_term[number] = parameters_by_term[number][:canonical_count]
+        forms.append(_ValuedCandidate(Candidate(tuple(terms)), np.concatenate(parameters_by_term)))
+    return forms
+
+
+def _leading_estimates(
+    search: ForceSearch, ranked_estimates: Sequence[Estimate], effect_count: int
+) -> list[Estimate]:
+    """Return the estimates with effects that are repeated in all samples, the best first.
 
     These are the most probable ones, and the law of the best one with the other kind of shape: the
     verdict compares a law of canonical shape with that of free shape.
@@ -150,93 +323,27 @@ def _leading_hypotheses(
     ----------
     search : ForceSearch
         The search in thinned records.
-    ranked_hypotheses : sequence of ForceHypothesis
-        Its hypotheses, the most probable first.
+    ranked_estimates : sequence of Estimate
+        Its estimates, the most probable first.
     effect_count : int
         The number of effects that were compared.
     """
-    with_effects = [hypothesis for hypothesis in ranked_hypotheses if hypothesis.candidate.terms]
+    with_effects = [estimate for estimate in ranked_estimates if estimate.candidate.terms]
     if not with_effects:
         return []
-    best_hypothesis = with_effects[0]
-    least_score = search.score(best_hypothesis, effect_count) - LEADING_RANGE
-    leading_hypotheses = [
-        hypothesis
-        for hypothesis in with_effects[:MOST_LEADING]
-        if search.score(hypothesis, effect_count) > least_score
+    best_estimate = with_effects[0]
+    least_score = search.score(best_estimate, effect_count) - LEADING_RANGE
+    leading_estimates = [
+        estimate
+        for estimate in with_effects[:MOST_LEADING]
+        if search.score(estimate, effect_count) > least_score
     ]
-    for hypothesis in with_effects:
-        has_same_effects = hypothesis.candidate.identifiers == best_hypothesis.candidate.identifiers
+    for estimate in with_effects:
+        has_same_effects = estimate.candidate.identifiers == best_estimate.candidate.identifiers
         if (
             has_same_effects
-            and hypothesis not in leading_hypotheses
-            and len(leading_hypotheses) < MOST_LEADING
+            and estimate not in leading_estimates
+            and len(leading_estimates) < MOST_LEADING
         ):
-            leading_hypotheses.append(hypothesis)
-    return leading_hypotheses
-
-
-def estimate_in_all_samples(
-    search: ForceSearch, hypothesis: ForceHypothesis
-) -> ForceHypothesis | None:
-    """Return a hypothesis that was fitted to thinned records, estimated in all samples.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search in all samples.
-    hypothesis : ForceHypothesis
-        The hypothesis in the thinned trials, about whose unknowns the trials are linearised.
-
-    Returns
-    -------
-    ForceHypothesis or None
-        The hypothesis; None if its laws are not possible along the motion.
-    """
-    thinned_trials = hypothesis.linear_trials.trials
-    shared_count = search.problem.shared.unknown_count
-    shared_values = thinned_trials[0].linearisation_point[:shared_count]
-    local_of_trials = [trial.linearisation_point[shared_count:] for trial in thinned_trials]
-    trials = search.column_builder.trials_about(
-        search.point_of_unknowns(shared_values, local_of_trials)
-    )
-    laws, estimator = laws_and_estimator(search, hypothesis.candidate, trials)
-    trajectories = []
-    for thinned_trial, trial, motion, own_unknowns in zip(
-        thinned_trials, trials.trials, hypothesis.motions, hypothesis.local, strict=True
-    ):
-        unknowns = np.concatenate((hypothesis.shared, own_unknowns))
-        trajectories.append(_trajectory_in_all_samples(thinned_trial, trial, motion, unknowns))
-    start = EstimatorStart(
-        hypothesis.effect, hypothesis.shared, tuple(trajectories), hypothesis.processes
-    )
-    estimate = estimator.polish(laws, start, hypothesis.speed_window or SPEED_WINDOWS[-1])
-    if estimate is None:
-        return None
-    return hypothesis_of_estimate(search, hypothesis.candidate, trials, estimate)
-
-
-def _trajectory_in_all_samples(
-    thinned_trial: PortedTrial, trial: PortedTrial, motion: TrialMotion, unknowns: FloatArray
-) -> Trajectory:
-    """Return the motion of a thinned trial at all fine stamps of the record.
-
-    The added state and the forces are interpolated. The motion of the ports is that of the model,
-    which is known at all stamps, and what the added state adds to it.
-
-    Parameters
-    ----------
-    thinned_trial, trial : PortedTrial
-        The trial with some of its samples, and with all of them.
-    motion : TrialMotion
-        The motion of the thinned trial.
-    unknowns : (K + L,) array
-        The values of the shared unknowns, then of those of the trial alone.
-    """
-    time, thinned_time = trial.fine_time, thinned_trial.fine_time
-    added_state = np.column_stack(
-        [np.interp(time, thinned_time, state) for state in motion.added_state.T]
-    )
-    forces = {port: np.interp(time, thinned_time, force) for port, force in motion.forces.items()}
-    positions, speeds = trial.port_motion(unknowns, added_state)
-    return Trajectory(added_state, positions, speeds, forces)
+            leading_estimates.append(estimate)
+    return leading_estimates

@@ -121,3 +121,7 @@ class LinearisedSensorErrors:
 
     change: FloatArray
     by_unknown: Mapping[int, FloatArray]
+
+
+NO_SENSOR_ERRORS = LinearisedSensorErrors(np.zeros(()), {})
+"""The changes of readings where no sensor has an error."""

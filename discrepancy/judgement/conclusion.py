@@ -21,10 +21,10 @@ from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
     FREE_SHAPE,
     CalibratedParameter,
-    Estimate,
     Gate,
     Hypothesis,
     NamedEffect,
+    ParameterEstimate,
     RemainderEstimate,
     Verdict,
     VerdictKind,
@@ -327,7 +327,7 @@ def _estimate(
     parameter: EffectParameter | ShapeParameter,
     scaled_value: float,
     scaled_ends: tuple[float, float],
-) -> Estimate:
+) -> ParameterEstimate:
     """Return the estimate of a parameter in its unit.
 
     Parameters
@@ -340,7 +340,7 @@ def _estimate(
         The ends of its scaled 90 % interval.
     """
     ends = [parameter.prior.value(scaled_end) for scaled_end in scaled_ends]
-    return Estimate(
+    return ParameterEstimate(
         name=parameter.name,
         value=parameter.prior.value(scaled_value),
         low=min(ends),

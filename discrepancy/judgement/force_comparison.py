@@ -10,12 +10,12 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.gates import check_absolute_fit
-from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.gap_share import GapShare
-from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.port_force import missing_force
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.search.strategy import Search
@@ -25,7 +25,7 @@ from discrepancy.verdict import Gate
 from .comparison import Comparison
 
 
-class ForceComparison(Comparison[ForceHypothesis]):
+class ForceComparison(Comparison[Estimate]):
     """A comparison of hypotheses by how well their force agrees with the missing force.
 
     Parameters
@@ -45,29 +45,29 @@ class ForceComparison(Comparison[ForceHypothesis]):
         self.has_held_out = self._force_shares.has_held_out
 
     @property
-    def no_effect(self) -> ForceHypothesis:
+    def no_effect(self) -> Estimate:
         """The hypothesis of free missing forces without any law."""
-        return self.force_search.hypothesis_of_all_ports
+        return self.force_search.estimate_without_effects
 
     @property
-    def ranked_hypotheses(self) -> Sequence[ForceHypothesis]:
+    def ranked_hypotheses(self) -> Sequence[Estimate]:
         """All hypotheses, the most probable first."""
-        return self.search.force_hypotheses
+        return self.search.force_estimates
 
-    def _compute_gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
+    def _compute_gap_share(self, hypothesis: Estimate, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains."""
         return self._force_shares.gap_share(hypothesis, held_out=held_out)
 
-    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
+    def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> Estimate | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         None if the candidate cannot be fitted.
         """
-        return self.force_search.fit_along_motion(
-            self.force_search.hypothesis_of_all_ports, candidate, effect
+        return self.force_search.estimate_effects(
+            self.force_search.estimate_without_effects, candidate, effect
         )
 
-    def fit_with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
+    def fit_with_free_shape(self, hypothesis: Estimate) -> Estimate | None:
         """Return the hypothesis of a single law with its shape free; None if there is none."""
         (term,) = hypothesis.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
@@ -80,19 +80,19 @@ class ForceComparison(Comparison[ForceHypothesis]):
             None,
         )
 
-    def start_point(self, hypothesis: ForceHypothesis) -> Point:
+    def start_point(self, hypothesis: Estimate) -> Point:
         """Return the values of all unknowns of a hypothesis as fitted to the missing force."""
-        return self.force_search.point_with_effects(hypothesis)
+        return self.force_search.point(hypothesis)
 
-    def failed_check_reason(self, hypothesis: ForceHypothesis) -> str:
+    def failed_check_reason(self, hypothesis: Estimate) -> str:
         """Return an empty reason, as there are no further tests with a missing force."""
         return ""
 
-    def check_fit(self, hypothesis: ForceHypothesis) -> Gate:
+    def check_fit(self, hypothesis: Estimate) -> Gate:
         """Test whether the residuals of the best simulation are noise as in the noise records."""
         return check_absolute_fit(self.problem, self.search.best())
 
-    def _compute_simulation(self, hypothesis: ForceHypothesis) -> CandidateFit:
+    def _compute_simulation(self, hypothesis: Estimate) -> CandidateFit:
         """Return the simulation with the parameters of a hypothesis, and their covariance.
 
         Only the trials' own unknowns are fitted. It is the fit without effect if the hypothesis
@@ -105,14 +105,14 @@ class ForceComparison(Comparison[ForceHypothesis]):
             return self.search.no_effect
         return replace(simulation, covariance=hypothesis.covariance)
 
-    def unexplained_text(self, hypothesis: ForceHypothesis, share: GapShare) -> str:
+    def unexplained_text(self, hypothesis: Estimate, share: GapShare) -> str:
         """Return in words how much of the missing force a hypothesis does not explain."""
         unit = self._force_unit(hypothesis)
         return (
             f"{share.remaining_rms:.3g} of {share.total_rms:.3g} {unit} (rms) of the missing force"
         )
 
-    def _force_unit(self, hypothesis: ForceHypothesis) -> str:
+    def _force_unit(self, hypothesis: Estimate) -> str:
         """Return the unit of the force at the port of a hypothesis's law.
 
         If no law acts at a port, it is that of the first missing force.
@@ -125,9 +125,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     def gap_sentence(self) -> str:
         """Return a sentence on the size and port of the missing force, and on what it depends."""
-        force_of_best_port = missing_force(
-            self.force_search, self.force_search.hypothesis_of_best_port()
-        )
+        force_of_best_port = missing_force(self.force_search, self.force_search.best_port_estimate)
         if force_of_best_port is None:
             return ""
         force = force_of_best_port.at_port

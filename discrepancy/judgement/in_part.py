@@ -59,7 +59,7 @@ def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutco
         The verdict. If the gap is unexplained, its fit is that of the best hypothesis that the
         sentence mentions.
     """
-    force_search = search.force_search if search.force_hypotheses else None
+    force_search = search.force_search if search.force_estimates else None
     if force_search is not None and not _missing_force_vanishes(search):
         return _verdict_by_comparison(ForceComparison(search, force_search), simulation_verdict)
     compare_under_wide_noise(search)
@@ -87,7 +87,7 @@ def _missing_force_vanishes(search: Search) -> bool:
         if simulation.candidate.terms:
             score = search.score_under_recorded_noise(simulation)
             best_without_force = max(best_without_force, score)
-    best_with_force = max(map(search.score, search.force_hypotheses))
+    best_with_force = max(map(search.score, search.force_estimates))
     return best_without_force > best_with_force
 
 

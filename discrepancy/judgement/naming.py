@@ -96,7 +96,7 @@ def _verdict_of_two_searches(
     first_search = search(problem, effects, on_progress, on_search)
     first_outcome = _verdict_on_search(first_search)
     is_unexplained = first_outcome.verdict.kind is VerdictKind.UNEXPLAINED
-    if not first_search.force_hypotheses or not is_unexplained:
+    if not first_search.force_estimates or not is_unexplained:
         return first_outcome
     on_progress("no effect follows the missing force: comparing whole simulations")
     # the first search may have refined the time steps, so fit again
@@ -109,7 +109,7 @@ def _verdict_of_two_searches(
     second_search.search_single_effects()
     second_search.search_sets()
     second_outcome = _verdict_on_search(second_search)
-    second_search.force_hypotheses = first_search.force_hypotheses
+    second_search.force_estimates = first_search.force_estimates
     is_named = second_outcome.verdict.kind is VerdictKind.NAMED_IN_PART
     has_law = any(_effects_acting_on_structure(problem, second_outcome.fit))
     # Held-out trials alone are not enough: most of the gap in fitted trials must be closed too. The
@@ -162,7 +162,7 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
     has_misfit = bool(failed_tests & {"absolute fit", "held-out trials"})
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
     is_open = not may_be_named and (has_misfit or verdict.kind in open_kinds)
-    is_open_group = verdict.kind is VerdictKind.GROUP and bool(search.force_hypotheses)
+    is_open_group = verdict.kind is VerdictKind.GROUP and bool(search.force_estimates)
     if is_open_group or is_open:
         return verdict_in_part(search, verdict)
     return VerdictOutcome(verdict, search, outcome.fit)
@@ -198,7 +198,7 @@ def _outcome_naming_laws_only(
     """
     acts_on_structure = _effects_acting_on_structure(search.problem, fit)
     names_both = any(acts_on_structure) and not all(acts_on_structure)
-    if not search.force_hypotheses or not names_both:
+    if not search.force_estimates or not names_both:
         return None
     return verdict_naming_laws_only(search, verdict)
 

@@ -14,10 +14,13 @@ import numpy as np
 from scipy.optimize import minimize
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.estimation.force_states import Process
+from discrepancy.estimation.linearisation import Linearisation
+from discrepancy.estimation.process_search import (
+    PRIOR_LOG_DEVIATION_OF_SIZE,
+    PRIOR_LOG_DEVIATION_OF_TIME,
+)
 
-from .filtered import Process
-from .linear_trials import LinearTrials
-from .process_search import PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME
 from .switched_record import (
     EventTrials,
     ForcePair,
@@ -65,8 +68,8 @@ class EventSearch(EventTrials):
 
     Parameters
     ----------
-    linear_trials : LinearTrials
-        The trials with the columns of all unknowns.
+    linearisation : Linearisation
+        The trials with the columns of all unknowns, without laws.
     port : int
         The number of the port.
     process : Process
@@ -76,9 +79,9 @@ class EventSearch(EventTrials):
     """
 
     def __init__(
-        self, linear_trials: LinearTrials, port: int, process: Process, *, stride: int = 1
+        self, linearisation: Linearisation, port: int, process: Process, *, stride: int = 1
     ) -> None:
-        super().__init__(linear_trials, port, stride=stride)
+        super().__init__(linearisation, port, stride=stride)
         self.process = process
 
     def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
@@ -250,14 +253,14 @@ class Events:
 
 
 def find_events(
-    linear_trials: LinearTrials, port: int, process: Process, least_score: float = -np.inf
+    linearisation: Linearisation, port: int, process: Process, least_score: float = -np.inf
 ) -> Events:
     """Return the most probable events at a port, or a force throughout if that is more probable.
 
     Parameters
     ----------
-    linear_trials : LinearTrials
-        The trials with the columns of all unknowns.
+    linearisation : Linearisation
+        The trials with the columns of all unknowns, without laws.
     port : int
         The number of the port.
     process : Process
@@ -271,9 +274,9 @@ def find_events(
         The events with changes if these are more probable than `least_score` and than a force that
         acts throughout the records that have one; otherwise such a force.
     """
-    sample_count = sum(len(trial.time) for trial in linear_trials.trials)
+    sample_count = sum(len(trial.trial.time) for trial in linearisation.trials)
     stride = ceil(sample_count / MOST_SAMPLES)
-    search = EventSearch(linear_trials, port, process, stride=stride)
+    search = EventSearch(linearisation, port, process, stride=stride)
     always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
     steady = _steady_force_where_needed(search, always_off)
     # stretches with a large force that may jump, besides a small force throughout
@@ -298,10 +301,10 @@ def find_events(
     return steady
 
 
-def events_throughout(linear_trials: LinearTrials, port: int, process: Process) -> Events:
+def events_throughout(linearisation: Linearisation, port: int, process: Process) -> Events:
     """Return a force that acts in all records from the first sample to the last, as events."""
-    always = [np.ones(len(trial.time), dtype=bool) for trial in linear_trials.trials]
-    return Events(EventSearch(linear_trials, port, process), (process, process), always, -np.inf)
+    always = [np.ones(len(trial.trial.time), dtype=bool) for trial in linearisation.trials]
+    return Events(EventSearch(linearisation, port, process), (process, process), always, -np.inf)
 
 
 def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
@@ -315,7 +318,7 @@ def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
         The step between these samples.
     """
     search = EventSearch(
-        coarse_events.search.linear_trials, coarse_events.search.port, coarse_events.search.process
+        coarse_events.search.linearisation, coarse_events.search.port, coarse_events.search.process
     )
     paths = [
         np.repeat(is_on, stride)[: len(trial.time)]

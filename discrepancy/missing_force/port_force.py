@@ -8,15 +8,14 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
 from reporting.arrays import LEAST_DIVISOR
 
-from .explained import ForceHypothesis
 from .gap_share import GapShare
-from .hypotheses import can_estimate_forces, scale_processes
-from .naming import ForceSearch
 from .shares import ForceShares
 
 ESTIMATION_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
@@ -150,7 +149,7 @@ class MissingForce:
     law: str = ""
 
 
-def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingForce | None:
+def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | None:
     """Return the missing force at one port, with the law that a hypothesis has there.
 
     The port is that of the law of the hypothesis if it has laws at one port only, otherwise the
@@ -160,7 +159,7 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     ----------
     search : ForceSearch
         The search for the missing force.
-    hypothesis : ForceHypothesis
+    estimate : Estimate
         The fitted hypothesis: its effects, and the motion and missing forces of each trial.
 
     Returns
@@ -169,14 +168,14 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
         The missing force; None if no force is missing at any port.
     """
     evidence_of_none = max(
-        evidence_without_force(at_port) for at_port in search.hypothesis_by_port.values()
+        at_port.log_evidence_without_force for at_port in search.estimate_by_port.values()
     )
     evidence_by_port = {}
-    for name, at_port in search.hypothesis_by_port.items():
+    for name, at_port in search.estimate_by_port.items():
         evidence_by_port[name] = at_port.log_evidence - evidence_of_none
     if max(evidence_by_port.values()) < LEAST_EVIDENCE:
         return None
-    terms = hypothesis.candidate.terms
+    terms = estimate.candidate.terms
     law_ports = {term.place for term in terms if term.place in search.ports}
     if len(law_ports) == 1:
         (port,) = law_ports
@@ -184,24 +183,24 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
         port = max(evidence_by_port, key=lambda name: evidence_by_port[name])
     number = search.ports.index(port)
     # a hypothesis without a missing force at this port: take the force at the port alone
-    if number not in hypothesis.processes:
-        hypothesis = search.hypothesis_by_port[port]
+    if number not in estimate.processes:
+        estimate = search.estimate_by_port[port]
     law_name = " and ".join(
-        term.name_in_words for term in hypothesis.candidate.terms if term.place == port
+        term.name_in_words for term in estimate.candidate.terms if term.place == port
     )
-    trial_forces = _forces_by_trial(hypothesis, number, has_law=bool(law_name))
+    trial_forces = _forces_by_trial(estimate, number, has_law=bool(law_name))
     unit, *_ = search.problem.model.port_units(port)
-    correlation_time = hypothesis.processes[number].correlation_time
+    correlation_time = estimate.processes[number].correlation_time
     force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
     return MissingForce(force, trial_forces, law_name)
 
 
-def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> list[TrialForce]:
+def _forces_by_trial(estimate: Estimate, port: int, *, has_law: bool) -> list[TrialForce]:
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
     Parameters
     ----------
-    hypothesis : ForceHypothesis
+    estimate : Estimate
         The fitted hypothesis: its effects, and the motion and missing forces of each trial.
     port : int
         The index of the port among the ports of the model.
@@ -210,19 +209,18 @@ def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -
         force the law explains.
     """
     trial_forces = []
-    for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
+    for smoothed_trial in estimate.trials:
+        trial = smoothed_trial.trial
         samples = slice(None, None, trial.substeps)
-        force = motion.forces[port][samples]
-        # the force consists of the force of the law and of what no law explains
-        law_force = force - motion.unexplained_forces[port][samples] if has_law else None
+        law_force = smoothed_trial.effect_forces[port][samples] if has_law else None
         trial_forces.append(
             TrialForce(
                 trial=trial.name,
                 time=trial.time,
-                position=motion.positions[samples, port],
-                speed=motion.speeds[samples, port],
-                force=force,
-                deviation=motion.deviations_by_port[port].force,
+                position=smoothed_trial.trajectory.positions[samples, port],
+                speed=smoothed_trial.trajectory.speeds[samples, port],
+                force=smoothed_trial.lacking_forces[port][samples],
+                deviation=smoothed_trial.missing_force_deviations[port][samples],
                 law=law_force,
             )
         )
@@ -287,21 +285,10 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def evidence_without_force(hypothesis: ForceHypothesis) -> float:
-    """Return the log evidence of a hypothesis if no force is missing [nat].
-
-    The sizes of its missing forces are multiplied by 1e-9, since a process of size zero is
-    singular.
-    """
-    return hypothesis.linear_trials.solve(
-        scale_processes(hypothesis.processes, 1e-9, 1.0)
-    ).log_evidence
-
-
 def missing_force_of_verdict(
     problem: Problem,
     search: ForceSearch | None,
-    hypotheses: Sequence[ForceHypothesis],
+    estimates: Sequence[Estimate],
     fit: CandidateFit,
 ) -> MissingForce | None:
     """Return the missing force for a verdict, with the share of it that its law explains.
@@ -312,7 +299,7 @@ def missing_force_of_verdict(
         The campaign and the model, with the layout of their unknowns.
     search : ForceSearch or None
         The search for the missing force, if there was one.
-    hypotheses : sequence of ForceHypothesis
+    estimates : sequence of Estimate
         The hypotheses that were fitted to the missing force.
     fit : CandidateFit
         The fit of the verdict.
@@ -330,11 +317,11 @@ def missing_force_of_verdict(
         if not can_estimate_forces(problem) or (terms and not laws):
             return None
         search = search or ForceSearch(problem)
-        hypothesis = _hypothesis_of_fit(search, hypotheses, fit)
-        force = missing_force(search, hypothesis or search.hypothesis_of_all_ports)
+        estimate = _estimate_of_fit(search, estimates, fit)
+        force = missing_force(search, estimate or search.estimate_without_effects)
     except ESTIMATION_ERRORS:
         return None
-    if force is None or not force.law or hypothesis is None:
+    if force is None or not force.law or estimate is None:
         return force
     at_port = force.at_port
     if len({law.place for law in laws}) > 1:
@@ -345,38 +332,38 @@ def missing_force_of_verdict(
         shares = ForceShares(search)
         held_out = None
         if shares.has_held_out:
-            held_out = _remaining_force(shares.gap_share(hypothesis, held_out=True))
-        fitted_remainder = _remaining_force(shares.gap_share(hypothesis, held_out=False))
+            held_out = _remaining_force(shares.gap_share(estimate, held_out=True))
+        fitted_remainder = _remaining_force(shares.gap_share(estimate, held_out=False))
         at_port = replace(at_port, fitted=fitted_remainder, held_out=held_out)
     return replace(force, at_port=at_port)
 
 
-def _hypothesis_of_fit(
-    search: ForceSearch, hypotheses: Sequence[ForceHypothesis], fit: CandidateFit
-) -> ForceHypothesis | None:
+def _estimate_of_fit(
+    search: ForceSearch, estimates: Sequence[Estimate], fit: CandidateFit
+) -> Estimate | None:
     """Return the hypothesis whose effects are those of a fit, estimated from the missing force.
 
     Parameters
     ----------
     search : ForceSearch
         The search for the missing force.
-    hypotheses : sequence of ForceHypothesis
+    estimates : sequence of Estimate
         The hypotheses that were estimated already; if none has these effects, one is estimated now.
     fit : CandidateFit
         A fit by simulation.
 
     Returns
     -------
-    ForceHypothesis or None
+    Estimate or None
         The hypothesis; None if the fit has no effects, or if their forces cannot be computed from
         the motion that the readings show.
     """
-    for hypothesis in hypotheses:
-        if hypothesis.candidate.key == fit.candidate.key:
-            return hypothesis
+    for estimate in estimates:
+        if estimate.candidate.key == fit.candidate.key:
+            return estimate
     if not fit.candidate.terms:
         return None
-    return search.fit_along_motion(search.hypothesis_of_all_ports, fit.candidate, fit.point.effect)
+    return search.estimate_effects(search.estimate_without_effects, fit.candidate, fit.point.effect)
 
 
 def _remaining_force(share: GapShare) -> ForceLeft:

@@ -8,14 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
+from discrepancy.estimation.filtered import SmoothedTrial
+from discrepancy.estimation.force_search import ForceSearch, TrialSet
+from discrepancy.estimation.gauss_newton import EstimatorStart, linearise_trials
+from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
+from discrepancy.estimation.process_search import Processes
+from discrepancy.estimation.trial import PortedTrial
 from discrepancy.fits.candidate import Point
 
-from .explained import NO_EFFECTS, ForceHypothesis
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
-from .hypotheses import ColumnBuilder
-from .linear_trials import LinearTrials, TrialMotion
-from .naming import ForceSearch
-from .trial import PortedTrial
 
 MOST_BLOCKS = 12
 """Largest number of blocks into which a trial is divided for the bootstrap."""
@@ -56,19 +58,19 @@ class ForceShares:
         self.search = search
         campaign = search.problem.campaign
         held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
-        self._held_out: ColumnBuilder | None = None
-        self._held_out_trials: dict[bytes, LinearTrials] = {}
-        self._without_effect: dict[bool, tuple[LinearTrials, list[TrialMotion]]] = {}
+        self._held_out: TrialSet | None = None
+        self._held_out_trials: dict[bytes, tuple[PortedTrial, ...]] = {}
+        self._without_effect: dict[bool, tuple[SmoothedTrial, ...]] = {}
         if held_out:
             problem = search.problem.with_trials(held_out)
-            self._held_out = ColumnBuilder(problem, range(len(problem.trials)), search.model_laws)
+            self._held_out = search.trial_set.with_problem(problem, range(len(problem.trials)))
 
     @property
     def has_held_out(self) -> bool:
         """Whether some of the trials in motion are held out."""
         return self._held_out is not None
 
-    def gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
+    def gap_share(self, estimate: Estimate, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains.
 
         Two shares are computed: that of the forces, and that of the changes of the readings by
@@ -78,22 +80,22 @@ class ForceShares:
 
         Parameters
         ----------
-        hypothesis : ForceHypothesis
-            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
+        estimate : Estimate
+            The estimate of the hypothesis.
         held_out : bool
             Whether the share is computed in the held-out trials, and not in the fitted trials.
         """
-        linear_trials, motions = self.smooth_trials(hypothesis, held_out=held_out)
-        _, motions_without = self._motions_without_effect(held_out)
-        law_ports = self._law_ports(hypothesis)
-        ports = law_ports or set(self.search.hypothesis_of_best_port().processes)
-        remaining_rms = _largest_rms([motion.unexplained_forces for motion in motions], ports)
-        total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
-        law_rms = _largest_rms([motion.law_forces for motion in motions], ports)
+        linearisation, trials = self.smooth_trials(estimate, held_out=held_out)
+        trials_without = self._trials_without_effect(held_out)
+        law_ports = self._law_ports(estimate)
+        ports = law_ports or set(self.search.best_port_estimate.processes)
+        remaining_rms = _largest_rms([trial.missing_forces for trial in trials], ports)
+        total_rms = _largest_rms([trial.lacking_forces for trial in trials_without], ports)
+        law_rms = _largest_rms([trial.effect_forces for trial in trials], ports)
         # trials in which the force of the law is small do not test the law
         is_tested = not law_ports or law_rms**2 > LEAST_FORCE_RATIO * total_rms**2
         of_forces, of_predictions = self._block_sums(
-            hypothesis, linear_trials, motions, motions_without
+            estimate, linearisation, trials, trials_without
         )
         shares = []
         for block_sums, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
@@ -103,7 +105,7 @@ class ForceShares:
                 squares_after=sums_after,
                 noise_squares=noise_sums,
                 held_out=held_out,
-                trial_count=len(motions),
+                trial_count=len(trials),
                 remaining_rms=remaining_rms,
                 total_rms=total_rms,
                 kind=kind,
@@ -112,18 +114,18 @@ class ForceShares:
             shares.append(share)
         return max(shares, key=lambda share: share.interval[0])
 
-    def _law_ports(self, hypothesis: ForceHypothesis) -> set[int]:
+    def _law_ports(self, estimate: Estimate) -> set[int]:
         """Return the numbers of the ports at which a hypothesis has laws."""
         names = self.search.ports
-        places = [term.place for term in hypothesis.candidate.terms]
+        places = [term.place for term in estimate.candidate.terms]
         return {names.index(place) for place in places if place in names}
 
     def _block_sums(
         self,
-        hypothesis: ForceHypothesis,
-        linear_trials: LinearTrials,
-        motions: Sequence[TrialMotion],
-        motions_without: Sequence[TrialMotion],
+        estimate: Estimate,
+        linearisation: Linearisation,
+        trials: Sequence[SmoothedTrial],
+        trials_without: Sequence[SmoothedTrial],
     ) -> tuple[list[_BlockSums], list[_BlockSums]]:
         """Return the sums of squares of forces and of the changes of readings, by block.
 
@@ -131,12 +133,12 @@ class ForceShares:
 
         Parameters
         ----------
-        hypothesis : ForceHypothesis
-            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
-        linear_trials : LinearTrials
-            The trials in motion as one linear model.
-        motions, motions_without : sequence of TrialMotion
-            The motion of each trial with the hypothesis, and without any effect.
+        estimate : Estimate
+            The estimate of the hypothesis.
+        linearisation : Linearisation
+            The trials, linear along their motion with the hypothesis.
+        trials, trials_without : sequence of SmoothedTrial
+            The smoothed trials with the hypothesis, and without any effect.
 
         Returns
         -------
@@ -144,29 +146,26 @@ class ForceShares:
             The sums of each block of all trials: of weighted forces, and of changes of readings
             divided by their noise.
         """
-        system = linear_trials.trials[0].system
+        system = trials[0].trial.system
         weights = {}
-        for port in motions[0].unexplained_forces:
+        for port in trials[0].missing_forces:
             strength_on_state = np.linalg.norm(system.actions[port])
             strength_on_readings = np.linalg.norm(system.through[port])
             weights[port] = float(np.hypot(strength_on_state, strength_on_readings))
         of_forces = []
         of_predictions = []
-        filters = linear_trials.force_filters(
-            {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
-        )
-        for trial, motion, motion_without, force_filter in zip(
-            linear_trials.trials, motions, motions_without, filters, strict=True
+        filters = linearisation.filter(self._large_processes(estimate))
+        for smoothed_trial, without_effect, filtered_trial in zip(
+            trials, trials_without, filters, strict=True
         ):
+            trial = smoothed_trial.trial
             # the missing forces that are estimated from noise alone
-            smoothed_noise = force_filter.smooth(_simulated_noise(trial))
-            noise_forces = {}
-            for (port, _), force in zip(force_filter.processes, smoothed_noise.forces, strict=True):
-                noise_forces[port] = force
+            noise_states, _ = filtered_trial.smooth_residual(_simulated_noise(trial))
+            noise_forces = filtered_trial.missing_forces(noise_states)
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
-                motion_without.forces,
-                motion.unexplained_forces,
+                without_effect.lacking_forces,
+                smoothed_trial.missing_forces,
                 noise_forces,
             )
             for begin, end in _blocks(len(trial.time)):
@@ -183,71 +182,79 @@ class ForceShares:
                 of_predictions.append(_BlockSums(*prediction_sums))
         return of_forces, of_predictions
 
-    def _motions_without_effect(self, held_out: bool) -> tuple[LinearTrials, list[TrialMotion]]:
-        """Return the trials, and the motion and missing force of each without any effect.
+    def _large_processes(self, estimate: Estimate) -> Processes:
+        """Return missing forces as large as without any effect, at the ports of an estimate.
+
+        They can describe all that the hypothesis does not explain.
+        """
+        return {**estimate.processes, **self.search.estimate_without_effects.processes}
+
+    def _trials_without_effect(self, held_out: bool) -> tuple[SmoothedTrial, ...]:
+        """Return the trials with the motion and missing force of each without any effect.
 
         Shared unknowns are kept within `SHARED_BOUND` prior deviations, as they would otherwise
         explain a part of the missing force.
         """
         if held_out not in self._without_effect:
-            hypothesis = self.search.hypothesis_of_all_ports
+            estimate = self.search.estimate_without_effects
             # an unknown with a flat prior has no bound
-            bounds = np.where(hypothesis.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
-            mean = np.clip(hypothesis.solution.mean, -bounds, bounds)
-            bounded_hypothesis = replace(
-                hypothesis, solution=replace(hypothesis.solution, mean=mean)
-            )
-            self._without_effect[held_out] = self.smooth_trials(
-                bounded_hypothesis, held_out=held_out
+            has_prior = self.search.problem.shared.precision > 0.0
+            bounds = np.where(has_prior, SHARED_BOUND, np.inf)
+            bounded_estimate = replace(estimate, shared=np.clip(estimate.shared, -bounds, bounds))
+            _, self._without_effect[held_out] = self.smooth_trials(
+                bounded_estimate, held_out=held_out
             )
         return self._without_effect[held_out]
 
     def smooth_trials(
-        self, hypothesis: ForceHypothesis, *, held_out: bool
-    ) -> tuple[LinearTrials, list[TrialMotion]]:
-        """Return the trials, and the motion and unexplained force of each with a hypothesis.
+        self, estimate: Estimate, *, held_out: bool
+    ) -> tuple[Linearisation, tuple[SmoothedTrial, ...]]:
+        """Return the trials, with the motion and unexplained force of each with a hypothesis.
 
         The unexplained force has the standard deviation of the force that is missing without any
-        effect, so that it can describe all that the hypothesis does not explain.
+        effect.
 
         Parameters
         ----------
-        hypothesis : ForceHypothesis
-            The fitted hypothesis: its effects, and the motion and missing forces of each trial.
+        estimate : Estimate
+            The estimate of the hypothesis, whose shared unknowns and effects are not changed.
         held_out : bool
             Whether the held-out trials are returned. Otherwise the fitted trials are returned.
         """
-        processes = {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
+        processes = self._large_processes(estimate)
         if not held_out:
-            motion_estimate = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
-            return hypothesis.linear_trials, motion_estimate.motions
+            return estimate.linearisation, estimate.linearisation.smooth(
+                processes, estimate.solution
+            )
         assert self._held_out is not None
-        builder = self._held_out
-        linear_trials = self._held_out_linearised_as(hypothesis)
-        solution = replace(hypothesis.solution, mean=hypothesis.shared)
-        motions = linear_trials.smooth(processes, solution).motions
+        precision = self.search.problem.shared.precision
+        trials = self._held_out_linearised_as(estimate)
+        without_laws = plain_linearisation(trials, precision)
+        linearisation = without_laws
+        smoothed_trials = without_laws.smooth(
+            processes, replace(estimate.solution, mean=estimate.shared)
+        )
         # the laws act along the motion, which in turn depends on their force: iterate
+        laws = self._held_out.laws(estimate.candidate, trials)
         for _ in range(SMOOTHING_ROUNDS):
-            effects_column = None
-            if len(hypothesis.effect):
-                effects_column = builder.column_of_candidate(
-                    linear_trials, motions, hypothesis.candidate, hypothesis.effect
-                )
-            linear_trials = builder.trials_along_motions(linear_trials, motions, effects_column)
-            motions = linear_trials.smooth(processes, solution).motions
-        return linear_trials, motions
+            start = EstimatorStart(
+                effect=estimate.effect,
+                shared=estimate.shared,
+                trajectories=tuple(trial.trajectory for trial in smoothed_trials),
+                processes=processes,
+            )
+            with_laws = linearise_trials(laws, trials, start, estimate.speed_window, precision)
+            if with_laws is None:
+                break
+            linearisation = with_laws
+            smoothed_trials = linearisation.smooth(processes, estimate.solution)
+        return linearisation, smoothed_trials
 
-    def _held_out_linearised_as(self, hypothesis: ForceHypothesis) -> LinearTrials:
-        """Return the held-out trials, linearised about the same values as the fitted trials.
-
-        Parameters
-        ----------
-        hypothesis : ForceHypothesis
-            The hypothesis with its fitted trials.
-        """
+    def _held_out_linearised_as(self, estimate: Estimate) -> tuple[PortedTrial, ...]:
+        """Return the held-out trials, linearised about the same values as the fitted trials."""
         assert self._held_out is not None
         problem = self._held_out.problem
-        fitted_trial = hypothesis.linear_trials.trials[0]
+        fitted_trial = estimate.trials[0].trial
         shared_values = fitted_trial.linearisation_point[: problem.shared.unknown_count]
         key = shared_values.tobytes()
         if key not in self._held_out_trials:

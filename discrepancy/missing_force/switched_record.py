@@ -13,10 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
+from discrepancy.estimation.force_states import ForceStates, ForceStateSpace, Process
+from discrepancy.estimation.linearisation import Linearisation
+from discrepancy.estimation.regression import integrate_out_last
+from discrepancy.estimation.steps import discretise
 
-from .filtered import ForceFilter, ForceStateSpace, Process, integrate_out_last
-from .kalman import FilterState, RecordFilter, StateInformation, discretise, join_filters
-from .linear_trials import LinearTrials
+from .two_filters import FilterState, RecordFilter, StateInformation, join_filters
 
 CHANGE_PRICE = 4.0
 """Log odds against a change of a path, in addition to the prior of its sample [nat]. With 4, the
@@ -54,8 +56,8 @@ class EventTrials:
 
     Parameters
     ----------
-    linear_trials : LinearTrials
-        The trials with the columns of all unknowns.
+    linearisation : Linearisation
+        The trials with the columns of all unknowns, without laws.
     port : int
         The number of the port.
     stride : int
@@ -65,18 +67,26 @@ class EventTrials:
     ----------
     trials : list of PortedTrial
         The trials with the samples that are used.
-    columns : list of (1 + K + L, N, C) ndarray
+    columns : list of (N, C, 1 + K + L) ndarray
         The residual and the columns of all unknowns, by trial.
     """
 
-    def __init__(self, linear_trials: LinearTrials, port: int, *, stride: int = 1) -> None:
-        self.linear_trials = linear_trials
+    def __init__(self, linearisation: Linearisation, port: int, *, stride: int = 1) -> None:
+        self.linearisation = linearisation
         self.port = port
         self.trials = [
-            replace(trial, time=trial.time[::stride], used=trial.used[::stride])
-            for trial in linear_trials.trials
+            replace(
+                linear_trial.trial,
+                time=linear_trial.trial.time[::stride],
+                used=linear_trial.trial.used[::stride],
+            )
+            for linear_trial in linearisation.trials
         ]
-        self.columns = [rows[:, ::stride] for rows in linear_trials.regression_rows]
+        # the columns of unknowns are minus the derivatives: change their sign
+        self.columns = []
+        for linear_trial in linearisation.trials:
+            signs = np.r_[1.0, -np.ones(linear_trial.weight_count - 1)]
+            self.columns.append(linear_trial.columns[::stride] * signs)
 
     def log_evidence(self, by_trial: Sequence[TrialProducts]) -> FloatArray:
         """Return the log evidence (...) of all trials [nat], given the products of each.
@@ -87,7 +97,7 @@ class EventTrials:
         sum_of_products = np.asarray(sum(trial.products for trial in by_trial))
         sum_of_determinants = np.asarray(sum(trial.half_log_determinants for trial in by_trial))
         products, half_log_determinants = integrate_out_last(
-            sum_of_products, sum_of_determinants, self.linear_trials.shared_precision
+            sum_of_products, sum_of_determinants, self.linearisation.shared_precision
         )
         squared_residual = products[..., 0, 0]
         return np.asarray(-0.5 * squared_residual - half_log_determinants)
@@ -123,18 +133,17 @@ class SwitchedRecord:
         self.products_of_others = products_of_others
         trial = trials.trials[trial_index]
         self.local_precision = trial.local_precision
-        force_filter = ForceFilter(trial, [(trials.port, force) for force in forces])
-        state_space = force_filter.state_space
+        force_states = ForceStates(trial, [(trials.port, force) for force in forces])
+        state_space = force_states.state_space
         # the states of the missing forces follow those of the structure; that of events is first
         event_state = len(trial.system.generator)
         # between two samples there are `substeps` steps, at whose ends nothing is read
         lengths, step_of_sample = trial.intervals
         is_used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
         is_used[::substeps] = trial.used
-        columns = np.zeros((*is_used.shape, len(trials.columns[trial_index])))
-        columns[::substeps] = np.moveaxis(
-            trials.columns[trial_index] * force_filter.white_noise_scale, 0, -1
-        )
+        trial_columns = trials.columns[trial_index]
+        columns = np.zeros((*is_used.shape, trial_columns.shape[-1]))
+        columns[::substeps] = trial_columns * force_states.white_noise_scale[:, None]
         # a step is of one of 4 J kinds: its force is off, begins, ends or is on (see
         # `switched_step_matrices`), and it has one of J lengths
         self.length_of_sample = np.concatenate(
@@ -201,7 +210,7 @@ class SwitchedRecord:
             The log evidence of each start with each end [nat]; -inf if the end is not after the
             start.
         """
-        column_count = 1 + len(self.trials.linear_trials.shared_precision)
+        column_count = 1 + len(self.trials.linearisation.shared_precision)
         products = np.zeros((len(starts), len(ends), column_count, column_count))
         # an infinite determinant is an evidence of -inf, which stays if an end is not after the
         # start

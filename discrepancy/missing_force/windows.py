@@ -15,6 +15,12 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
+from discrepancy.estimation.estimate import Estimate, estimate_of_processes
+from discrepancy.estimation.force_search import ForceSearch
+from discrepancy.estimation.force_states import Process
+from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
+from discrepancy.estimation.process_search import Processes
+from discrepancy.estimation.trial import PortedTrial
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -22,14 +28,7 @@ from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import LEAST_EVIDENCE, MOST_EVENTS, Events, events_throughout, find_events
-from .explained import ForceHypothesis, fit_missing_forces
-from .filtered import Process
-from .linear_trials import LinearTrials
-from .naming import ForceSearch
-from .port_force import evidence_without_force
-from .process_search import Processes
 from .switched_record import change_samples
-from .trial import PortedTrial
 
 TIMED_KINDS = frozenset(TrialKind) - {TrialKind.STATIC}
 """Kinds of trials whose readings follow each other in time; those of a static trial do not."""
@@ -90,23 +89,22 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
         The fit of the verdict.
     """
     search = ForceSearch(problem)
-    port = max(
-        search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence
-    )
+    port = max(search.estimate_by_port, key=lambda name: search.estimate_by_port[name].log_evidence)
     evidence_of_law = _evidence_of_law(search, port, fit)
     channels_by_trial = [data.trial.channels for data in problem.trials]
-    port_number, hypothesis = _port_or_channel_error(
-        search.ports.index(port), search.hypothesis_with_jumps(port), channels_by_trial
+    port_number, estimate = _port_or_channel_error(
+        search.ports.index(port), search.estimate_with_jumps(port), channels_by_trial
     )
     # no windows without a missing force
-    if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
+    if estimate.log_evidence < estimate.log_evidence_without_force + LEAST_EVIDENCE:
         return ()
-    process = hypothesis.processes[port_number]
-    best_events = find_events(hypothesis.linear_trials, port_number, process, evidence_of_law)
+    process = estimate.processes[port_number]
+    best_events = find_events(estimate.linearisation, port_number, process, evidence_of_law)
     # the part of the readings that the force causes gives the size of each window
     readings_by_force = []
-    for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
-        force = motion.forces[port_number]
+    for smoothed_trial in estimate.trials:
+        trial = smoothed_trial.trial
+        force = smoothed_trial.lacking_forces[port_number]
         readings_by_force.append(
             trial.readings_of_state(
                 trial.state_under_force(port_number, force), {port_number: force}
@@ -134,9 +132,8 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     if not terms_at_port:
         return -np.inf
     laws_at_port, parameters = fit.candidate.subset_of_terms(terms_at_port, fit.effect)
-    force_at_port = search.hypothesis_by_port[port]
-    law_fit = search.fit_along_motion(force_at_port, laws_at_port, parameters)
-    return -np.inf if law_fit is None else law_fit.log_evidence
+    with_laws = search.estimate_effects(search.estimate_by_port[port], laws_at_port, parameters)
+    return -np.inf if with_laws is None else with_laws.log_evidence
 
 
 def windows_of_residuals(
@@ -171,18 +168,18 @@ def windows_of_residuals(
         extends_in_time = fitted_trial.used.any() and np.ptp(trial.time) > 0.0
         if trial.kind not in kinds or not extends_in_time:
             continue
-        hypothesis, pattern = strongest_pattern(
+        estimate, pattern = strongest_pattern(
             trial.name, trial.time, white_residuals, fitted_trial.used
         )
-        if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
+        if estimate.log_evidence < estimate.log_evidence_without_force + LEAST_EVIDENCE:
             continue
-        process = hypothesis.processes[0]
+        process = estimate.processes[0]
         try:
-            best_events = find_events(hypothesis.linear_trials, 0, process)
+            best_events = find_events(estimate.linearisation, 0, process)
         # with residuals of millions of noise deviations matrices become singular: a gap throughout
         except np.linalg.LinAlgError:
-            best_events = events_throughout(hypothesis.linear_trials, 0, process)
-        residuals_by_pattern = hypothesis.motions[0].forces[0][:, None] * pattern
+            best_events = events_throughout(estimate.linearisation, 0, process)
+        residuals_by_pattern = estimate.trials[0].missing_forces[0][:, None] * pattern
         windows += _windows_of_events(
             best_events, [trial.channels], [residuals_by_pattern], with_effect=with_effect
         )
@@ -263,16 +260,16 @@ def _select_channels(channels: Sequence[str], is_selected: BoolArray) -> tuple[s
 
 
 def _port_or_channel_error(
-    port: int, at_port: ForceHypothesis, channels: Sequence[tuple[str, ...]]
-) -> tuple[int, ForceHypothesis]:
+    port: int, at_port: Estimate, channels: Sequence[tuple[str, ...]]
+) -> tuple[int, Estimate]:
     """Return the missing force at a port, or an error of a channel if that is more probable.
 
     Parameters
     ----------
     port : int
         The number of the port.
-    at_port : ForceHypothesis
-        The hypothesis of a missing force at that port.
+    at_port : Estimate
+        The estimate of a missing force at that port.
     channels : sequence of tuple of str
         The channels of each trial.
 
@@ -280,36 +277,32 @@ def _port_or_channel_error(
     -------
     port : int
         The number of the port; 0 for a channel, which is the only port of the returned trials.
-    hypothesis : ForceHypothesis
+    estimate : Estimate
         The more probable of both.
     """
-    linear_trials = at_port.linear_trials
-    trials = linear_trials.trials
+    linearisation = at_port.linearisation
+    trials = [linear_trial.trial for linear_trial in linearisation.trials]
     longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port
-    best_hypothesis = at_port
+    best_estimate = at_port
     channel_names = dict.fromkeys(chain(*channels))  # each once, in order
     for channel in channel_names:
-        with_channel_error = replace(
-            linear_trials,
-            trials=[
+        with_channel_error = plain_linearisation(
+            [
                 _with_channel_as_port(trial, names, channel)
                 for trial, names in zip(trials, channels, strict=True)
             ],
-            motions=[
-                replace(motion, forces={}, unexplained_forces={})
-                for motion in linear_trials.motions
-            ],
+            linearisation.shared_precision,
         )
         evidence, processes = _most_probable_channel_error(with_channel_error, longest_duration)
-        if evidence > best_hypothesis.log_evidence:
+        if evidence > best_estimate.log_evidence:
             best_port = 0
-            best_hypothesis = fit_missing_forces(with_channel_error, processes, processes)
-    return best_port, best_hypothesis
+            best_estimate = estimate_of_processes(with_channel_error, processes, processes)
+    return best_port, best_estimate
 
 
 def _most_probable_channel_error(
-    linear_trials: LinearTrials, longest_duration: float
+    linearisation: Linearisation, longest_duration: float
 ) -> tuple[float, Processes]:
     """Return the random process that describes the error of one channel best, with its evidence.
 
@@ -318,7 +311,7 @@ def _most_probable_channel_error(
 
     Parameters
     ----------
-    linear_trials : LinearTrials
+    linearisation : Linearisation
         The trials. Their only port is the channel: a force at this port is an error of its readings
         in units of the noise deviation, see `_with_channel_as_port`.
     longest_duration : float
@@ -342,7 +335,7 @@ def _most_probable_channel_error(
             may_jump=True,
         )
         processes = {channel_port: process}
-        evidence = linear_trials.solve(processes).log_evidence
+        evidence = linearisation.solve(processes).log_evidence
         # the first process is taken in any case, even if its evidence is minus infinity
         is_first = not best_processes
         if is_first or evidence > best_evidence:
@@ -392,7 +385,7 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
 
 def strongest_pattern(
     name: str, time: FloatArray, series: FloatArray, is_used: BoolArray
-) -> tuple[ForceHypothesis, FloatArray]:
+) -> tuple[Estimate, FloatArray]:
     """Return the strongest pattern of residuals over channels, and its amplitude as a force.
 
     Parameters
@@ -408,7 +401,7 @@ def strongest_pattern(
 
     Returns
     -------
-    hypothesis : ForceHypothesis
+    estimate : Estimate
         The amplitude of the pattern over time, as a missing force in a record of one channel.
     pattern : (C,) array
         The pattern over the channels, of norm one.
@@ -450,8 +443,8 @@ def strongest_pattern(
     )
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
     processes = {0: Process(size, 0.1 * float(np.ptp(time)), may_jump=True)}
-    hypothesis = fit_missing_forces(LinearTrials([trial], np.zeros(0)), processes, processes)
-    return hypothesis, pattern[0]
+    linearisation = plain_linearisation([trial], np.zeros(0))
+    return estimate_of_processes(linearisation, processes, processes), pattern[0]
 
 
 # ---------------------------------------------------------------- windows

@@ -35,7 +35,7 @@ from discrepancy.report.verdict_sentences import (
     remainders_sentence,
     tested_trials,
 )
-from discrepancy.verdict import Estimate, Gate, NamedEffect, Verdict, VerdictKind
+from discrepancy.verdict import Gate, NamedEffect, ParameterEstimate, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.record_table import add_titled_table
@@ -197,7 +197,7 @@ def verdict_card(verdict: Verdict) -> str:
             f"but with {moved[0].name} moved by {abs(moved[0].deviations):.1f} stated deviations, "
             "where an error of the model may hide"
         )
-    parameters: list[Estimate] = []
+    parameters: list[ParameterEstimate] = []
     if verdict.kind in NAMING:
         for effect in verdict.effects:
             parameters += effect.parameters

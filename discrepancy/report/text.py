@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from math import isfinite, isnan
 
-from discrepancy.verdict import Estimate, Hypothesis, VerdictKind
+from discrepancy.verdict import Hypothesis, ParameterEstimate, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Words
 from reporting.words import between, rounded
@@ -26,7 +26,7 @@ LARGEST_PLAIN_NUMBER = 1e6
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 
 
-def estimate_text(estimate: Estimate) -> tuple[str, str]:
+def estimate_text(estimate: ParameterEstimate) -> tuple[str, str]:
     """Return a value and its 90 % interval as texts, to two digits of the half-width."""
     if not (isfinite(estimate.low) and isfinite(estimate.high)):
         return f"{estimate.value:.4g}", "not known"
@@ -117,6 +117,6 @@ def nats(evidence: float) -> str:
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-def parameter_text(estimate: Estimate) -> str:
+def parameter_text(estimate: ParameterEstimate) -> str:
     """Return the description of a parameter, with its formula as it is printed."""
     return formula(estimate.description or estimate.name.replace("_", " "))

@@ -19,11 +19,11 @@ from discrepancy.report.text import (
 )
 from discrepancy.report.verdict_sentences import group_members
 from discrepancy.verdict import (
-    Estimate,
     Experiment,
     Gate,
     Hypothesis,
     NamedEffect,
+    ParameterEstimate,
     Verdict,
     VerdictKind,
 )
@@ -55,13 +55,13 @@ class EffectRow(NamedTuple):
         The number of the member of a group, in its first row; else empty.
     effect : NamedEffect
         The effect.
-    parameter : Estimate or None
+    parameter : ParameterEstimate or None
         The parameter; None if the effect has none.
     """
 
     member: str
     effect: NamedEffect
-    parameter: Estimate | None
+    parameter: ParameterEstimate | None
 
     @property
     def description(self) -> str:

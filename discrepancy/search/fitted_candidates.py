@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.log_prior import log_prior
 from discrepancy.fits.candidate import Candidate, CandidateKey
 from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.proof_record import ErrorComparison
 from discrepancy.search_settings import SEARCH
 from reporting.probabilities import normalised_probabilities
@@ -62,7 +62,7 @@ class FittedCandidates:
         """Return the log prior probability of the effects of a candidate at their places [nat]."""
         return log_prior(candidate, len(self.effects), self.problem.setting)
 
-    def score(self, fit: CandidateFit | ForceHypothesis) -> float:
+    def score(self, fit: CandidateFit | Estimate) -> float:
         """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
         return fit.log_evidence + self.log_prior(fit.candidate)
 

@@ -13,10 +13,10 @@ from scipy.special import ndtr, ndtri
 
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import DiscrepancyError
+from discrepancy.estimation.estimate import Estimate
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import CandidateFit, objective, try_fit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.search_settings import SEARCH
 
 from .fitted_candidates import FittedCandidates
@@ -25,9 +25,7 @@ LEAST_TAIL = 0.02
 """Prior probability that is left beyond a moved end of a stretch."""
 
 
-def canonical_relatives(
-    leading_term: EffectTerm, hypotheses: Iterable[ForceHypothesis]
-) -> list[ForceHypothesis]:
+def canonical_relatives(leading_term: EffectTerm, hypotheses: Iterable[Estimate]) -> list[Estimate]:
     """Return the hypotheses that a fit from other starting magnitudes may improve.
 
     Such a hypothesis consists of one effect. The effect has the same family (such as friction) and
@@ -39,7 +37,7 @@ def canonical_relatives(
     ----------
     leading_term : EffectTerm
         The leading effect at its place.
-    hypotheses : iterable of ForceHypothesis
+    hypotheses : iterable of Estimate
         All hypotheses: sets of effects that were fitted to the missing force.
     """
     relatives = []

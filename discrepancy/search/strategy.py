@@ -15,15 +15,14 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
 from discrepancy.estimation.ranking import rank_by_missing_force
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
-from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import can_estimate_forces
-from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from . import other_optima
@@ -57,14 +56,14 @@ class Search(FittedCandidates):
     wide_problem : Problem or None
         The problem under the wider noise of `wide_fits`, which is as large as the residuals of the
         best hypothesis.
-    force_hypotheses : list of ForceHypothesis
+    force_estimates : list of Estimate
         The sets of effects that were fitted to the missing force, the most probable first.
     """
 
     screened_gains: dict[str, float] = field(default_factory=dict)
     on_progress: OnProgress = ignore_progress
     wide_problem: Problem | None = None
-    force_hypotheses: list[ForceHypothesis] = field(init=False, default_factory=list)
+    force_estimates: list[Estimate] = field(init=False, default_factory=list)
 
     @cached_property
     def force_search(self) -> ForceSearch | None:
@@ -198,14 +197,14 @@ class Search(FittedCandidates):
         point = self.problem.prior_mean_point(base.candidate)
         force_search = self.force_search if self.is_all_in_motion else None
         if force_search is not None:
-            hypothesis = force_search.hypothesis_of_all_ports
+            hypothesis = force_search.estimate_without_effects
             if base.candidate.terms:
-                with_effects = force_search.fit_along_motion(
+                with_effects = force_search.estimate_effects(
                     hypothesis, base.candidate, base.effect
                 )
                 # without the effects if they cannot act along the motion
                 hypothesis = with_effects or hypothesis
-            point = force_search.point_with_effects(hypothesis)
+            point = force_search.point(hypothesis)
         return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
 
     def _fit_from_starts(
@@ -351,10 +350,10 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        self.force_hypotheses = rank_by_missing_force(force_search, self.effects, self.on_progress)
+        self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
         # fit the most probable sets to the readings, each from its estimate by the missing force
         eligible_hypotheses = []
-        for hypothesis in self.force_hypotheses:
+        for hypothesis in self.force_estimates:
             candidate = hypothesis.candidate
             # a law of free shape together with another law could fit nearly anything
             is_family_in_set = candidate.has_free_shape and len(candidate.terms) > 1
@@ -369,7 +368,7 @@ class Search(FittedCandidates):
             probable_hypotheses[: SEARCH.most_far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} until it converges",
         ):
-            start = force_search.point_with_effects(hypothesis)
+            start = force_search.point(hypothesis)
             fit = try_fit(self.problem, hypothesis.candidate, start)
             if fit is not None:
                 self.record_fit(fit, exact=True)
@@ -400,10 +399,10 @@ class Search(FittedCandidates):
         if self._is_in_optimum_of_estimate(leading_fit):
             return
         (leading_term,) = leading_fit.candidate.terms
-        for hypothesis in other_optima.canonical_relatives(leading_term, self.force_hypotheses):
+        for hypothesis in other_optima.canonical_relatives(leading_term, self.force_estimates):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
-            start = force_search.point_with_effects(hypothesis)
+            start = force_search.point(hypothesis)
             for point in other_optima.points_at_other_magnitudes(self.problem, candidate, start):
                 fit = try_fit(self.problem, candidate, point)
                 if fit is None:
@@ -427,9 +426,8 @@ class Search(FittedCandidates):
             return False
         return any(
             hypothesis.candidate.key == fit.candidate.key
-            and hypothesis.speed_window is not None
             and np.abs(hypothesis.effect - fit.effect).max() < SEARCH.same_optimum_deviation
-            for hypothesis in self.force_hypotheses
+            for hypothesis in self.force_estimates
         )
 
     def add_effects(self) -> None:

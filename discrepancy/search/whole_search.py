@@ -64,7 +64,7 @@ def search(
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
-        start = result.force_search.point_with_effects(result.force_search.hypothesis_of_all_ports)
+        start = result.force_search.point(result.force_search.estimate_without_effects)
         second_fit = try_fit(problem, Candidate(), start)
         least_gain = SEARCH.least_gain_to_fit
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:

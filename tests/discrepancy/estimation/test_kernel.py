@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
-from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
-from discrepancy.missing_force.kalman import respond_to_inputs
+from discrepancy.estimation.kernel import (
+    filter_record,
+    respond_to_drift,
+    smooth_record,
+    substep_matrices_with_laws,
+)
+from discrepancy.estimation.steps import respond_to_inputs
 
 PARTS, SAMPLES, STATES, CHANNELS, WIDTH = 2, 6, 3, 2, 3
 STAMPS = PARTS * (SAMPLES - 1) + 1
@@ -48,9 +53,25 @@ def joint(record):
     return forcing, whole, np.array(matrix), np.array(left)
 
 
+KINDS = np.arange(-1, STAMPS - 1)
+"""Each step is of its own kind; no step leads to the first stamp."""
+
+
+def filtered(record, *, keeps_states):
+    """Return what the filter gives for a record, and the part of the state that the weights determine."""
+    transition, noise, drift, rows, columns, used, covariance, mean = record
+    known = respond_to_drift(KINDS, transition, drift, mean)
+    random_part = columns - np.einsum("kcn,knw->kcw", rows, known[::PARTS])
+    start = np.zeros((STATES, WIDTH))
+    result = filter_record(
+        PARTS, KINDS, transition, noise, rows, random_part, used, covariance, start, keeps_states
+    )
+    return known, result
+
+
 def test_innovations_give_the_density_of_all_readings(record):
-    *steps, rows, columns, used, covariance, mean = record
-    _, _, innovations, _, variances = filter_record(PARTS, *steps, rows, columns, used, covariance, mean)
+    used = record[5]
+    _, (innovations, _, variances, _, _) = filtered(record, keeps_states=False)
     forcing, whole, matrix, left = joint(record)
     readings = matrix @ whole @ matrix.T + np.eye(len(matrix))
     residual = left - matrix @ forcing
@@ -61,18 +82,17 @@ def test_innovations_give_the_density_of_all_readings(record):
 
 
 def test_the_smoother_gives_mean_and_variance_of_all_states(record):
-    *steps, rows, columns, used, covariance, mean = record
+    transition, _, _, rows, _, used, *_ = record
     weights = np.array([1.0, -0.4, 0.7])
-    means, covariances, innovations, gains, variances = filter_record(
-        PARTS, *steps, rows, columns, used, covariance, mean
-    )
+    known, (innovations, gains, variances, means, covariances) = filtered(record, keeps_states=True)
     smoothed, variance = smooth_record(
-        PARTS, steps[0], rows, used, means @ weights, covariances, innovations @ weights, gains, variances
-    )
+        PARTS, KINDS, transition, rows, used, innovations @ weights, gains, variances,
+        means @ weights, covariances,
+    )  # fmt: skip
     forcing, whole, matrix, left = joint(record)
     gain = whole @ matrix.T @ np.linalg.inv(matrix @ whole @ matrix.T + np.eye(len(matrix)))
     expected = forcing @ weights + gain @ (left - matrix @ forcing) @ weights
-    np.testing.assert_allclose(smoothed.ravel(), expected, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose((known @ weights + smoothed).ravel(), expected, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(variance.ravel(), np.diag(whole - gain @ matrix @ whole), rtol=1e-7, atol=1e-9)
 
 

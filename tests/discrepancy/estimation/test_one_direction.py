@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.ranking import rank_by_missing_force
-from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.model_choice import load_model
 from discrepancy.workflow import check_and_prepare, problem_without_wrong_ends
 from tests.discrepancy.rigs import chosen
@@ -82,7 +82,7 @@ def search(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
 
 def test_a_recorded_speed_moves_the_port_from_the_first_sample_on(search: ForceSearch) -> None:
     """Dry friction acts at any speed, so that a first speed of zero would leave it out there."""
-    trial = search.hypothesis_of_all_ports.linear_trials.trials[0]
+    trial = search.estimate_without_effects.trials[0].trial
 
     assert trial.port_speeds[0, 0] == pytest.approx(0.3 / (1.0 + np.exp(7.0)), rel=1e-6)
 
@@ -101,7 +101,7 @@ def test_friction_in_one_direction_is_estimated_in_its_size(search: ForceSearch)
 def test_a_missing_force_varies_within_the_record(search: ForceSearch) -> None:
     """One with a longer correlation time would be a constant, which trades places with the law."""
     effects = chosen("coulomb_friction", "quadratic_damping")
-    duration = float(np.ptp(search.hypothesis_of_all_ports.linear_trials.trials[0].time))
+    duration = float(np.ptp(search.estimate_without_effects.trials[0].trial.time))
 
     estimates = rank_by_missing_force(search, effects)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from benchmarks.pushed_axis import DAMPING, FRICTION, MASS, axis_model, pushed_axis
+from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation import ranking
-from discrepancy.estimation.refinement import estimate_hypothesis
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.workflow import problem_without_wrong_ends
 from tests.discrepancy.rigs import chosen
 
@@ -22,47 +22,51 @@ def search() -> ForceSearch:
     return ForceSearch(problem_without_wrong_ends(pushed_axis(600), axis_model()))
 
 
-def friction_of(search: ForceSearch, hypothesis: ForceHypothesis) -> float:
+def friction_of(search: ForceSearch, estimate: Estimate) -> float:
     """Return the force of the dry friction of a hypothesis [N]."""
-    (term,) = hypothesis.candidate.terms
-    (law,) = term.patch(search.problem.setting, hypothesis.effect)
+    (term,) = estimate.candidate.terms
+    (law,) = term.patch(search.problem.setting, estimate.effect)
     return float(law.coefficient)
 
 
-def assert_values_of_the_truth(search: ForceSearch, hypothesis: ForceHypothesis) -> None:
+def shared_values_of_linearisation(estimate: Estimate) -> FloatArray:
+    """Return mass and damping about which the trials of an estimate are linear."""
+    return estimate.trials[0].trial.linearisation_point[:2]
+
+
+def assert_values_of_the_truth(search: ForceSearch, estimate: Estimate) -> None:
     """Check friction, mass and damping, the last two as shared unknowns."""
-    assert friction_of(search, hypothesis) == pytest.approx(FRICTION, rel=5e-3)
+    assert friction_of(search, estimate) == pytest.approx(FRICTION, rel=5e-3)
     # in trials that are linear about the unknowns without friction, the damping is off by 0.35
-    np.testing.assert_allclose(hypothesis.shared, TRUE_UNKNOWNS, atol=0.08)
+    np.testing.assert_allclose(estimate.shared, TRUE_UNKNOWNS, atol=0.08)
 
 
 @pytest.fixture(scope="module")
-def estimated(search: ForceSearch) -> ForceHypothesis:
-    """Return the estimate of dry friction, from a fit along the motion of the missing force."""
+def estimated(search: ForceSearch) -> Estimate:
+    """Return the estimate of dry friction, which begins at the estimate without effects."""
     (effect,) = chosen("coulomb_friction")
     candidate = Candidate((EffectTerm(effect, "slide"),))
-    along = search.fit_along_motion(search.hypothesis_of_all_ports, candidate, np.array([2.0]))
-    assert along is not None
-    hypothesis = estimate_hypothesis(search, along)
-    assert hypothesis is not None
-    return hypothesis
+    estimate = search.estimate_effects(search.estimate_without_effects, candidate, np.array([2.0]))
+    assert estimate is not None
+    return estimate
 
 
 def test_values_are_true_though_the_search_is_linear_about_others(
-    search: ForceSearch, estimated: ForceHypothesis
+    search: ForceSearch, estimated: Estimate
 ) -> None:
     """Without friction the mass and the damping come out wrong, and the trials are linear about that."""
-    assert np.abs(search.point.shared - TRUE_UNKNOWNS).max() > 0.5
+    first_values = shared_values_of_linearisation(search.estimate_without_effects)
+    assert np.abs(first_values - TRUE_UNKNOWNS).max() > 0.5
     assert_values_of_the_truth(search, estimated)
 
 
-def test_the_trials_of_an_estimate_are_linear_about_its_own_values(estimated: ForceHypothesis) -> None:
-    about = estimated.linear_trials.trials[0].linearisation_point[:2]
+def test_the_trials_of_an_estimate_are_linear_about_its_own_values(estimated: Estimate) -> None:
+    about = shared_values_of_linearisation(estimated)
     assert np.all(np.abs(about - estimated.shared) < 0.1)
 
 
 def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -> None:
-    trial = search.hypothesis_of_all_ports.linear_trials.trials[0]
+    trial = search.estimate_without_effects.trials[0].trial
     thinned = trial.thinned(3, trial.substeps)
     np.testing.assert_array_equal(thinned.residual, trial.residual[::3])
     count = len(thinned.fine_time)
@@ -84,13 +88,13 @@ def records_count_as_long(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_long_records_are_thinned_for_the_ranking(search: ForceSearch) -> None:
     thinned = ranking.search_in_thinned_records(search)
     assert thinned is not None
-    assert [trial.stride for trial in thinned.hypothesis_of_all_ports.linear_trials.trials] == [3, 3]
+    assert [trial.trial.stride for trial in thinned.estimate_without_effects.trials] == [3, 3]
 
 
 @pytest.mark.usefixtures("records_count_as_long")
-def test_hypotheses_of_long_records_are_estimated_in_all_samples(search: ForceSearch) -> None:
-    hypotheses = ranking.rank_by_missing_force(search, chosen("coulomb_friction", "quadratic_damping"))
-    assert hypotheses[0].candidate.identifiers == ("coulomb_friction",)
-    for hypothesis in hypotheses:
-        assert {trial.stride for trial in hypothesis.linear_trials.trials} == {1}
-    assert_values_of_the_truth(search, hypotheses[0])
+def test_effects_of_long_records_are_estimated_in_all_samples(search: ForceSearch) -> None:
+    estimates = ranking.rank_by_missing_force(search, chosen("coulomb_friction", "quadratic_damping"))
+    assert estimates[0].candidate.identifiers == ("coulomb_friction",)
+    for estimate in estimates:
+        assert {trial.trial.stride for trial in estimate.trials} == {1}
+    assert_values_of_the_truth(search, estimates[0])

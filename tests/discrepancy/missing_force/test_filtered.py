@@ -8,15 +8,17 @@ from scipy.linalg import expm
 
 from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
+from discrepancy.estimation.estimate import estimate_of_processes
+from discrepancy.estimation.filtered import FilteredTrial
+from discrepancy.estimation.force_states import Process
+from discrepancy.estimation.linearisation import plain_linearisation
+from discrepancy.estimation.ported_trial import correlated_noise_part
+from discrepancy.estimation.regression import Regression
+from discrepancy.estimation.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
-from discrepancy.missing_force.explained import fit_missing_forces
-from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, sum_regressions
-from discrepancy.missing_force.linear_trials import LinearTrials
-from discrepancy.missing_force.ported_trial import correlated_noise_part
 from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
-from discrepancy.missing_force.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
@@ -32,11 +34,19 @@ def gaussian(covariance, readings):
     return -0.5 * (quadratic + np.linalg.slogdet(covariance)[1])
 
 
-def evidence(filtered):
-    """Return the log evidence of a trial's residuals."""
-    trial = filtered.trial
-    found = sum_regressions([filtered], [np.concatenate((trial.residual[None], trial.local_derivatives))])
-    return -0.5 * found.products[0, 0] - found.half_log_determinant
+def alone(trial):
+    """Return a trial without shared unknowns as one linear model."""
+    return plain_linearisation([trial], np.zeros(0))
+
+
+def filtered(trial, process):
+    """Return the filter of a trial with a missing force at its port."""
+    return FilteredTrial(alone(trial).trials[0], {0: process})
+
+
+def evidence(trial, process):
+    """Return the log evidence of a trial's residuals with a missing force at its port."""
+    return alone(trial).solve({0: process}).log_evidence
 
 
 FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
@@ -123,7 +133,6 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     trial = trial_of(
         time, residual, used=used, local=local, coloured=[ColouredNoise(0, share, 12.0)] if share else ()
     )
-    filtered = ForceFilter(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
     noise = np.kron(share * np.exp(-12.0 * np.abs(time[:, None] - time)), np.diag([1.0, 0.0]))
@@ -131,56 +140,68 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     flat = local.reshape(unknown, 80)
     covariance = (covariance + noise + flat.T @ flat)[np.ix_(at, at)]
     readings = residual.ravel()[at]
-    assert evidence(filtered) == pytest.approx(gaussian(covariance, readings), abs=0.05 if rough else 0.02)
-    if unknown:  # trials of one system and grid are filtered together, and tell what each tells
-        rows = np.concatenate((residual[None] * used, local))
-        both, *each = (
-            sum_regressions([filtered] * len(of), of) for of in ([rows, 2.0 * rows], [rows], [2.0 * rows])
-        )
-        np.testing.assert_allclose(both.products, each[0].products + each[1].products, rtol=1e-9)
-        assert both.half_log_determinant == pytest.approx(
-            sum(one.half_log_determinant for one in each), rel=1e-9
-        )
+    assert evidence(trial, process) == pytest.approx(
+        gaussian(covariance, readings), abs=0.05 if rough else 0.02
+    )
+    if unknown:
         return
-    _, (force,), (deviation,), _ = filtered.smooth(trial.residual)
+    states, variances = filtered(trial, process).smooth_residual(trial.residual)
+    force, deviation = (filtered(trial, process).missing_forces(of)[0] for of in (states, np.sqrt(variances)))
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force, mean, atol=0.02 * process.standard_deviation)
     own = cross[::PARTS, at]
     variance = process.standard_deviation**2 - np.einsum("nk,kn->n", own, np.linalg.solve(covariance, own.T))
-    np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.standard_deviation)
+    np.testing.assert_allclose(deviation[::PARTS], np.sqrt(variance), atol=0.02 * process.standard_deviation)
+
+
+def test_trials_tell_together_what_each_tells():
+    random = np.random.default_rng(3)
+    trials = [
+        trial_of(
+            0.02 * np.arange(40), random.standard_normal((40, 2)), local=random.standard_normal((2, 40, 2))
+        )
+        for _ in range(2)
+    ]
+    together = plain_linearisation(trials, np.zeros(0)).solve({0: PROCESS}).log_evidence
+    assert together == pytest.approx(sum(evidence(trial, PROCESS) for trial in trials), rel=1e-9)
 
 
 def test_steady_gains_are_those_of_every_step():
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
-    filtered = ForceFilter(trial, [(0, PROCESS)])
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(
         jittered, "intervals", SampleIntervals(np.full(900, 0.02), np.arange(900))
     )  # as if each were its own
-    every = ForceFilter(jittered, [(0, PROCESS)])
-    late = [states(one)[0][[200, 899]] for one in (filtered, every)]
-    assert [np.array_equal(*covers) for covers in late] == [True, False]
-    assert evidence(filtered) == pytest.approx(evidence(every), abs=1e-6)
-    for one, other in zip(filtered.smooth(trial.residual), every.smooth(trial.residual), strict=True):
+    assert evidence(trial, PROCESS) == pytest.approx(evidence(jittered, PROCESS), abs=1e-6)
+    for one, other in zip(
+        filtered(trial, PROCESS).smooth_residual(trial.residual),
+        filtered(jittered, PROCESS).smooth_residual(trial.residual),
+        strict=True,
+    ):
         np.testing.assert_allclose(one, other, atol=1e-7)
 
 
-def states(filtered):
-    """Return the states of a trial after each of its samples."""
-    record, which = filtered.record_filter(filtered.trial.residual[None]), filtered.trial.intervals[1]
-    begin = record.initial_state(filtered.state_space.initial_covariance)
-    return record.filter_before(which, 0, begin, np.arange(1, len(which) + 1))
+def test_a_steady_covariance_is_not_computed_anew():
+    """The state of every sample of a long record has the same covariance, to the bit."""
+    random = np.random.default_rng(4)
+    trial = trial_of(0.02 * np.arange(900), random.standard_normal((900, 2)))
+    search = EventSearch(alone(trial), 0, PROCESS)
+    record = SwitchedRecord(search, 0, (PROCESS, PROCESS)).record_filter
+    kinds = np.zeros(900, dtype=np.int64)
+    start = record.initial_state(np.eye(record.output_rows.shape[1]))
+    states = record.filter_before(kinds, 0, start, np.array([200, 899]))
+    np.testing.assert_array_equal(*states.covariance)
 
 
 def test_a_force_of_a_long_correlation_stays_finite():
     """Backwards it would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = ForceFilter(trial, [(0, Process(1.0, 1e-3))])
-    smoothed = filtered.smooth(trial.residual)
-    assert np.isfinite(evidence(filtered))
-    assert np.all(np.isfinite(smoothed.forces))
+    short = Process(1.0, 1e-3)
+    states, _ = filtered(trial, short).smooth_residual(trial.residual)
+    assert np.isfinite(evidence(trial, short))
+    assert np.all(np.isfinite(states))
 
 
 def test_a_pushed_state_follows_its_closed_form():
@@ -233,7 +254,7 @@ def test_the_most_probable_process_is_the_top_of_a_grid(end):
         end, 5.0 * np.sin(8.0 * 0.02 * np.arange(count))
     )
     residual[:, 0] += 4.0 if end == 1 else 0.0
-    view = LinearTrials([trial_of(0.02 * np.arange(count), residual)], np.zeros(0))
+    view = alone(trial_of(0.02 * np.arange(count), residual))
     about = {0: Process(1.0, 0.2)}
     found, value = view.most_probable_processes(about, about)
     times = np.geomspace(*view.correlation_time_range, 16)
@@ -264,7 +285,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
     residual = random.standard_normal((40, 2)) * [3.0, 1.0]
     local = random.standard_normal((1, 40, 2))
     trial = trial_of(time, residual, local=local)
-    search = EventSearch(LinearTrials([trial], np.zeros(0)), 0, EVENT)
+    search = EventSearch(alone(trial), 0, EVENT)
     switched = SwitchedRecord(search, 0, (EVENT, REST))
     starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
     values = switched.evidence_of_stretches(np.zeros(40, dtype=bool), starts, ends)
@@ -283,15 +304,17 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
-def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
+def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_is_missing(settled):
     """Of a settled trial, too, whose state before is what the forces that act make of it."""
     random = np.random.default_rng(3)
     trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), begins_at_rest=settled)
-    search = EventSearch(LinearTrials([trial], np.zeros(0)), 0, EVENT)
-    for on, forces in ((False, [REST]), (True, [EVENT, REST])):
-        wanted = evidence(ForceFilter(trial, [(0, one) for one in forces]))
-        found = search.log_evidence(search.products((EVENT, REST), [np.full(40, on)]))
-        assert found == pytest.approx(wanted, abs=1e-7)
+    search = EventSearch(alone(trial), 0, EVENT)
+    off = search.log_evidence(search.products((EVENT, REST), [np.zeros(40, dtype=bool)]))
+    assert off == pytest.approx(evidence(trial, REST), abs=1e-7)
+    # an event throughout, beside which nothing is missing, is a missing force
+    nothing = replace(REST, standard_deviation=1e-9)
+    on = search.log_evidence(search.products((EVENT, nothing), [np.ones(40, dtype=bool)]))
+    assert on == pytest.approx(evidence(trial, EVENT), abs=1e-6)
 
 
 def event_case(folder, kind, seed):
@@ -448,9 +471,9 @@ def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channel
         trials[1], deviation=trials[1].deviation[::-1],
         system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
     )  # fmt: skip
-    forced = fit_missing_forces(LinearTrials(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
+    forced = estimate_of_processes(plain_linearisation(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
     number, found = _port_or_channel_error(0, forced, names)
-    shown = [trial.system.through[0] != 0.0 for trial in found.linear_trials.trials]
+    shown = [trial.system.through[0] != 0.0 for trial in (item.trial for item in found.trials)]
     assert number == 0
     np.testing.assert_array_equal(shown, [[False, True], [True, False]])
 

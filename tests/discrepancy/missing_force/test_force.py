@@ -15,17 +15,21 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
+from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.force_search import ForceSearch
+from discrepancy.estimation.linearisation import plain_linearisation
+from discrepancy.estimation.log_prior import log_prior
+from discrepancy.estimation.ported_trial import ported_trial
+from discrepancy.estimation.ranking import rank_hypotheses
+from discrepancy.estimation.screen import screen_effects
+from discrepancy.estimation.trajectory import Trajectory
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import log_prior
-from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
 from discrepancy.missing_force.port_force import explained_variance, missing_force
-from discrepancy.missing_force.ported_trial import ported_trial
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
@@ -111,23 +115,22 @@ class RankedLaws:
     """The search for the missing force of a rig, and the laws that may explain it, the best one first."""
 
     search: ForceSearch
-    laws: list[ForceHypothesis]
+    laws: list[Estimate]
 
 
 @once
 def ranked_laws(number):
     """Return the ranking of a rig, each law alone, made once for all tests that ask about it."""
-    with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
-        patch.setattr("discrepancy.missing_force.naming.FOLLOWED_COUNTS", (FOLLOWED_COUNTS[0],))
+    with TemporaryDirectory() as folder:
         problem = blind(Path(folder), number)
         search = ForceSearch(problem)
-        hypotheses = search.rank_hypotheses(available(problem))
+        hypotheses = rank_hypotheses(search, available(problem), largest_set=1)
     return RankedLaws(search, [item for item in hypotheses if item.candidate.terms])
 
 
 @LAWS_OF_RIGS
 def test_a_force_is_most_probable_at_the_port_where_it_acts(number, effect, port):
-    by_port = ranked_laws(number).search.hypothesis_by_port
+    by_port = ranked_laws(number).search.estimate_by_port
     assert max(by_port, key=lambda name: by_port[name].log_evidence) == port
 
 
@@ -140,14 +143,14 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(number, effect, por
     others = [item for item in ranked.laws if item.candidate.terms[0].effect.family != term.effect.family]
     assert (term.effect.identifier, term.place) == (effect, port)
     assert best.log_evidence > others[0].log_evidence + 10.0
-    assert best.log_evidence > ranked.search.hypothesis_of_all_ports.log_evidence + 10.0
+    assert best.log_evidence > ranked.search.estimate_without_effects.log_evidence + 10.0
 
 
 @LAWS_OF_RIGS
 def test_a_fit_that_begins_at_the_values_of_the_best_law_stays_there(number, effect, port):
     ranked = ranked_laws(number)
     best = ranked.laws[0]
-    again = ranked.search.fit_along_motion(best, best.candidate, best.effect)
+    again = ranked.search.polish_effects(best, best.candidate, best.effect)
     deviations = np.sqrt(np.diag(best.effect_covariance))
     np.testing.assert_allclose((again.effect - best.effect) / deviations, 0.0, atol=0.4)
 
@@ -165,7 +168,7 @@ def test_the_best_law_is_most_of_the_gap(number, effect, port):
 def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
     """A dead zone, whose stiffness first sight does not tell; a drag seven deviations above the median."""
     problem = blind(tmp_path, number, 37)
-    best = ForceSearch(problem).rank_hypotheses(chosen(effect))[0]
+    best = rank_hypotheses(ForceSearch(problem), chosen(effect))[0]
     (law,) = at_unit(best.candidate.patch(problem.setting, best.effect))
     for key, value in drawn(number, 37, 64)[2]["values"].items():
         assert getattr(law, key.removeprefix(f"{effect}.")) == pytest.approx(value, rel=0.05)
@@ -185,7 +188,7 @@ def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
     port, *_ = problem.model.ports
     free = Candidate((EffectTerm(friction, port, free_shape=True),))
     force = ForceSearch(problem)
-    law = force.fit_along_motion(force.hypothesis_of_all_ports, free, free.terms[0].start_values())
+    law = force.estimate_effects(force.estimate_without_effects, free, free.terms[0].start_values())
     family = f"a law of the family {friction.family}"
     missing = missing_force(force, law)
     assert missing.law == missing.at_port.law == family
@@ -294,7 +297,7 @@ RIVALS_OF_A_GAIN = chosen("quadratic_damping", "coulomb_friction", "gauge_gain")
 def test_a_rig_without_a_gap_misses_no_force(tmp_path):
     problem = problem_without_gap(tmp_path, 1.0)
     search = ForceSearch(problem)
-    assert missing_force(search, search.hypothesis_of_all_ports) is None
+    assert missing_force(search, search.estimate_without_effects) is None
     verdict = investigate(problem.campaign, problem.model, RIVALS_OF_A_GAIN, thorough=False).verdict
     assert verdict.kind is VerdictKind.NOTHING_MISSING
 
@@ -319,15 +322,15 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
                 iter(
                     ForceSearch(
                         Problem(campaign, item, Setting(campaign, item, scales))
-                    ).hypothesis_by_port.values()
+                    ).estimate_by_port.values()
                 )
             )
             for item in (lumped, fmu)
         )
         assert second.log_evidence == pytest.approx(first.log_evidence, abs=0.5)
-        for one, other in zip(first.motions, second.motions, strict=True):
-            force = one.forces[0]
-            np.testing.assert_allclose(other.forces[0], force, atol=2e-3 * np.ptp(force))
+        for one, other in zip(first.trials, second.trials, strict=True):
+            force = one.lacking_forces[0]
+            np.testing.assert_allclose(other.lacking_forces[0], force, atol=2e-3 * np.ptp(force))
     # of one whose system is not known no force is seen
     unknown = ("isolated = false", "isolated = false\nsuperposition = false")
     with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))) as fmu:
@@ -336,11 +339,11 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
 
 
 def drawn_through(search, effect, place):
-    """Return an effect along the missing force, from where it is first seen."""
+    """Return the estimate of an effect, from where it is first seen."""
     term = EffectTerm(effect, place)
-    base = search.hypothesis_of_all_ports
-    start = next(item for item in search.screen_effects(base, [effect]) if item[1] == term)[2][0]
-    return search.fit_along_motion(base, Candidate((term,)), start)
+    base = search.estimate_without_effects
+    start = next(item for item in screen_effects(search, base, [effect]) if item[1] == term)[2][0].effect
+    return search.estimate_effects(base, Candidate((term,)), start)
 
 
 @pytest.mark.parametrize("high", [3.0, 1.05])
@@ -372,12 +375,16 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, numb
         trial = ported_trial(problem, 0, Point(shared, point.local, point.effect))
         return trial.readings_of_state(trial.state_under_force(0, forces[0]), forces)
 
+    # the readings of the linear trial by a unit of each shared unknown, along the forced motion
     added = here.state_under_force(0, forces[0])
-    slopes = {k: item for k, item in enumerate(here.system_derivatives) if item is not None}
-    assert slopes
-    for k, slope in slopes.items():
+    bare = plain_linearisation([here], problem.shared.precision).trials[0]
+    trajectory = Trajectory(added, here.port_positions, here.port_speeds, forces)
+    forced = replace(bare, trajectory=trajectory)
+    changed = [k for k, item in enumerate(here.system_derivatives) if item is not None]
+    assert changed
+    for k in changed:
         expected = (shown(k, 1e-3) - shown(k, -1e-3)) / 2e-3
-        found = here.change_by_system_parameter(slope, added, forces).readings
+        found = bare.columns[:, :, 1 + k] - forced.columns[:, :, 1 + k]
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 
@@ -389,10 +396,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     write_drive(tmp_path)
     problem = read(tmp_path)
     search = ForceSearch(problem)
-    base = search.hypothesis_of_all_ports
-    screened = search.screen_effects(base, available(problem))[:6]
-    found = [search.fit_along_motion(base, Candidate((term,)), start) for _, term, (start, *_) in screened]
-    best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.log_evidence)
+    best, *_ = rank_hypotheses(search, available(problem), largest_set=1)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
     (friction,) = best.candidate.patch(problem.setting, best.effect)

@@ -12,7 +12,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from reporting.arrays import LEAST_DIVISOR
 
-from .filtered import Process
+from .force_states import Process
 
 Processes = Mapping[int, Process]
 """Missing forces as processes, by the numbers of their ports."""
@@ -282,3 +282,41 @@ def logarithms(processes: Processes) -> FloatArray:
     return np.log(
         [(process.standard_deviation, process.correlation_time) for process in processes.values()]
     )
+
+
+def scale_processes(
+    processes: Processes, size_factor: float, time_factor: float
+) -> dict[int, Process]:
+    """Return processes with their sizes and correlation times multiplied by factors.
+
+    Parameters
+    ----------
+    processes : mapping of int to Process
+        The processes, by the number of the port.
+    size_factor, time_factor : float
+        The factors on all standard deviations and on all correlation times.
+    """
+    scaled_processes = {}
+    for port, process in processes.items():
+        scaled_processes[port] = replace(
+            process,
+            standard_deviation=process.standard_deviation * size_factor,
+            correlation_time=process.correlation_time * time_factor,
+        )
+    return scaled_processes
+
+
+def processes_within_range(
+    processes: Processes, time_range: tuple[float, float]
+) -> dict[int, Process]:
+    """Return processes whose correlation times are clipped to a range [s].
+
+    A force that stays the same throughout the records is a constant, not a process.
+    """
+    shortest, longest = time_range
+    return {
+        port: replace(
+            process, correlation_time=min(max(process.correlation_time, shortest), longest)
+        )
+        for port, process in processes.items()
+    }

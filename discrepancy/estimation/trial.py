@@ -7,8 +7,7 @@ forces add to it (`system_derivatives`); both together are exact along the actua
 
 Terms and shapes: a port is a place where a force can act. An interval between two of the N samples
 is divided into substeps; their ends are the F = (N - 1) substeps + 1 fine stamps. The added
-state (F, n) is the state of the linear system that forces at ports add to the model's response. A
-column is the change of the readings (N, C) for a unit of one unknown.
+state (F, n) is the state of the linear system that forces at ports add to the model's response.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.time_history import subdivide
 
-from .kalman import respond_to_inputs, state_under_inputs
+from .steps import respond_to_inputs, state_under_inputs
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """The forces by port of a trial in which no force acts: an empty mapping."""
@@ -96,38 +95,6 @@ class SubstepMatrices(NamedTuple):
     transitions: FloatArray
     by_input_at_begin: FloatArray
     by_input_at_end: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class TrialColumn:
-    """The change of a trial for a unit of one unknown, such as the amplitude of an effect.
-
-    Attributes
-    ----------
-    readings : (N, C) ndarray
-        The change of the readings, divided by the noise deviations.
-    added_state : (F, n) ndarray or None
-        The change of the added state; None if it does not change.
-    forces : mapping of int to (F,) ndarray
-        The change of the force at each port, by the number of the port [N, N m or the port's flow].
-    """
-
-    readings: FloatArray
-    added_state: FloatArray | None = None
-    forces: Mapping[int, FloatArray] = field(default_factory=dict)
-
-    def plus(self, other_column: "TrialColumn", factor: float) -> "TrialColumn":
-        """Return the sum of this column and another one that is multiplied by `factor`."""
-        forces = dict(self.forces)
-        for port, force in other_column.forces.items():
-            forces[port] = forces.get(port, 0.0) + factor * force
-        if other_column.added_state is None:
-            added_state = self.added_state
-        elif self.added_state is None:
-            added_state = factor * other_column.added_state
-        else:
-            added_state = self.added_state + factor * other_column.added_state
-        return TrialColumn(self.readings + factor * other_column.readings, added_state, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,46 +283,6 @@ class PortedTrial:
         if self.begins_at_rest and force[0] != 0.0:
             start = np.linalg.lstsq(self.system.generator, -direction * force[0], rcond=1e-12)[0]
         return self._state_under_inputs(start, direction[:, None], force[:, None])
-
-    def change_by_system_parameter(
-        self,
-        system_derivative: PortedSystem,
-        added_state: FloatArray,
-        forces: Mapping[int, FloatArray],
-    ) -> TrialColumn:
-        """Return the change of the trial for a unit of a parameter that changes the system itself.
-
-        The added state s of `PortedSystem` obeys ds/dt = A s - b g. The derivative of this equation
-        by the parameter p is an equation for the sensitivity z = ds/dp:
-
-            dz/dt = A z + u,  u = dA/dp s - db/dp g.
-
-        Parameters
-        ----------
-        system_derivative : PortedSystem
-            The derivative of the system by the parameter, with dA/dp and db/dp.
-        added_state : (F, n) array
-            The state s that missing forces and laws add, at the fine stamps.
-        forces : mapping of int to (F,) array
-            The forces g at ports that add it, by the number of the port.
-        """
-        inputs = added_state @ system_derivative.generator.T
-        for port, force in forces.items():
-            inputs -= np.outer(force, system_derivative.actions[port])
-        start = np.zeros(len(system_derivative.generator))
-        if self.begins_at_rest:
-            # equilibrium A z + u = 0; a rigid motion makes A singular, hence least squares
-            start = -np.linalg.lstsq(self.system.generator, inputs[0], rcond=1e-12)[0]
-        # each input acts on one state; inputs that are zero throughout are left out for speed
-        driven_states = np.flatnonzero(np.any(inputs, axis=0))
-        directions = np.eye(len(start))[:, driven_states]
-        sensitivity = self._state_under_inputs(start, directions, inputs[:, driven_states])
-        # the parameter changes the readings by the state, and by the output equation itself
-        readings_by_output_equation = self.divide_by_noise(
-            self.outputs_of_state(system_derivative, added_state, forces)
-        )
-        readings = self.readings_of_state(sensitivity) + readings_by_output_equation
-        return TrialColumn(readings, sensitivity)
 
     def _state_under_inputs(
         self,

@@ -1,6 +1,5 @@
-"""A hypothesis that is fitted along the missing force: effects, remaining force and motion."""
+"""A hypothesis at its most probable values: effects, motion, missing forces and evidence."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,9 +8,10 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
 
-from .filtered import Solution
-from .linear_trials import LinearTrials, TrialMotion
-from .process_search import MOST_STEPS, Processes
+from .filtered import SmoothedTrial
+from .linearisation import Linearisation
+from .process_search import MOST_STEPS, Processes, scale_processes
+from .regression import Solution
 
 NO_EFFECTS = Candidate()
 """The candidate without effects."""
@@ -20,69 +20,76 @@ NO_EFFECT_VALUES = np.zeros(0)
 HIDDEN_SHARE = 0.5
 """Share of the unexplained force that may look like a law of the hypothesis. Without it, the
 intervals of a weaker law contain only 4 of 9 true values."""
+NEGLIGIBLE_SIZE = 1e-9
+"""Factor on the size of a missing force that stands for none: a process of size zero is
+singular."""
 
 
 @dataclass(frozen=True, eq=False)
-class ForceHypothesis:
-    """A hypothesis that is fitted to the missing force, with effects along the estimated motion.
+class Estimate:
+    """A hypothesis at its most probable values, estimated together with the motion of the trials.
 
     Attributes
     ----------
     candidate : Candidate
         The effects; without any, all of the force is missing.
-    effect : (E,) array
+    effect : (E,) ndarray
         The scaled effect parameters, with standard normal prior.
+    shared : (K,) ndarray
+        The scaled unknowns that all trials share.
+    conditional_covariance : (K + E, K + E) ndarray
+        The covariance of shared unknowns and effect parameters, given the missing force's process.
     processes : mapping of int to Process
         The forces that remain missing with the effects, by the numbers of their ports.
     log_evidence : float
         The log evidence, with the prior of the processes [nat].
-    linear_trials : LinearTrials
-        The trials, with the columns of the effects.
-    solution : Solution
-        The K shared unknowns, then the E effect parameters.
-    local : sequence of (L,) array
-        The unknowns of each trial alone.
-    motions : sequence of TrialMotion
-        The motion of each trial.
-    speed_window : float or None
+    trials : tuple of SmoothedTrial
+        The motion and the forces of each trial.
+    linearisation : Linearisation
+        The trials, linear about the values of the last step.
+    speed_window : float
         The half width of the window of speeds over which laws of the speed are averaged, divided by
-        the rms speed, if effects and motion were estimated together; else None.
+        the rms speed.
+    converged : bool
+        Whether the last step was short enough.
     """
 
     candidate: Candidate
     effect: FloatArray
+    shared: FloatArray
+    conditional_covariance: FloatArray
     processes: Processes
     log_evidence: float
-    linear_trials: LinearTrials
-    solution: Solution
-    local: Sequence[FloatArray]
-    motions: Sequence[TrialMotion]
-    speed_window: float | None = None
+    trials: tuple[SmoothedTrial, ...]
+    linearisation: Linearisation
+    speed_window: float = 0.0
+    converged: bool = True
+
+    @property
+    def local(self) -> tuple[FloatArray, ...]:
+        """The unknowns (L,) of each trial alone."""
+        return tuple(smoothed_trial.local for smoothed_trial in self.trials)
 
     @property
     def effect_covariance(self) -> FloatArray:
         """The covariance (E, E) of the effect parameters, given the missing force's process."""
-        first_effect = len(self.linear_trials.shared_precision)
-        return self.solution.covariance[first_effect:, first_effect:]
+        first_effect = len(self.shared)
+        return self.conditional_covariance[first_effect:, first_effect:]
+
+    @property
+    def solution(self) -> Solution:
+        """The shared unknowns, then the effect parameters, with the log evidence."""
+        return Solution(
+            log_evidence=self.log_evidence,
+            mean=np.concatenate((self.shared, self.effect)),
+            covariance=self.conditional_covariance,
+        )
 
     @cached_property
-    def shared(self) -> FloatArray:
-        """The conditional mean (K,) of the shared unknowns given the effect parameters `effect`.
-
-        It differs from the mean of the solution if the iteration ended before `effect` reached that
-        mean.
-        """
-        first_effect = len(self.linear_trials.shared_precision)
-        mean = self.solution.mean
-        covariance = self.solution.covariance
-        if not len(self.effect):
-            return mean[:first_effect]
-        # conditional mean of a joint Gaussian: m_s + C_se C_ee^-1 (effect - m_e)
-        residual = self.effect - mean[first_effect:]
-        weighted_residual = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
-        return np.asarray(
-            mean[:first_effect] + covariance[:first_effect, first_effect:] @ weighted_residual
-        )
+    def log_evidence_without_force(self) -> float:
+        """The log evidence of the same trials and laws if no force is missing [nat]."""
+        no_force = scale_processes(self.processes, NEGLIGIBLE_SIZE, 1.0)
+        return self.linearisation.solve(no_force).log_evidence
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -92,14 +99,14 @@ class ForceHypothesis:
         its force depends on the motion, and a part of it may look like the laws of the hypothesis.
         The rms of this hidden part is taken as `HIDDEN_SHARE` times that of the unexplained force.
         """
-        covariance = self.solution.covariance
+        covariance = self.conditional_covariance
         if not len(self.effect):
             return covariance
-        first_effect = len(self.linear_trials.shared_precision)
         added_covariance = self._covariance_of_hidden_force()
-        effect_covariance = covariance[first_effect:, first_effect:]
         # all unknowns follow the effect parameters by their regression on these
-        regression = np.linalg.lstsq(effect_covariance, covariance[first_effect:], rcond=None)[0].T
+        regression = np.linalg.lstsq(
+            self.effect_covariance, covariance[len(self.shared) :], rcond=None
+        )[0].T
         return np.asarray(covariance + regression @ added_covariance @ regression.T)
 
     def _covariance_of_hidden_force(self) -> FloatArray:
@@ -134,62 +141,54 @@ class ForceHypothesis:
 
         T is the number of samples of all trials together.
         """
+        first_effect = len(self.shared)
         by_trial = []
-        for number, trial in enumerate(self.linear_trials.trials):
-            no_force = np.zeros(len(trial.fine_time))
-            forces = [
-                column[number].forces.get(port, no_force)
-                for column in self.linear_trials.effect_columns
-            ]
-            by_trial.append(np.array([np.asarray(force)[:: trial.substeps] for force in forces]))
+        for linear_trial in self.linearisation.trials:
+            trial = linear_trial.trial
+            forces = np.zeros((len(self.effect), len(trial.time)))
+            if port in linear_trial.forces:
+                for unknown, force in linear_trial.forces[port].by_unknown.items():
+                    if unknown >= first_effect:
+                        forces[unknown - first_effect] = force[:: trial.substeps]
+            by_trial.append(forces)
         return np.concatenate(by_trial, axis=-1)
 
 
-def fit_missing_forces(
-    linear_trials: LinearTrials,
+def estimate_of_processes(
+    linearisation: Linearisation,
     median_processes: Processes,
     initial_processes: Processes,
-    candidate: Candidate = NO_EFFECTS,
-    effect: FloatArray = NO_EFFECT_VALUES,
     *,
     skip_grid: bool = False,
     most_steps: int = MOST_STEPS,
-) -> ForceHypothesis:
-    """Fit a hypothesis to the trials: its missing forces, the motion, and the shared unknowns.
-
-    The standard deviation and correlation time of each missing force are the most probable ones.
+) -> Estimate:
+    """Return the estimate of trials without effects, with the most probable missing forces.
 
     Parameters
     ----------
-    linear_trials : LinearTrials
-        The trials in motion as one linear model, with the columns of the effects: the changes of
-        the readings for a unit of each effect parameter.
+    linearisation : Linearisation
+        The trials, along a motion that was estimated before.
     median_processes : mapping of int to Process
         The prior medians of the missing forces, by the numbers of their ports.
     initial_processes : mapping of int to Process
-        The missing forces with which the search for the most probable missing forces begins.
-    candidate : Candidate
-        The effects of the hypothesis, each at its place.
-    effect : (E,) array
-        The effect parameters about which the trials are linear, on the scale on which their priors
-        are standard normal.
+        The missing forces with which the search for the most probable ones begins.
     skip_grid : bool
         Whether the search begins at `initial_processes`. Otherwise it begins at the best point of a
         grid of standard deviations and correlation times around `initial_processes`.
     most_steps : int
         The largest number of steps of Newton's method in the search for the missing forces.
     """
-    processes, log_evidence = linear_trials.most_probable_processes(
+    processes, log_evidence = linearisation.most_probable_processes(
         median_processes, initial_processes, skip_grid=skip_grid, most_steps=most_steps
     )
-    motion_estimate = linear_trials.smooth(processes)
-    return ForceHypothesis(
-        candidate=candidate,
-        effect=effect,
+    solution, smoothed_trials = linearisation.solve_and_smooth(processes)
+    return Estimate(
+        candidate=NO_EFFECTS,
+        effect=NO_EFFECT_VALUES,
+        shared=solution.mean,
+        conditional_covariance=solution.covariance,
         processes=processes,
         log_evidence=log_evidence,
-        linear_trials=linear_trials,
-        solution=motion_estimate.solution,
-        local=motion_estimate.local,
-        motions=motion_estimate.motions,
+        trials=smoothed_trials,
+        linearisation=linearisation,
     )

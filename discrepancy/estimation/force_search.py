@@ -1,0 +1,590 @@
+"""The missing forces of a problem at the ports of its model, and estimates of effects instead.
+
+A force is missing at one port, at several, or at one with jumps. An effect takes a part of it: the
+effects and the motion are estimated together, beginning at the estimate without them.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
+from discrepancy.fits.problem import Problem
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
+
+from .effects import HALF_DIFFERENCE, EffectLaws
+from .estimate import NO_EFFECT_VALUES, NO_EFFECTS, Estimate, estimate_of_processes
+from .estimator import USUAL_WINDOW, MotionEstimator
+from .force_states import Process
+from .gauss_newton import EstimatorStart, GaussNewton, linearise_trials, start_from_estimate
+from .linearisation import Linearisation, plain_linearisation
+from .log_prior import log_prior
+from .ported_trial import ported_trial, thin_trial
+from .process_search import Processes, scale_processes
+from .trajectory import Trajectory
+from .trial import PortedTrial
+
+MOST_PORTS = 4
+"""Largest number of ports at which forces are missing at once."""
+FURTHER_PORT_FACTOR = 0.1
+"""Factor on the standard deviation of a missing force as estimated at its port alone. The search
+for the forces at all ports together begins with the product. At the best port the factor is one."""
+MOST_LINEARISATIONS = 3
+"""Largest number of times that the trials are linearised about the unknowns of an estimate."""
+SAME_POINT = 0.1
+"""Change of all shared unknowns, in prior standard deviations, below which the trials are not
+linearised again."""
+WIDE_WINDOW = 0.1
+"""Half width of the window of speeds where the model's own laws are linear along a first motion."""
+
+
+def can_estimate_forces(problem: Problem) -> bool:
+    """Return whether missing forces can be estimated in a problem.
+
+    That needs trials in motion, and a model that describes how its ports move.
+    """
+    model = problem.model
+    has_motion = any(data.trial.is_dynamic for data in problem.trials)
+    return has_motion and model.shows_ports and bool(model.ports)
+
+
+@dataclass(frozen=True, eq=False)
+class TrialSet:
+    """Some trials in motion of a problem, from which linear systems with ports and laws are made.
+
+    Attributes
+    ----------
+    problem : Problem
+        The campaign and the model without its own laws, with the layout of their unknowns.
+    trial_indices : sequence of int
+        The indices of the trials in the problem.
+    evaluate_model_laws : callable
+        The function that takes the shared unknowns (K,) and returns the model's own laws at ports.
+    unknowns_of_model_laws : tuple of int
+        The numbers of the shared unknowns that change the model's own laws.
+    sample_limit : int or None
+        The number of samples of all trials together to which trials are thinned, if they can be.
+    """
+
+    problem: Problem
+    trial_indices: Sequence[int]
+    evaluate_model_laws: Callable[[FloatArray], ModelPatch]
+    unknowns_of_model_laws: tuple[int, ...]
+    sample_limit: int | None = None
+
+    def with_problem(self, problem: Problem, trial_indices: Sequence[int]) -> "TrialSet":
+        """Return all samples of other trials, with the same model."""
+        return replace(self, problem=problem, trial_indices=trial_indices, sample_limit=None)
+
+    def trials_about(self, point: Point) -> tuple[PortedTrial, ...]:
+        """Return the trials as systems with ports, linear about values of the unknowns."""
+        sample_counts = [len(self.problem.trials[k].trial.time) for k in self.trial_indices]
+        wanted_stride = 1.0
+        if self.sample_limit is not None:
+            wanted_stride = sum(sample_counts) / self.sample_limit
+        return tuple(
+            thin_trial(ported_trial(self.problem, number, point), wanted_stride)
+            for number in self.trial_indices
+        )
+
+    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+        """Return the laws and sensor errors of a hypothesis in these trials."""
+        return EffectLaws(
+            problem=self.problem,
+            trials=tuple(trials),
+            trial_indices=self.trial_indices,
+            candidate=candidate,
+            evaluate_model_laws=self.evaluate_model_laws,
+            unknowns_of_model_laws=self.unknowns_of_model_laws,
+        )
+
+
+class ForceSearch:
+    """The missing forces of a problem at the ports of its model, and estimates of effects.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem with trials in motion, whose model has ports.
+    sample_limit : int, optional
+        The number of samples of all trials together to which trials are thinned, if they can be.
+
+    Attributes
+    ----------
+    estimate_by_port : dict of str to Estimate
+        The missing force at each port alone, by the name of the port. It is estimated twice: first
+        along the motion of the model, which gives the initial states of the trials; then along the
+        motion that was estimated first, with the model's own laws and with the parameters linear
+        about their first estimates.
+    ports : tuple of str
+        The names of the ports.
+    problem_with_laws : Problem
+        The problem as it was given; `problem` has the same trials, and a model without laws.
+    model_laws : ModelPatch
+        The model's own laws at its ports, which its linear system does not contain.
+    trial_set : TrialSet
+        The trials in motion, of which linear systems are made.
+    """
+
+    def __init__(self, problem: Problem, sample_limit: int | None = None) -> None:
+        self.problem_with_laws = problem
+        linear_model, self.model_laws = problem.model.without_laws()
+        trials = tuple(data.trial for data in problem.trials)
+        self.model = problem.model
+        self.problem = problem.with_trials(trials, linear_model)
+        self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
+        self.ports = tuple(linear_model.ports)
+        start = self.problem.prior_mean_point(NO_EFFECTS)
+        self.trial_set = TrialSet(
+            problem=self.problem,
+            trial_indices=self.trial_indices,
+            evaluate_model_laws=self.evaluate_model_laws,
+            unknowns_of_model_laws=self._unknowns_of_model_laws(start.shared),
+            sample_limit=sample_limit,
+        )
+        self.estimate_by_port: dict[str, Estimate] = {}
+        # first estimate, along the motion of the model at the prior means
+        linearisation = plain_linearisation(
+            self.trial_set.trials_about(start), self.problem.shared.precision
+        )
+        for port, name in enumerate(self.ports):
+            processes = self.prior_processes((port,))
+            self.estimate_by_port[name] = estimate_of_processes(linearisation, processes, processes)
+        # second estimate, about the unknowns of the best port
+        trials_about_best = self.trial_set.trials_about(self._point_of(self._most_probable_port()))
+        for port, name in enumerate(self.ports):
+            self.estimate_by_port[name] = self._estimate_along_motion(
+                trials_about_best,
+                self.estimate_by_port[name].processes,
+                self.prior_processes((port,)),
+            )
+
+    # ---------------------------------------------------------------- where a force is missing
+
+    def _most_probable_port(self) -> Estimate:
+        """Return the missing force at one port that has the largest evidence."""
+        return max(self.estimate_by_port.values(), key=lambda at_port: at_port.log_evidence)
+
+    @cached_property
+    def best_port_estimate(self) -> Estimate:
+        """The missing force at one port that has the largest evidence."""
+        return self._most_probable_port()
+
+    @cached_property
+    def estimate_without_effects(self) -> Estimate:
+        """The missing forces at several ports, estimated together.
+
+        These are all ports of the model, or the `MOST_PORTS` ports with the largest evidence if
+        there are more. With a single port the result is the estimate at that port.
+        """
+        best_alone = self.best_port_estimate
+        estimates_alone = sorted(
+            self.estimate_by_port.values(), key=lambda at_port: -at_port.log_evidence
+        )[:MOST_PORTS]
+        if len(estimates_alone) == 1:
+            return best_alone
+        start_processes = dict(best_alone.processes)
+        for at_port in estimates_alone[1:]:
+            # alone, each port takes the whole gap: the further ports begin with a smaller force
+            # of the same correlation time
+            start_processes |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
+        prior_medians = self.prior_processes(start_processes)
+        estimate = estimate_of_processes(best_alone.linearisation, prior_medians, start_processes)
+        # the model's own laws depend on the motion, so forces and motion are estimated twice
+        return estimate_of_processes(
+            self._linearise_along(estimate), prior_medians, estimate.processes, skip_grid=True
+        )
+
+    def estimate_with_jumps(self, port: str) -> Estimate:
+        """Return the missing force at a port as a process that may jump.
+
+        The trials are linearised twice, the second time about the motion of the first estimate.
+
+        Parameters
+        ----------
+        port : str
+            The name of the port.
+        """
+        estimate = self.estimate_by_port[port]
+        for _ in range(2):
+            jumping_processes = {
+                number: replace(process, may_jump=True)
+                for number, process in estimate.processes.items()
+            }
+            estimate = self._estimate_along_motion(
+                self.trial_set.trials_about(self._point_of(estimate)),
+                jumping_processes,
+                self.prior_processes(jumping_processes),
+            )
+        return estimate
+
+    def _estimate_along_motion(
+        self,
+        trials: tuple[PortedTrial, ...],
+        first_processes: Processes,
+        prior_medians: dict[int, Process],
+    ) -> Estimate:
+        """Return the most probable missing forces along the motion that first forces give.
+
+        Parameters
+        ----------
+        trials : tuple of PortedTrial
+            The trials, linear about other unknowns than before.
+        first_processes : mapping of int to Process
+            The missing forces with which the motion is estimated first.
+        prior_medians : dict of int to Process
+            Their prior medians.
+        """
+        linearisation = plain_linearisation(trials, self.problem.shared.precision)
+        solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
+        trajectories = tuple(trial.trajectory for trial in smoothed_trials)
+        along_motion = self._linearise(trials, trajectories, solution.mean)
+        return estimate_of_processes(along_motion, prior_medians, first_processes)
+
+    def _linearise_along(self, estimate: Estimate) -> Linearisation:
+        """Return the trials of an estimate without effects, linear along its motion."""
+        trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
+        trajectories = tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials)
+        return self._linearise(trials, trajectories, estimate.shared)
+
+    def _linearise(
+        self,
+        trials: tuple[PortedTrial, ...],
+        trajectories: tuple[Trajectory, ...],
+        shared_values: FloatArray,
+    ) -> Linearisation:
+        """Return trials along trajectories with the model's own laws, without effects.
+
+        If the laws are not possible there, they are left out.
+
+        Parameters
+        ----------
+        trials : tuple of PortedTrial
+            The trials as linear systems with ports.
+        trajectories : tuple of Trajectory
+            The motion of each trial.
+        shared_values : (K,) array
+            The values of the shared unknowns.
+        """
+        precision = self.problem.shared.precision
+        start = EstimatorStart(NO_EFFECT_VALUES, shared_values, trajectories, {})
+        laws = self.trial_set.laws(NO_EFFECTS, trials)
+        linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, precision)
+        return linearisation or plain_linearisation(trials, precision)
+
+    def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
+        """Return the prior medians of missing forces, by the number of the port.
+
+        The median standard deviation is 5 % of the elastic force at the port. The median
+        correlation time is the time in which the vibration advances by one radian, or the duration
+        of the trials if the port has no frequency.
+
+        Parameters
+        ----------
+        ports : iterable of int
+            The numbers of the ports.
+        """
+        scales = self.problem.setting.scales
+        processes = {}
+        for port in ports:
+            scale = scales.ports[self.ports[port]]
+            rate = scale.angular_frequency or 1.0 / scales.duration
+            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
+            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
+        return processes
+
+    def evaluate_model_laws(self, shared_values: FloatArray) -> ModelPatch:
+        """Return the model's own laws at values (K,) of the shared unknowns."""
+        parameters = self.problem.shared.parameters(shared_values)
+        return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
+
+    def _unknowns_of_model_laws(self, shared_values: FloatArray) -> tuple[int, ...]:
+        """Return the numbers of the shared unknowns that change the model's own laws.
+
+        They are compared at values (K,) of the shared unknowns, and a small step away.
+        """
+        laws_at_point = self.evaluate_model_laws(shared_values)
+        return tuple(
+            number
+            for number in range(self.problem.shared.parameter_count)
+            if self.evaluate_model_laws(with_step(shared_values, number, HALF_DIFFERENCE))
+            != laws_at_point
+        )
+
+    def force_deviation(self, port: int) -> float:
+        """Return the standard deviation of the missing force at a port without any effect.
+
+        Its unit is N, N m or the port's flow. It is the prior median if no force was estimated
+        there.
+
+        Parameters
+        ----------
+        port : int
+            The number of the port.
+        """
+        process = self.estimate_without_effects.processes.get(port)
+        if process is None:
+            process = self.prior_processes((port,))[port]
+        return process.standard_deviation
+
+    # ---------------------------------------------------------------- effects
+
+    def score(self, estimate: Estimate, effect_count: int) -> float:
+        """Return the log of evidence times prior of an estimate [nat].
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The estimate of a set of effects.
+        effect_count : int
+            The number of effects that are compared.
+        """
+        prior = log_prior(estimate.candidate, effect_count, self.problem.setting)
+        return estimate.log_evidence + prior
+
+    def estimator(self, trials: Sequence[PortedTrial]) -> MotionEstimator:
+        """Return the estimator of hypotheses in some trials."""
+        prior_medians = self.prior_processes(self.estimate_without_effects.processes)
+        return MotionEstimator(
+            GaussNewton(tuple(trials), self.problem.shared.precision, prior_medians)
+        )
+
+    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+        """Return the laws and sensor errors of a hypothesis in some of the trials."""
+        return self.trial_set.laws(candidate, trials)
+
+    def estimate_effects(
+        self, base: Estimate, candidate: Candidate, effect: FloatArray
+    ) -> Estimate | None:
+        """Return a set of effects at its most probable values, estimated with the motion.
+
+        Parameters
+        ----------
+        base : Estimate
+            The estimate whose motion and missing forces are those to begin with. The missing forces
+            begin at least as large as without any effect, so that the motion follows the readings
+            even if the values of the effects are still wrong.
+        candidate : Candidate
+            The effects of the hypothesis, each at its place.
+        effect : (E,) array
+            The scaled effect parameters to begin with.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible along the motion.
+        """
+        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        start = replace(start_from_estimate(base), effect=effect)
+        processes = {
+            port: replace(
+                process,
+                standard_deviation=max(process.standard_deviation, self.force_deviation(port)),
+            )
+            for port, process in base.processes.items()
+        }
+        laws = self.laws(candidate, trials)
+        first_estimate = self.estimator(trials).estimate_from_far(
+            laws, replace(start, processes=processes)
+        )
+        return None if first_estimate is None else self.estimate_about_own_values(first_estimate)
+
+    def estimate_roughly(
+        self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
+    ) -> Estimate | None:
+        """Return a set of effects near its most probable values, for a first comparison.
+
+        Parameters
+        ----------
+        base : Estimate
+            The estimate whose motion is that to begin with. Its missing forces are one beginning.
+        candidate : Candidate
+            The effects of the hypothesis, each at its place.
+        effect : (E,) array
+            The scaled effect parameters to begin with.
+        processes : mapping of int to Process
+            The missing forces that may remain beside the effects, which are another beginning.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible along the motion.
+        """
+        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        start = replace(start_from_estimate(base), effect=effect)
+        laws = self.laws(candidate, trials)
+        return self.estimator(trials).estimate_roughly(laws, start, processes)
+
+    def polish_effects(
+        self, base: Estimate, candidate: Candidate, effect: FloatArray
+    ) -> Estimate | None:
+        """Return a set of effects at its most probable values, from values that are near these.
+
+        Parameters
+        ----------
+        base : Estimate
+            The estimate whose motion and missing forces are those to begin with.
+        candidate : Candidate
+            The effects of the hypothesis, each at its place.
+        effect : (E,) array
+            The scaled effect parameters to begin with.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible along the motion.
+        """
+        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        start = replace(start_from_estimate(base), effect=effect)
+        # the estimate without effects has no window
+        speed_window = base.speed_window or USUAL_WINDOW
+        return self.estimator(trials).polish(self.laws(candidate, trials), start, speed_window)
+
+    def estimate_about_own_values(self, estimate: Estimate) -> Estimate:
+        """Return an estimate in trials that are linear about its own unknowns.
+
+        The first estimate is made in trials that are linear about the unknowns without any effect.
+        The response of the model is not linear in a parameter: a mass that is wrong by a tenth
+        leaves a hundredth of the forces, which would then be missing.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The estimate of the motion and of all unknowns. It is returned if no estimate can be
+            made in the other trials.
+        """
+        for number in range(MOST_LINEARISATIONS):
+            trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
+            point = self._point_of(estimate)
+            point_of_trials = trials[0].linearisation_point[: len(point.shared)]
+            is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))
+            if is_same_point and number > 0:
+                break
+            next_trials = trials if is_same_point else self.trial_set.trials_about(point)
+            laws = self.laws(estimate.candidate, next_trials)
+            estimator = self.estimator(next_trials)
+            start = start_in_other_trials(estimate, next_trials)
+            if number == 0:
+                next_estimate = estimator.estimate_nearby(laws, start, estimate.speed_window)
+            else:
+                next_estimate = estimator.polish(laws, start, estimate.speed_window)
+            if next_estimate is None:
+                break
+            estimate = next_estimate
+        return estimate
+
+    def estimate_in_all_samples(self, thinned_estimate: Estimate) -> Estimate | None:
+        """Return an estimate of thinned trials in all samples; None if its laws are not possible.
+
+        The trials are linear about the same unknowns as the thinned ones.
+        """
+        shared_count = self.problem.shared.unknown_count
+        points = [trial.trial.linearisation_point for trial in thinned_estimate.trials]
+        point = self.point_of_unknowns(
+            points[0][:shared_count], [values[shared_count:] for values in points]
+        )
+        trials = self.trial_set.trials_about(point)
+        trajectories = []
+        for smoothed_trial, trial in zip(thinned_estimate.trials, trials, strict=True):
+            unknowns = np.concatenate((thinned_estimate.shared, smoothed_trial.local))
+            trajectories.append(
+                _trajectory_in_all_samples(
+                    smoothed_trial.trial, trial, smoothed_trial.trajectory, unknowns
+                )
+            )
+        start = replace(start_from_estimate(thinned_estimate), trajectories=tuple(trajectories))
+        laws = self.laws(thinned_estimate.candidate, trials)
+        return self.estimator(trials).polish(laws, start, thinned_estimate.speed_window)
+
+    # ---------------------------------------------------------------- values of unknowns
+
+    def point(self, estimate: Estimate) -> Point:
+        """Return the unknowns of an estimate with its effects, from which a fit may begin."""
+        point = self._point_of(estimate)
+        return Point(estimate.shared.copy(), point.local, estimate.effect.copy())
+
+    def _point_of(self, estimate: Estimate) -> Point:
+        """Return the unknowns of an estimate without its effects, clipped to their ranges."""
+        return self.point_of_unknowns(estimate.shared, estimate.local)
+
+    def point_of_unknowns(
+        self, shared_values: FloatArray, local_of_trials: Iterable[FloatArray]
+    ) -> Point:
+        """Return values of the unknowns as a point of the problem, clipped to their ranges.
+
+        Parameters
+        ----------
+        shared_values : (K,) array
+            The scaled values of the K unknowns that all trials share.
+        local_of_trials : iterable of (L,) array
+            The unknowns of each trial in motion.
+        """
+        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
+        for number, values in zip(self.trial_indices, local_of_trials, strict=True):
+            local_values[number] = values
+        low, high = self.problem.shared.bounds
+        # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
+        # within two prior standard deviations
+        low = np.maximum(low + PARAMETER_STEP, -2.0)
+        high = np.minimum(high - PARAMETER_STEP, 2.0)
+        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))
+
+
+def start_in_other_trials(
+    estimate: Estimate, other_trials: Sequence[PortedTrial]
+) -> EstimatorStart:
+    """Return the start of an estimate in trials that are linear about other unknowns.
+
+    The motion of the ports stays the same. The model moves them differently about other unknowns,
+    so that the added state changes by what moves the ports back.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The estimate of the motion and of all unknowns.
+    other_trials : sequence of PortedTrial
+        The trials in which the next estimate is made, with the same fine stamps.
+    """
+    trajectories = []
+    for smoothed_trial, other_trial in zip(estimate.trials, other_trials, strict=True):
+        unknowns = np.concatenate((estimate.shared, smoothed_trial.local))
+        trajectory = smoothed_trial.trajectory
+        motion = smoothed_trial.trial.port_motion(unknowns, trajectory.added_state)
+        other_motion = other_trial.port_motion(unknowns, trajectory.added_state)
+        motion_difference = np.concatenate(motion, axis=1) - np.concatenate(other_motion, axis=1)
+        motion_by_state = np.concatenate((other_trial.system.positions, other_trial.system.speeds))
+        change = motion_difference @ np.linalg.pinv(motion_by_state).T
+        trajectories.append(replace(trajectory, added_state=trajectory.added_state + change))
+    return replace(start_from_estimate(estimate), trajectories=tuple(trajectories))
+
+
+def _trajectory_in_all_samples(
+    thinned_trial: PortedTrial, trial: PortedTrial, trajectory: Trajectory, unknowns: FloatArray
+) -> Trajectory:
+    """Return the motion of a thinned trial at all fine stamps of the record.
+
+    The added state and the forces are interpolated. The motion of the ports is that of the model,
+    which is known at all stamps, and what the added state adds to it.
+
+    Parameters
+    ----------
+    thinned_trial, trial : PortedTrial
+        The trial with some of its samples, and with all of them.
+    trajectory : Trajectory
+        The motion of the thinned trial.
+    unknowns : (K + L,) array
+        The values of the shared unknowns, then of those of the trial alone.
+    """
+    time, thinned_time = trial.fine_time, thinned_trial.fine_time
+    added_state = np.column_stack(
+        [np.interp(time, thinned_time, state) for state in trajectory.added_state.T]
+    )
+    forces = {
+        port: np.interp(time, thinned_time, force) for port, force in trajectory.forces.items()
+    }
+    positions, speeds = trial.port_motion(unknowns, added_state)
+    return Trajectory(added_state, positions, speeds, forces)

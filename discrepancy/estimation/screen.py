@@ -1,0 +1,383 @@
+"""The screen of effects: how well each, added alone to an estimate, explains the missing force.
+
+The motion of the estimate is taken as known. An effect is then a column of a linear model, whose
+factor is one more unknown, and one pass of the filter weighs the columns of all effects.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erf
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.catalogue.entry import Effect
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from fe.runtime.errors import InvalidPatchError
+from reporting.arrays import LEAST_DIVISOR
+
+from .effects import EffectLaws
+from .estimate import Estimate
+from .estimator import NARROWEST_WINDOW
+from .filtered import SmoothedTrial
+from .force_search import WIDE_WINDOW, ForceSearch
+from .laws import LawForce
+from .linearisation import Linearisation
+from .linearised import LinearisedTrial
+from .process_search import Processes, processes_within_range, scale_processes
+from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors
+
+SHAPE_VALUES = (-1.3, -0.4, 0.4, 1.3)
+"""Standard normal values at which a parameter that is not a magnitude is tried."""
+MOST_COMBINATIONS = 16
+"""Largest number of combinations of parameter values at which an effect is tried."""
+MAGNITUDE_VALUE = 0.5
+"""Standard normal value at which a magnitude is tried. At zero, the middle of a prior with both
+signs, the effect would do nothing."""
+FACTOR_DEVIATION = 3.0
+"""Prior standard deviation of the factor on an effect, over the factor with which the effect would
+be as large as the gap. It is wide, so that the screen prefers no size."""
+SCREENED_DEVIATIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
+"""Standard deviations of the missing forces with which effects are screened, over those of the
+estimate: an effect leaves only a part of the force."""
+SCREENED_TIMES = (0.5, 1.5)
+"""Correlation times of these forces, over those of the estimate."""
+LARGEST_RATIO = 1e100
+"""Ratio of an effect to the gap that stands for infinity, if the gap is zero."""
+CREEP_SHARE = 0.02
+"""Share of the rms speed below which a body creeps before it slides, so that no law of the speed is
+valid."""
+TIED_EVIDENCE = 1.0
+"""Difference to the log evidence of the best values of an effect up to which estimates begin at its
+other values, too [nat]."""
+
+
+class EffectColumn(NamedTuple):
+    """The change of a trial by an effect along a motion that is taken as known.
+
+    Attributes
+    ----------
+    forces : mapping of int to (F,) ndarray
+        The forces of the effect at the fine stamps, by the number of the port [N or N m].
+    readings : (N, C) ndarray
+        The change of the readings by an effect that is no force, divided by the noise.
+    """
+
+    forces: dict[int, FloatArray]
+    readings: FloatArray
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether the effect changes nothing in the trial."""
+        return not (np.any(self.readings) or any(np.any(force) for force in self.forces.values()))
+
+
+class TriedEffect(NamedTuple):
+    """An effect at its place, with scaled values (E,), and its column in each trial."""
+
+    term: EffectTerm
+    values: FloatArray
+    columns: list[EffectColumn]
+
+
+class ScreenedStart(NamedTuple):
+    """Values from which an estimate of an effect may begin.
+
+    Attributes
+    ----------
+    log_evidence : float
+        The log evidence of the screening [nat].
+    effect : (E,) ndarray
+        The scaled parameters of the effect.
+    processes : mapping of int to Process
+        The missing forces that remain beside the effect, by the number of the port.
+    """
+
+    log_evidence: float
+    effect: FloatArray
+    processes: Processes
+
+
+class ScreenedEffect(NamedTuple):
+    """An effect that may be added to an estimate, with the result of its screening.
+
+    Attributes
+    ----------
+    log_evidence : float
+        The largest log evidence of the screening, at the best of the tried values [nat].
+    term : EffectTerm
+        The effect at its place.
+    starts : list of ScreenedStart
+        The values from which estimates of the effect begin.
+    """
+
+    log_evidence: float
+    term: EffectTerm
+    starts: list[ScreenedStart]
+
+
+def screen_effects(
+    search: ForceSearch, base: Estimate, effects: Iterable[Effect]
+) -> list[ScreenedEffect]:
+    """Return the effects that may be added to an estimate, the most promising first.
+
+    Each effect is tried at each of its places, with several values of its parameters. All values
+    whose evidence is within `TIED_EVIDENCE` of the best are starts of later estimates. For example,
+    dead zones of different stiffness act alike if only their amplitude is fitted, but estimates
+    that begin with them lead to different ends.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    base : Estimate
+        The estimate to which an effect is added.
+    effects : iterable of Effect
+        The effects that may be missing in the model.
+    """
+    tried_effects = _try_effects(search, base, effects)
+    starts_by_term: dict[EffectTerm, list[ScreenedStart]] = {}
+    for tried_effect, start in _weigh_effects(base, tried_effects):
+        starts_by_term.setdefault(tried_effect.term, []).append(start)
+    screened_effects = []
+    for term, starts in starts_by_term.items():
+        best_evidence = max(start.log_evidence for start in starts)
+        tied_starts = [
+            start for start in starts if start.log_evidence > best_evidence - TIED_EVIDENCE
+        ]
+        screened_effects.append(ScreenedEffect(best_evidence, term, tied_starts))
+    return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
+
+
+def values_to_try(term: EffectTerm) -> list[FloatArray]:
+    """Return sets of standard normal parameter values (E,) at which an effect is tried."""
+    shape_indices = [
+        number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
+    ]
+    # with several such parameters, only the lowest and the highest value of each
+    levels = SHAPE_VALUES if len(shape_indices) < 2 else SHAPE_VALUES[::3]
+    combinations = []
+    for shape_values in list(product(levels, repeat=len(shape_indices)))[:MOST_COMBINATIONS]:
+        values = np.full(len(term.parameters), MAGNITUDE_VALUE)
+        values[shape_indices] = shape_values
+        combinations.append(values)
+    return combinations
+
+
+def _terms_to_add(
+    search: ForceSearch, base: Estimate, effects: Iterable[Effect]
+) -> Iterator[EffectTerm]:
+    """Yield the effects at places where an estimate lacks them, also with a free shape."""
+    in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
+    for effect in effects:
+        for place in effect.places(search.problem.setting):
+            if (effect.identifier, place) in in_base:
+                continue
+            yield EffectTerm(effect, place)
+            if effect.shape:
+                yield EffectTerm(effect, place, free_shape=True)
+
+
+def _try_effects(
+    search: ForceSearch, base: Estimate, effects: Iterable[Effect]
+) -> list[TriedEffect]:
+    """Return the columns of all effects that may be added, at several values of each.
+
+    Effects that change nothing, or are not possible along the motion, are left out.
+    """
+    trials = [smoothed_trial.trial for smoothed_trial in base.trials]
+    tried_effects = []
+    for term in _terms_to_add(search, base, effects):
+        laws = search.laws(Candidate((term,)), trials)
+        for values in values_to_try(term):
+            try:
+                columns = [
+                    _column_in_trial(laws, number, smoothed_trial, values)
+                    for number, smoothed_trial in enumerate(base.trials)
+                ]
+            except (DiscrepancyError, InvalidPatchError):
+                continue
+            is_finite = all(np.all(np.isfinite(column.readings)) for column in columns)
+            if is_finite and not all(column.is_zero for column in columns):
+                tried_effects.append(TriedEffect(term, values, columns))
+    return tried_effects
+
+
+def _column_in_trial(
+    laws: EffectLaws, trial_index: int, smoothed_trial: SmoothedTrial, values: FloatArray
+) -> EffectColumn:
+    """Return the change of a trial by a single effect along its smoothed motion.
+
+    Sensors measure the explained motion. The motion by missing forces is left out: as these may
+    have any size, they would fit any gain of a sensor.
+    """
+    (term,) = laws.candidate.terms
+    window = NARROWEST_WINDOW if laws.hold_at_rest else WIDE_WINDOW
+    arguments = LawArguments(trial_index, smoothed_trial.trajectory, values, np.zeros(0), window)
+    forces = {
+        port: law_force.force
+        for port, law_force in laws.effect_forces_along_trajectory(arguments).items()
+    }
+    if forces:
+        if laws.hold_at_rest:
+            forces = {
+                port: _force_that_holds(force, smoothed_trial, port)
+                for port, force in forces.items()
+            }
+        return EffectColumn(forces, np.zeros_like(smoothed_trial.trial.residual))
+    readings = laws.readings_change(trial_index, smoothed_trial.explained_trajectory, term, values)
+    return EffectColumn({}, readings)
+
+
+def _force_that_holds(
+    sliding_force: FloatArray, smoothed_trial: SmoothedTrial, port: int
+) -> FloatArray:
+    """Return the force (F,) of a law that holds its port while the speed is zero.
+
+    Where the port is at rest within its uncertainty, the force is the one that keeps it there, at
+    most as large as that of the law: it is known from the missing force.
+
+    Parameters
+    ----------
+    sliding_force : (F,) array
+        The force of the law at the smoothed speed.
+    smoothed_trial : SmoothedTrial
+        The trial with its smoothed motion and missing force.
+    port : int
+        The number of the port.
+    """
+    speeds = smoothed_trial.trajectory.speeds[:, port]
+    slow_speed = max(CREEP_SHARE * float(np.sqrt(np.mean(speeds**2))), LEAST_DIVISOR)
+    # probability that a normal error of deviation `slow_speed` is smaller than the speed
+    probability_of_motion = erf(np.abs(speeds) / (np.sqrt(2.0) * slow_speed))
+    lacking_force = smoothed_trial.lacking_forces.get(port, np.zeros_like(speeds))
+    size = np.abs(sliding_force)
+    holding_force = np.clip(lacking_force, -size, size)
+    return np.asarray(
+        probability_of_motion * sliding_force + (1.0 - probability_of_motion) * holding_force
+    )
+
+
+def _weigh_effects(
+    base: Estimate, tried_effects: Sequence[TriedEffect]
+) -> list[tuple[TriedEffect, ScreenedStart]]:
+    """Return effects with their best evidence and values, each added alone to an estimate.
+
+    The best is taken over several deviations and times of the remaining missing forces. An effect
+    is left out if its factor always has a sign that the effect cannot have.
+    """
+    if not tried_effects:
+        return []
+    with_columns = _with_columns(base, tried_effects)
+    base_count = len(base.linearisation.prior_precision)
+    best_starts: dict[int, ScreenedStart] = {}
+    for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
+        processes = processes_within_range(
+            scale_processes(base.processes, size_factor, time_factor),
+            with_columns.correlation_time_range,
+        )
+        normal_equations = with_columns.regression(with_columns.filter(processes))
+        for index, tried_effect in enumerate(tried_effects):
+            # the unknowns of the base are fitted again, with this column alone
+            unknowns = [*range(base_count), base_count + index]
+            solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
+            factor = float(solution.mean[-1])
+            has_possible_sign = factor > 0.0 or tried_effect.term.may_be_negative
+            if not (has_possible_sign and np.isfinite(solution.log_evidence)):
+                continue
+            if index not in best_starts or best_starts[index].log_evidence < solution.log_evidence:
+                effect = tried_effect.term.multiply_magnitudes_within_range(
+                    tried_effect.values, factor
+                )
+                best_starts[index] = ScreenedStart(solution.log_evidence, effect, processes)
+    return [(tried_effects[index], start) for index, start in best_starts.items()]
+
+
+def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linearisation:
+    """Return the trials of an estimate with one more unknown for each effect: its factor."""
+    first_factor = len(base.linearisation.prior_precision)
+    effect = np.concatenate((base.effect, np.zeros(len(tried_effects))))
+    linear_trials = []
+    for trial_index, linear_trial in enumerate(base.linearisation.trials):
+        columns = [tried_effect.columns[trial_index] for tried_effect in tried_effects]
+        linear_trials.append(_trial_with_columns(linear_trial, columns, first_factor, effect))
+    precisions = _precisions_of_factors(base, tried_effects)
+    return Linearisation(
+        tuple(linear_trials), np.concatenate((base.linearisation.prior_precision, precisions))
+    )
+
+
+def _trial_with_columns(
+    linear_trial: LinearisedTrial,
+    columns: Sequence[EffectColumn],
+    first_factor: int,
+    effect: FloatArray,
+) -> LinearisedTrial:
+    """Return a linear trial with the columns of effects, whose factors are unknowns of value zero.
+
+    Parameters
+    ----------
+    linear_trial : LinearisedTrial
+        The trial with the laws of the estimate.
+    columns : sequence of EffectColumn
+        The column of each effect in this trial.
+    first_factor : int
+        The number of the first factor among the unknowns.
+    effect : (E,) array
+        The effect parameters of the estimate, then the factors.
+    """
+    no_force = np.zeros(len(linear_trial.trial.fine_time))
+    forces_by_port = {
+        port: LinearisedForce(force.law_force, dict(force.by_unknown))
+        for port, force in linear_trial.forces.items()
+    }
+    errors_by_unknown = dict(linear_trial.sensor_errors.by_unknown)
+    for number, column in enumerate(columns, start=first_factor):
+        for port, force_of_effect in column.forces.items():
+            if port not in forces_by_port:
+                no_law = LawForce(no_force, no_force, no_force)
+                forces_by_port[port] = LinearisedForce(no_law, {})
+            force = forces_by_port[port]
+            forces_by_port[port] = LinearisedForce(
+                force.law_force, {**force.by_unknown, number: force_of_effect}
+            )
+        if np.any(column.readings):
+            errors_by_unknown[number] = column.readings
+    return replace(
+        linear_trial,
+        forces=forces_by_port,
+        sensor_errors=LinearisedSensorErrors(linear_trial.sensor_errors.change, errors_by_unknown),
+        effect=effect,
+    )
+
+
+def _precisions_of_factors(base: Estimate, tried_effects: Sequence[TriedEffect]) -> list[float]:
+    """Return the prior precisions of the factors on effects.
+
+    The prior standard deviation of a factor is `FACTOR_DEVIATION` times the factor with which the
+    effect would be as large as the gap: of forces for an effect with a force, of readings for
+    another one.
+    """
+    gap_of_readings = _rms([trial.trial.residual for trial in base.trials])
+    gap_of_forces = _rms(
+        [force for trial in base.trials for force in trial.lacking_forces.values()]
+    )
+    precisions = []
+    for tried_effect in tried_effects:
+        forces = [force for column in tried_effect.columns for force in column.forces.values()]
+        if forces:
+            ratio = _rms(forces) / gap_of_forces
+        else:
+            ratio = _rms([column.readings for column in tried_effect.columns]) / gap_of_readings
+        # precision = 1 / (FACTOR_DEVIATION * gap / effect)^2
+        precisions.append(min(ratio / FACTOR_DEVIATION, LARGEST_RATIO) ** 2)
+    return precisions
+
+
+def _rms(series: Iterable[FloatArray]) -> float:
+    """Return the root mean square of several arrays together, at least `LEAST_DIVISOR`."""
+    values = np.concatenate([np.ravel(entries) for entries in series])
+    return max(float(np.sqrt(np.mean(values**2))), LEAST_DIVISOR)
