@@ -1,1 +1,1 @@
-"""The joint estimate of trajectory, missing force and unknowns of a hypothesis."""
+"""The joint estimate of motion, missing force and unknowns, and the effects that explain most."""

@@ -1,1 +1,1 @@
-"""The force that a model lacks: its values in time, its port, and the laws that explain it."""
+"""The force that a model lacks: its port, its size and share, and the events in which it acts."""

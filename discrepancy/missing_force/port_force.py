@@ -160,7 +160,7 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     search : ForceSearch
         The search for the missing force.
     estimate : Estimate
-        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
+        The estimate of a hypothesis, with the motion and the forces of each trial.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     else:
         port = max(evidence_by_port, key=lambda name: evidence_by_port[name])
     number = search.ports.index(port)
-    # a hypothesis without a missing force at this port: take the force at the port alone
+    # an estimate without a missing force at this port: take the force at the port alone
     if number not in estimate.processes:
         estimate = search.estimate_by_port[port]
     law_name = " and ".join(
@@ -201,7 +201,7 @@ def _forces_by_trial(estimate: Estimate, port: int, *, has_law: bool) -> list[Tr
     Parameters
     ----------
     estimate : Estimate
-        The fitted hypothesis: its effects, and the motion and missing forces of each trial.
+        The estimate of a hypothesis, with the motion and the forces of each trial.
     port : int
         The index of the port among the ports of the model.
     has_law : bool
@@ -341,7 +341,7 @@ def missing_force_of_verdict(
 def _estimate_of_fit(
     search: ForceSearch, estimates: Sequence[Estimate], fit: CandidateFit
 ) -> Estimate | None:
-    """Return the hypothesis whose effects are those of a fit, estimated from the missing force.
+    """Return the estimate of the effects of a fit, from the missing force.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ def _estimate_of_fit(
     Returns
     -------
     Estimate or None
-        The hypothesis; None if the fit has no effects, or if their forces cannot be computed from
+        The estimate; None if the fit has no effects, or if their forces cannot be computed from
         the motion that the readings show.
     """
     for estimate in estimates:
