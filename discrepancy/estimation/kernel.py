@@ -387,7 +387,9 @@ def filter_record(
             covariance_at_sample[:] = covariance
         if keeps_states:
             means[j] = mean
-            covariances[j] = covariances[j - substeps] if steady and j > substeps else covariance
+            # between samples a steady covariance is not computed: take that of the last interval
+            is_skipped = steady and j % substeps != 0
+            covariances[j] = covariances[j - substeps] if is_skipped else covariance
     return innovations, all_gains, variances, means, covariances
 
 

@@ -209,16 +209,17 @@ class LinearisedTrial:
 
     def _known_state_at_start(self) -> FloatArray:
         """Return the state (n, W) at the first sample for a unit of each weight."""
-        start = np.zeros((len(self.trial.system.generator), self.weight_count))
-        if self.trial.begins_at_rest and self.law_ports:
-            # At rest the rate is zero under the laws. With their force T s + u and its effect B on
-            # the rate, (A + B T) s + B u = 0.
-            start = np.linalg.lstsq(
-                self.rate_matrix_at_start,
-                -self.state_rate_by_force @ self.force_by_weight[0],
-                rcond=1e-12,
-            )[0]
-        return start
+        trial = self.trial
+        rate = np.zeros((len(trial.system.generator), self.weight_count))
+        if not trial.begins_at_rest:
+            return rate
+        # At rest the rate is zero. With the laws' force T s + u, its effect B on the rate, and the
+        # rate r by parameters of the linear system, (A + B T) s + B u + r = 0.
+        rate += self.state_rate_by_force @ self.force_by_weight[0]
+        for unknown_index, rate_change in self._rate_by_system_parameters.items():
+            rate[:, 1 + unknown_index] += rate_change[0]
+            rate[:, CONSTANT] -= trial.linearisation_point[unknown_index] * rate_change[0]
+        return np.asarray(np.linalg.lstsq(self.rate_matrix_at_start, -rate, rcond=1e-12)[0])
 
     @cached_property
     def rate_matrix_at_start(self) -> FloatArray:
@@ -226,6 +227,19 @@ class LinearisedTrial:
         return np.asarray(
             self.trial.system.generator + self.state_rate_by_force @ self.force_by_state[0]
         )
+
+    @cached_property
+    def _rate_by_system_parameters(self) -> dict[int, FloatArray]:
+        """The derivatives (F, n) of A s - sum_p b_p force_p by parameters, along the trajectory."""
+        derivatives = {}
+        for unknown_index, derivative in enumerate(self.trial.system_derivatives):
+            if derivative is None:
+                continue
+            rate_change = self.trajectory.added_state @ derivative.generator.T
+            for port, force in self.trajectory.forces.items():
+                rate_change = rate_change - np.outer(force, derivative.actions[port])
+            derivatives[unknown_index] = rate_change
+        return derivatives
 
     def _drift_by_system_parameters(
         self, by_input_at_begin: FloatArray, by_input_at_end: FloatArray
@@ -242,13 +256,7 @@ class LinearisedTrial:
         step_count = len(trial.fine_time) - 1
         drift = np.zeros((step_count, len(trial.system.generator), self.weight_count))
         interval_of_substep = self.interval_of_stamp[1:]
-        for unknown_index, derivative in enumerate(trial.system_derivatives):
-            if derivative is None:
-                continue
-            # derivative of A s - sum_p b_p force_p by the parameter, along the trajectory
-            rate_change = self.trajectory.added_state @ derivative.generator.T
-            for port, force in self.trajectory.forces.items():
-                rate_change = rate_change - np.outer(force, derivative.actions[port])
+        for unknown_index, rate_change in self._rate_by_system_parameters.items():
             state_change = _change_over_substeps(
                 by_input_at_begin, interval_of_substep, rate_change[:-1]
             )

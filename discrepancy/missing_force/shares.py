@@ -10,7 +10,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
 from discrepancy.estimation.filtered import SmoothedTrial
-from discrepancy.estimation.force_search import ForceSearch, TrialSet
+from discrepancy.estimation.force_search import WIDE_WINDOW, ForceSearch, TrialSet
 from discrepancy.estimation.gauss_newton import EstimatorStart, linearise_trials
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
@@ -90,7 +90,7 @@ class ForceShares:
         law_ports = self._law_ports(estimate)
         ports = law_ports or set(self.search.best_port_estimate.processes)
         remaining_rms = _largest_rms([trial.missing_forces for trial in trials], ports)
-        total_rms = _largest_rms([trial.lacking_forces for trial in trials_without], ports)
+        total_rms = _largest_rms([trial.missing_forces for trial in trials_without], ports)
         law_rms = _largest_rms([trial.effect_forces for trial in trials], ports)
         # trials in which the force of the law is small do not test the law
         is_tested = not law_ports or law_rms**2 > LEAST_FORCE_RATIO * total_rms**2
@@ -164,7 +164,7 @@ class ForceShares:
             noise_forces = filtered_trial.missing_forces(noise_states)
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
-                without_effect.lacking_forces,
+                without_effect.missing_forces,
                 smoothed_trial.missing_forces,
                 noise_forces,
             )
@@ -236,6 +236,8 @@ class ForceShares:
         )
         # the laws act along the motion, which in turn depends on their force: iterate
         laws = self._held_out.laws(estimate.candidate, trials)
+        # an estimate without effects has no window, but the model may have laws of its own
+        speed_window = estimate.speed_window or WIDE_WINDOW
         for _ in range(SMOOTHING_ROUNDS):
             start = EstimatorStart(
                 effect=estimate.effect,
@@ -243,7 +245,7 @@ class ForceShares:
                 trajectories=tuple(trial.trajectory for trial in smoothed_trials),
                 processes=processes,
             )
-            with_laws = linearise_trials(laws, trials, start, estimate.speed_window, precision)
+            with_laws = linearise_trials(laws, trials, start, speed_window, precision)
             if with_laws is None:
                 break
             linearisation = with_laws

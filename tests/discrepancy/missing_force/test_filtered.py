@@ -12,13 +12,17 @@ from discrepancy.estimation.estimate import estimate_of_processes
 from discrepancy.estimation.filtered import FilteredTrial
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import plain_linearisation
+from discrepancy.estimation.linearised import LinearisedTrial
 from discrepancy.estimation.ported_trial import correlated_noise_part
 from discrepancy.estimation.regression import Regression
+from discrepancy.estimation.steps import discretise
+from discrepancy.estimation.trajectory import NO_SENSOR_ERRORS, Trajectory
 from discrepancy.estimation.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
+from discrepancy.missing_force.two_filters import FilterState, RecordFilter, join_filters
 from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
@@ -195,6 +199,31 @@ def test_a_steady_covariance_is_not_computed_anew():
     np.testing.assert_array_equal(*states.covariance)
 
 
+def test_filters_from_both_sides_meet_at_every_sample():
+    """The readings before a sample and those since then tell what all of them tell."""
+    random = np.random.default_rng(6)
+    trial = trial_of(0.02 * np.arange(30), random.standard_normal((30, 2)))
+    (linear_trial,) = alone(trial).trials
+    space = FilteredTrial(linear_trial, {0: PROCESS}).force_states.state_space
+    lengths, kinds = trial.intervals
+    transitions, noises = discretise(space.generator, space.intensity, lengths)
+    record = RecordFilter(transitions, noises, space.output_rows, trial.used, linear_trial.columns)
+    samples = np.array([1, 7, 15, 29, 30])
+    begin = record.initial_state(space.initial_covariance)
+    before = record.filter_before(kinds, 0, begin, samples)
+    inner = FilterState(*(array[1] for array in before))
+    again = record.filter_before(kinds, 7, inner, samples[1:])
+    for array, continued in zip(before, again, strict=True):
+        np.testing.assert_allclose(continued, array[1:], rtol=1e-12, atol=1e-12)
+    stepped = before._replace(
+        covariance=transitions[0] @ before.covariance @ transitions[0].T + noises[0],
+        mean=transitions[0] @ before.mean,
+    )
+    products, half_log_determinants = join_filters(stepped, record.information_after(kinds, samples))
+    found = -0.5 * products[:, 0, 0] - half_log_determinants
+    np.testing.assert_allclose(found, evidence(trial, PROCESS), rtol=1e-9)
+
+
 def test_a_force_of_a_long_correlation_stays_finite():
     """Backwards it would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
@@ -215,6 +244,44 @@ def test_a_pushed_state_follows_its_closed_form():
     from_rest = replace(trial, begins_at_rest=True).state_under_force(0, constant_force)
     np.testing.assert_allclose(from_zero, exact, atol=1e-12)
     np.testing.assert_allclose(from_rest - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
+def test_a_parameter_changes_state_and_readings_as_it_does_in_a_simulation(settled):
+    """That of a stiffness, against the difference of two simulations under the same force."""
+    base = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
+    stiffer, nothing = np.array([[0.0, 0.0], [-8.0, 0.0]]), np.zeros((1, 2))
+    by_stiffness = PortedSystem(
+        stiffer, ("mass",), nothing, nothing, nothing, np.vstack((nothing, stiffer[1])), nothing
+    )
+    trial = replace(
+        base,
+        begins_at_rest=settled,
+        shared_derivatives=np.zeros((1, 50, 2)),
+        system_derivatives=(by_stiffness,),
+        linearisation_point=np.array([0.3]),
+    )
+    force = 1.0 + np.sin(5.0 * trial.fine_time)
+    states, readings = [], []
+    for step in (-1e-4, 0.0, 1e-4):
+        system = replace(
+            trial.system,
+            generator=trial.system.generator + step * stiffer,
+            outputs=trial.system.outputs + step * by_stiffness.outputs,
+        )
+        changed = replace(trial, system=system)
+        states.append(changed.state_under_force(0, force))
+        readings.append(changed.readings_of_state(states[-1], {0: force}))
+    trajectory = Trajectory(states[1], trial.port_positions, trial.port_speeds, {0: force})
+    linear_trial = LinearisedTrial(trial, trajectory, {}, NO_SENSOR_ERRORS, np.zeros(0), np.zeros(1))
+    constant, by_unknown = np.moveaxis(linear_trial.known_states, -1, 0)
+    expected = (states[2] - states[0]) / 2e-4
+    np.testing.assert_allclose(by_unknown, expected, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(constant, -0.3 * by_unknown, rtol=1e-9, atol=1e-12)
+    expected_readings = (readings[2] - readings[0]) / 2e-4
+    np.testing.assert_allclose(
+        -linear_trial.columns[:, :, 1], expected_readings, atol=1e-3 * np.abs(expected_readings).max()
+    )
 
 
 def test_simulated_noise_has_its_deviation_and_its_correlation():
@@ -304,17 +371,21 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
-def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_is_missing(settled):
+def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
     """Of a settled trial, too, whose state before is what the forces that act make of it."""
     random = np.random.default_rng(3)
     trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), begins_at_rest=settled)
     search = EventSearch(alone(trial), 0, EVENT)
-    off = search.log_evidence(search.products((EVENT, REST), [np.zeros(40, dtype=bool)]))
-    assert off == pytest.approx(evidence(trial, REST), abs=1e-7)
-    # an event throughout, beside which nothing is missing, is a missing force
-    nothing = replace(REST, standard_deviation=1e-9)
-    on = search.log_evidence(search.products((EVENT, nothing), [np.ones(40, dtype=bool)]))
-    assert on == pytest.approx(evidence(trial, EVENT), abs=1e-6)
+    # a port beside the other one, at the same place
+    ports = {
+        name: np.repeat(getattr(trial.system, name), 2, axis=0)
+        for name in ("actions", "positions", "speeds", "through")
+    }
+    twofold = replace(trial, system=replace(trial.system, ports=("mass", "again"), **ports))
+    for on, forces in ((False, {0: REST}), (True, {0: EVENT, 1: REST})):
+        wanted = alone(twofold).solve(forces).log_evidence
+        found = search.log_evidence(search.products((EVENT, REST), [np.full(40, on)]))
+        assert found == pytest.approx(wanted, abs=1e-7)
 
 
 def event_case(folder, kind, seed):
