@@ -1,5 +1,7 @@
 """`FmiAsset`: the one client of any FMU. It knows FMI and roles of variables, not wings."""
 
+from __future__ import annotations
+
 import os
 from array import array
 from copy import copy
