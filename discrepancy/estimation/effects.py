@@ -52,11 +52,6 @@ class EffectLaws:
     evaluate_model_laws: Callable[[FloatArray], ModelPatch]
     unknowns_of_model_laws: tuple[int, ...]
 
-    @property
-    def effect_unknown_count(self) -> int:
-        """The number E of unknowns of the effects."""
-        return self.candidate.parameter_count
-
     @cached_property
     def hold_at_rest(self) -> bool:
         """Whether a law of the hypothesis may hold a body at rest, as dry friction does.
@@ -128,7 +123,7 @@ class EffectLaws:
         derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
 
         effect_values, shared_values = arguments.effect, arguments.shared
-        for k in range(self.effect_unknown_count):
+        for k in range(self.candidate.parameter_count):
             self._add_derivatives(
                 derivatives,
                 len(shared_values) + k,

@@ -61,15 +61,6 @@ class ReadingChanges:
 
         It is the response of the patched model minus that of the model. The estimated motion is not
         used.
-
-        Parameters
-        ----------
-        trial : PortedTrial
-            The trial as a linear system with ports.
-        trial_index : int
-            The index of the trial in the problem.
-        patch : ModelPatch
-            The change of the model.
         """
         shared_values, local_values = self._linearisation_point(trial)
         # both responses are without the gains of the channels
@@ -83,19 +74,7 @@ class ReadingChanges:
     def _readings_of_sensor_errors(
         self, trial: PortedTrial, trajectory: Trajectory, trial_index: int, sensors: ModelPatch
     ) -> FloatArray:
-        """Return the change (N, C) of the readings by errors of sensors, divided by the noise.
-
-        Parameters
-        ----------
-        trial : PortedTrial
-            The trial as a linear system with ports.
-        trajectory : Trajectory
-            The motion that the sensors measure, with the forces at ports.
-        trial_index : int
-            The index of the trial in the problem.
-        sensors : ModelPatch
-            The change of the model that consists of errors of sensors.
-        """
+        """Return the change (N, C) of the readings by errors of sensors, divided by the noise."""
         problem = self.problem
         data = problem.trials[trial_index]
         # a thinned trial has some of the samples of the record
