@@ -118,7 +118,9 @@ def try_deck(deck: Path, seconds: float) -> DeckRecord:
     seconds : float
         Processor time that the process, and each run of CalculiX, may take [s].
     """
-    context = multiprocessing.get_context("fork")
+    # A fork of this process would have the locks of its threads, such as those of BLAS.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.studies.calculix_decks"])
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_send_record, args=(deck, seconds, sender))
     process.start()

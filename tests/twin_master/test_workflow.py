@@ -15,8 +15,8 @@ import pytest
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
 from reporting.former_names import FormerNameWarning
+from tests.own_process import ended_by
 from tests.twin_master.runs import check_same, cut_off_after, noted, with_former_names, written
-from tests.twin_master.watch.conftest import HANGS
 from twin_master import workflow
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, read_config
@@ -95,14 +95,7 @@ class KilledReplacement:
         self.was_moved_aside = moves == 1  # later moves have put the second run in its place
         make(self.folder, "first")
         written(self.folder, "mine", name="notes.txt")
-        child = os.fork()
-        if not child:
-            signal.alarm(HANGS)  # it ends by itself if it hangs
-            try:
-                self.replace(moves)
-            finally:
-                os._exit(1)
-        self.status = os.waitpid(child, 0)[1]
+        self.exit_code = ended_by(lambda: self.replace(moves))
 
     def replace(self, moves: int) -> None:
         """Replace the run, and kill this process behind so many moves."""
@@ -126,7 +119,7 @@ class KilledReplacement:
 @pytest.fixture(params=[1, 2, 3], ids=lambda moves: f"{moves} moves")
 def killed_replacement(request: pytest.FixtureRequest, tmp_path: Path) -> KilledReplacement:
     killed = KilledReplacement(tmp_path, request.param)
-    assert killed.status == signal.SIGKILL
+    assert killed.exit_code == -signal.SIGKILL
     return killed
 
 

@@ -2,12 +2,14 @@
 
 import json
 import os
+import pkgutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +18,9 @@ import pytest
 from distributed import Client
 
 from reporting.progress import Progress, Stage
+from tests.own_process import HANGS, ended_by
 from tests.twin_master.runs import journal
-from tests.twin_master.watch.conftest import HANGS, wait_until
+from tests.twin_master.watch.conftest import wait_until
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
 from twin_master.fleet.engine import Engine
@@ -53,8 +56,9 @@ def check_complete(folder: Path, whole: Path) -> None:
     assert sorted(noted) == list(range(TWINS))
 
 
-def fly_and_die(fleet: Fleet, folder: Path, owner: Any, name: str, calls: int) -> None:
-    """Fly a fleet in this process, which kills itself after so many calls of a function."""
+def fly_and_die(library_file: Path, folder: Path, place: str, name: str, calls: int) -> None:
+    """Fly a fleet in this process, which kills itself after so many calls of a function of a place."""
+    owner = pkgutil.resolve_name(place)
     function = getattr(owner, name)
     count = 0
 
@@ -67,19 +71,7 @@ def fly_and_die(fleet: Fleet, folder: Path, owner: Any, name: str, calls: int) -
         return result
 
     setattr(owner, name, killing)
-    fly_fleet(fleet, folder)
-
-
-def ended_by(run: Callable[[], object]) -> int:
-    """Run a function in a process of its own, and return how it ended."""
-    child = os.fork()
-    if not child:
-        signal.alarm(HANGS)  # it ends by itself if it hangs
-        try:
-            run()
-        finally:
-            os._exit(1)
-    return os.waitpid(child, 0)[1]
+    fly_fleet(growing(library_file), folder)
 
 
 @pytest.fixture(
@@ -97,14 +89,8 @@ def ended_by(run: Callable[[], object]) -> int:
 )
 def killed_client(request: pytest.FixtureRequest, library_file: Path, tmp_path: Path) -> Path:
     """The folder of the fleet, whose process was killed while it wrote."""
-    place, name, calls = request.param
-    module, _, owner_name = place.partition(":")
-    owner = sys.modules[module]
-    if owner_name:
-        owner = getattr(owner, owner_name)
     folder = tmp_path / "cut"
-    fleet = growing(library_file)
-    assert ended_by(lambda: fly_and_die(fleet, folder, owner, name, calls)) == signal.SIGKILL
+    assert ended_by(partial(fly_and_die, library_file, folder, *request.param)) == -signal.SIGKILL
     return folder
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.own_process import ended_by
 from tests.twin_master.runs import journal, of_library
-from tests.twin_master.watch.conftest import HANGS
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line, record_of_line, records
@@ -217,16 +217,13 @@ def lines_up_to(content: bytes, count: int) -> bytes:
 
 def killed_where(known: Known, folder: Path, patch: Callable[[pytest.MonkeyPatch], None]) -> None:
     """Fly in a process of its own that kills itself with SIGKILL where a patch says so."""
-    child = os.fork()
-    if not child:
-        signal.alarm(HANGS)  # it ends by itself if it hangs
-        try:
-            with pytest.MonkeyPatch.context() as monkeypatch:
-                patch(monkeypatch)
-                flown(known, folder)
-        finally:
-            os._exit(1)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+
+    def fly_patched() -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            patch(monkeypatch)
+            flown(known, folder)
+
+    assert ended_by(fly_patched) == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("step", [0, 5, 63, 64, 66])

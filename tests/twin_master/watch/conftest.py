@@ -2,7 +2,6 @@
 
 import copy
 import json
-import os
 import re
 import shutil
 import signal
@@ -21,6 +20,7 @@ import pytest
 from paho.mqtt import client as paho
 
 from reporting.progress import SilentProgress
+from tests.own_process import HANGS, started
 from tests.twin_master.runs import flight_of, journal, text_of
 from twin_master.feeds.broker_address import PASSWORD_VARIABLE
 from twin_master.feeds.csv_feed import CsvFeed
@@ -37,9 +37,6 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.result import store_watch
 from twin_master.watch.workflow import begin_watch
 
-HANGS = 600
-"""After so long [s] something hangs; nothing here takes a second on a machine that is not busy."""
-
 
 def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
     lines = ["step,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
@@ -52,10 +49,18 @@ def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: b
     return path
 
 
+def before_begin(watch: Watch) -> Watch:
+    """Return a copy of a watch without what it makes when it begins."""
+    watch = copy.copy(watch)
+    for name in ("journal", "intake", "twin"):
+        vars(watch).pop(name, None)
+    return watch
+
+
 def begun(base: Watch, folder: Path) -> Watch:
     """Return a watch of the same configuration in a folder of its own, without calibrating again."""
     shutil.copytree(base.folder, folder)
-    watch = copy.copy(base)
+    watch = before_begin(base)
     watch.folder, watch.journal_path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
     return watch
 
@@ -92,22 +97,14 @@ def belief_of(watch: Watch) -> object:
 
 def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
     """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
-    journal, child = watch.folder / JOURNAL_NAME, os.fork()
-    if not child:
-        signal.alarm(HANGS)  # it ends by itself if it hangs
-        try:
-            run()
-            os._exit(0)
-        finally:
-            os._exit(1)
-    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+    journal, process = watch.folder / JOURNAL_NAME, started(run)
+    while process.is_alive():
         if journal.exists() and journal.stat().st_size >= size:
-            os.kill(child, signal.SIGKILL)
-            ended = os.waitpid(child, 0)
-            break
+            process.kill()
+            process.join()
         time.sleep(0.0005)
-    assert ended[1] in (0, signal.SIGKILL)
-    return ended[1] == signal.SIGKILL
+    assert process.exitcode in (0, -signal.SIGKILL)
+    return process.exitcode == -signal.SIGKILL
 
 
 def viewed(folder: Path) -> Flight:

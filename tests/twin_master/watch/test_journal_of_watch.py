@@ -5,15 +5,25 @@ import os
 import signal
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.own_process import ended_by
 from tests.twin_master.runs import check_same, in_format_1, journal
-from tests.twin_master.watch.conftest import HANGS, Mosquitto, begun, mosquitto, ran, wait_until, write_csv
-from tests.twin_master.watch.test_brokers import TOPIC, heard_at, where_of
+from tests.twin_master.watch.conftest import (
+    Mosquitto,
+    before_begin,
+    begun,
+    mosquitto,
+    ran,
+    wait_until,
+    write_csv,
+)
+from tests.twin_master.watch.test_brokers import TOPIC, heard_at, run_over, where_of
 from twin_master.feeds.csv_feed import CsvFeed
 from twin_master.feeds.recorded_feeds import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
@@ -22,7 +32,6 @@ from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.folder import Watch
-from twin_master.watch.mqtt import MqttFeed
 from twin_master.watch.teaching import Teaching
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
@@ -70,22 +79,20 @@ class LearningWatch:
     def killed_at(self, step: int, folder: Path, name: str) -> Watch:
         """Return a watch that was killed by SIGKILL before or after a method of its journal wrote a step."""
         watch = self.new(folder)
-        kill_at(step, lambda: self.run(watch), after=name == "after")
+        feed = CsvFeed(self.recording, watch.scenario)
+        kill_at(step, partial(ran, watch, feed), after=name == "after")
         return watch
 
 
 def kill_at(step: int, run: Callable[[], object], *, after: bool) -> None:
     """Run in a process of its own, which is killed before or after its journal has a step."""
-    child = os.fork()
-    if not child:
-        signal.alarm(HANGS)  # it ends by itself if it hangs
-        try:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(JournalFile, "append", dying_at(step, after=after))
-                run()
-        finally:
-            os._exit(1)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+
+    def run_patched() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(JournalFile, "append", dying_at(step, after=after))
+            run()
+
+    assert ended_by(run_patched) == -signal.SIGKILL
 
 
 def dying_at(step: int, *, after: bool) -> Callable[..., None]:
@@ -207,7 +214,7 @@ class KilledOverBroker:
     """A learning watch that is killed several times over a broker, and the decisions that are heard."""
 
     def __init__(self, learning: LearningWatch, broker: Mosquitto, folder: Path) -> None:
-        self.watch, self.broker = learning.new(folder), broker
+        watch, where = learning.new(folder), where_of(broker)
         messages = learning.messages(STEPS_OVER_BROKER)
         listener, self.heard = heard_at(broker, "listener")
 
@@ -216,23 +223,17 @@ class KilledOverBroker:
                 listener.publish(TOPIC, message, qos=1)
 
         # All messages but the first wait at the broker
-        self.run(1, publish)
+        run_over(where, watch, 1, publish)
         listener.disconnect()
-        listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
+        listener.loop_stop()  # the broker keeps what it is to hear
         for step in KILLED_AFTER:
-            learning.over(self.watch)
-            kill_at(step, lambda: self.run(STEPS_OVER_BROKER), after=True)
-        learning.over(self.watch)
-        self.run(STEPS_OVER_BROKER)
+            learning.over(watch)
+            kill_at(step, partial(run_over, where, before_begin(watch), STEPS_OVER_BROKER), after=True)
+        learning.over(watch)
+        run_over(where, watch, STEPS_OVER_BROKER)
         listener = broker.client("listener", self.heard)
         wait_until(lambda: self.heard and self.heard[-1]["step"] == STEPS_OVER_BROKER - 1)
         listener.disconnect()
-
-    def run(self, steps: int, note: Callable[[str], object] = str) -> None:
-        """Watch over the broker up to a number of steps."""
-        feed = MqttFeed(where_of(self.broker), self.watch, note)
-        self.watch.run(feed, str, step_limit=steps)
-        feed.close()
 
 
 def test_a_killed_watch_publishes_what_it_has_learnt_again_with_the_same_bits(learning, tmp_path):

@@ -234,14 +234,14 @@ def test_a_watch_that_was_killed_anywhere_is_the_same_to_the_bit(base, eventful,
         watch = begun(base, tmp_path / name)
         watches.append(with_section(watch, seconds_per_step=1.0, longest_gap=200))
     whole, killed = watches
-    feed = file_feed(eventful, whole.scenario)
-    ran(whole, feed)
+    ran(whole, file_feed(eventful, whole.scenario))
     expected = (whole.folder / JOURNAL_NAME).read_bytes()
     told = {notice["kind"] for record in journal(whole.folder) for notice in record.get("notices", ())}
     assert {"pause", "clock", "gap", "rate", "begin"} <= told
     chance = random.Random(1)
     kills, size = 0, 0
-    while killed_at(killed, size + chance.randint(1, 4_000), lambda: ran(killed, feed, pause=0.005)):
+    feed = file_feed(eventful, killed.scenario)
+    while killed_at(killed, size + chance.randint(1, 12_000), lambda: ran(killed, feed, pause=0.005)):
         kills += 1
         content = (killed.folder / JOURNAL_NAME).read_bytes()
         assert expected.startswith(content)

@@ -111,15 +111,21 @@ def test_a_copy_from_behind_its_last_step_is_refused(whole):
         raise AssertionError
 
 
-def test_a_kill_at_any_moment_loses_no_step(watch, recorded, whole, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)  # so that each line may be the last
+def run_with_flushes(watch: Watch, feed: CsvFeed) -> None:
+    """Run a watch that flushes each line, so that each may be the last."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)
+        ran(watch, feed, pause=0.005)
+
+
+def test_a_kill_at_any_moment_loses_no_step(watch, recorded, whole):
     feed = CsvFeed(recorded, watch.scenario)
     chance = random.Random(3)
     file = watch.folder / JOURNAL_NAME
     expected = (whole / JOURNAL_NAME).read_bytes()
     kills, size = 0, 0
     while killed_at(
-        watch, size + chance.randint(0, len(expected) // 16), lambda: ran(watch, feed, pause=0.005)
+        watch, size + chance.randint(0, len(expected) // 16), lambda: run_with_flushes(watch, feed)
     ):
         kills += 1
         content = file.read_bytes()
