@@ -22,8 +22,8 @@ from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import OverridesOrMapping, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.fleet.checks import source_of
+from twin_master.mission.plant import Plant, sentence_of_ending_action
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.steps import Plant, sentence_of_ending_action
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 
 try:

@@ -34,7 +34,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from tests.uav_twin.test_discrepancy_import import TWO
 from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError, ScenarioError
-from twin_master.mission.steps import Truth
+from twin_master.mission.plant import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.workflow import check_scenario
 from uav_twin import _HOMES, cli, load_design, load_scenario

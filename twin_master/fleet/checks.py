@@ -9,7 +9,7 @@ from twin_master.errors import FleetError
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.storage.store_layout import dimension_sizes
-from twin_master.mission.side_by_side import FLIGHT_ERRORS
+from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.scenario.schema import Scenario
 
 _WING_PARAMETER = "young_modulus_factor"

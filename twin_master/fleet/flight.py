@@ -49,8 +49,8 @@ from twin_master.mission.parts import (
     GivenSensorModel,
     TwinParts,
 )
+from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
-from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.pictures import plot_courses

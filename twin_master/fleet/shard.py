@@ -29,16 +29,12 @@ from twin_master.feeds.message import FeedItem
 from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.members import Member
 from twin_master.fleet.storage.store import FAILED, stored_variables
-from twin_master.mission.loop import operate
+from twin_master.mission.loop import log_notices, operate
 from twin_master.mission.parts import TwinParts
+from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.mission.replay import BelievedModel, refilter
-from twin_master.mission.side_by_side import (
-    FLIGHT_ERRORS,
-    Flights,
-    fly_one_by_one,
-    fly_side_by_side,
-)
+from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
@@ -65,16 +61,14 @@ def flights_of_recordings(
         try:
             history = _history_of_recording(knowledge, messages)
         except FLIGHT_ERRORS as error:
-            flights.failure[number] = str(error)
+            flights.fail(number, str(error))
             continue
         step_count = len(history.steps)
         if step_count == 0:
-            flights.failure[number] = "its recording has no step yet."
+            flights.fail(number, "its recording has no step yet.")
         elif step_count > most_steps:
-            flights.failure[number] = (
-                f"it has {step_count} steps, and {most_steps} at most are flown: "
-                "set `steps` of the group."
-            )
+            sentence = f"it has {step_count} steps, and {most_steps} at most are flown: "
+            flights.fail(number, f"{sentence}set `steps` of the group.")
         else:
             flights.store_history(number, history)
     return flights
@@ -93,7 +87,7 @@ def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) ->
     reading_of_step: dict[int, Reading] = {}
     has_late_message = False
     intake_notices: list[tuple[int, Notice]] = []
-    for step in operate(twin, intake, history.add):
+    for step in operate(twin, intake, history.add, log_notices):
         number = intake.observation_step
         reading_of_step[number] = Reading(step.reading.observed, twin.control_of(number))
         if step.reading.revises is not None:

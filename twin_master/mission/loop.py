@@ -1,4 +1,4 @@
-"""The loop of a mission or a watch: a source gives observations, the twin assimilates and decides.
+"""The loop of missions, fleets and watches: act and observe, assimilate and decide.
 
 A mission that was interrupted can be resumed.
 """
@@ -7,7 +7,9 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
+
+from numpy.typing import ArrayLike
 
 from reporting.log import module_logger
 from reporting.progress import Progress, SilentProgress
@@ -27,22 +29,33 @@ from twin_master.mission.journal import (
     step_record,
     with_short_truth,
 )
+from twin_master.mission.plant import Plant
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.recent_parts import BLOCK_STEPS, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
-from twin_master.mission.steps import History, MissionStep, Plant, Reading
+from twin_master.mission.steps import History, MissionStep, OperatedStep, Reading, StepT
 from twin_master.network.estimator import Notice
-from twin_master.network.twin import Twin, TwinStep
+from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 
 _logger = module_logger(__name__)
 
 
-class Source(Protocol):
-    """Where observations come from: a simulated asset, a file, a broker."""
+class SteppedTwin(Protocol[StepT]):
+    """A `Twin`, or `TwinsSideBySide`: it assimilates an observation and decides."""
 
-    def read(self, twin: Twin) -> Reading | None:
-        """Return the next observation for the twin; None if there are no more."""
+    def step(self, observation: ArrayLike, control: int | None = None) -> StepT:
+        """Return estimate and decision after an observation; a control left out is the proposed."""
+
+
+AnyTwin = TypeVar("AnyTwin", contravariant=True)
+
+
+class Source(Protocol[AnyTwin]):
+    """Where observations come from: simulated assets, a file, a broker."""
+
+    def read(self, twin: AnyTwin) -> Reading | None:
+        """Act on the decision of the twin, and return its next observation; None at the end."""
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Return the observation that replaces one that the twin refused with an error."""
@@ -52,15 +65,20 @@ StepSink = Callable[[MissionStep], None]
 """Stores a step, such as in a journal or in a history."""
 
 
-def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionStep]:
+def operate(
+    twin: SteppedTwin[StepT],
+    source: Source[Any],
+    *sinks: Callable[[OperatedStep[StepT]], None],
+) -> Iterator[OperatedStep[StepT]]:
     """Let a twin assimilate and decide until its source ends; yield each step once it is stored.
 
     Parameters
     ----------
-    twin : Twin
-        The twin that assimilates and decides.
+    twin : Twin or TwinsSideBySide
+        The twin or twins that assimilate and decide.
     source : Source
-        The source. It is asked for an observation after the previous step was stored.
+        The source of such a twin. It is asked for an observation after the previous step was
+        stored.
     *sinks : callable
         Functions that store each step, called one after the other.
     """
@@ -76,11 +94,9 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
             reading = source.replace_impossible(reading, error)
             twin_step = _assimilate(twin, reading)
         time_decided = time.perf_counter()
-        step = MissionStep(reading, twin_step)
+        step = OperatedStep(reading, twin_step)
         for sink in sinks:
             sink(step)
-        for notice in twin_step.notices:
-            _logger.info("%s", notice.sentence)
         time_stored = time.perf_counter()
         yield replace(
             step,
@@ -92,11 +108,17 @@ def operate(twin: Twin, source: Source, *sinks: StepSink) -> Iterator[MissionSte
         )
 
 
-def _assimilate(twin: Twin, reading: Reading) -> TwinStep:
+def _assimilate(twin: SteppedTwin[StepT], reading: Reading) -> StepT:
     """Let the twin take in a reading, as its next step or as the revision of an earlier one."""
-    if reading.revises is not None:
+    if reading.revises is not None and isinstance(twin, Twin):
         return twin.revise(reading.revises, reading.observed, reading.control)
     return twin.step(reading.observed, reading.control)
+
+
+def log_notices(step: MissionStep) -> None:
+    """Write the notices of a step to the log."""
+    for notice in step.twin_step.notices:
+        _logger.info("%s", notice.sentence)
 
 
 def fly(
@@ -142,7 +164,7 @@ def fly(
     unit = f"{scenario.mission.step_name}s"
     with progress.stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
         stage.advance(twin.steps)
-        for step in operate(twin, plant, *sinks):
+        for step in operate(twin, plant, *sinks, log_notices):
             history.add(step)
             stage.advance(detail=scenario.control_names[step.twin_step.control_index])
     if plant.reason_of_end:

@@ -31,7 +31,7 @@ from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import discounts, plan_within_limit
-from twin_master.mission.steps import Plant, Truth
+from twin_master.mission.plant import Plant, Truth
 from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
@@ -362,9 +362,9 @@ class Knowledge:
         """Return the true damage, noise and faults of the mission with a seed."""
         return Truth(self.scenario, self.true_model, seed)
 
-    def plant(self, truth: Truth, asset: Asset) -> Plant:
-        """Return the simulated asset, with the true damage, noise and faults."""
-        return Plant(self.scenario, truth, asset)
+    def plant(self, truth: Truth, *assets: Asset) -> Plant:
+        """Return the simulated asset, or several side by side, with damage, noise and faults."""
+        return Plant(self.scenario, truth, *assets)
 
 
 def _inspected_sensor_model(

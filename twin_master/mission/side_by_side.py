@@ -7,30 +7,25 @@ draws of one twin, never over twins.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from calibration.errors import CalibrationError
-from fe.runtime.errors import FiniteElementError
-from fmu_asset.errors import FmuError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import TwinMasterError
 from twin_master.learning.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.learning.monitor import gauge_watch_of
 from twin_master.learning.watch_state import WatchState
-from twin_master.mission.loop import early_end_sentence, fly
+from twin_master.mission.loop import early_end_sentence, fly, operate
+from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth, sentence_of_ending_action
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, Truth, checked_observation, sentence_of_ending_action
+from twin_master.mission.steps import History, OperatedStep, Reading
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
 from twin_master.network.planner import decision_probability, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, unbelievable_observation
 
-FLIGHT_ERRORS = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
-"""Errors that end the flight of one asset, but not the flights of the others."""
 _MOST_NUMBERS_TOGETHER = 10_000_000
 """Numbers of four bytes in the beliefs about gauges of the twins that fly together."""
 
@@ -61,6 +56,8 @@ class Flights:
         How the asset of each twin ended its simulation early; empty if it did not.
     notices : list of list of (int, Notice)
         The notices of each twin to its operator, with their steps.
+    is_flying : (B,) array of bool
+        Which twins have neither failed nor ended.
     """
 
     observation_rows: Float
@@ -72,6 +69,7 @@ class Flights:
     failure: list[str]
     ended: list[str]
     notices: list[list[tuple[int, Notice]]]
+    is_flying: NDArray[np.bool_]
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
@@ -89,6 +87,7 @@ class Flights:
             failure=[""] * count,
             ended=[""] * count,
             notices=[[] for _ in range(count)],
+            is_flying=np.ones(count, dtype=bool),
         )
 
     @classmethod
@@ -106,7 +105,31 @@ class Flights:
             failure=list(chain.from_iterable(formation.failure for formation in flights)),
             ended=list(chain.from_iterable(formation.ended for formation in flights)),
             notices=list(chain.from_iterable(formation.notices for formation in flights)),
+            is_flying=np.concatenate([formation.is_flying for formation in flights]),
         )
+
+    def fail(self, twin: int, sentence: str) -> None:
+        """Note the error that ends the flight of a twin."""
+        self.failure[twin] = sentence
+        self.is_flying[twin] = False
+
+    def end(self, twin: int, sentence: str) -> None:
+        """Note how the asset of a twin has ended its simulation early."""
+        self.ended[twin] = sentence
+        self.is_flying[twin] = False
+
+    def store_step(self, step: "OperatedStep[StepOfTwins]") -> None:
+        """Store a step of the twins that are still flying."""
+        beliefs = step.twin_step
+        is_flying = self.is_flying
+        ground_truth = step.reading.ground_truth
+        assert ground_truth is not None  # the assets are simulated
+        self.observation_rows[is_flying, beliefs.step] = step.reading.observed[is_flying]
+        self.control_index[is_flying, beliefs.step] = beliefs.control_index[is_flying]
+        self.state[is_flying, beliefs.step] = ground_truth.state[is_flying]
+        self.filtered[is_flying, beliefs.step] = beliefs.filtered[is_flying]
+        self.log_evidence[is_flying, beliefs.step] = beliefs.log_evidence[is_flying]
+        self.unexplained[is_flying, beliefs.step] = beliefs.unexplained[is_flying]
 
     def store_history(self, twin: int, history: History) -> None:
         """Store the steps of one twin."""
@@ -119,117 +142,9 @@ class Flights:
             self.unexplained[twin, :steps_flown] = history.unexplained
         if history.simulated:
             self.state[twin, :steps_flown] = history.state
-        self.ended[twin] = history.sentence_of_early_end
+        if history.sentence_of_early_end:
+            self.end(twin, history.sentence_of_early_end)
         self.notices[twin] = history.notices
-
-
-class _TrueStates(NamedTuple):
-    """The true states of B assets.
-
-    Attributes
-    ----------
-    state_index : (B,) array
-        The indices of the states; zeros if the states are scripted.
-    state : (B, F) array
-        The value of each state factor, SI.
-    """
-
-    state_index: Index
-    state: Float
-
-
-class _StatelessAssets:
-    """Assets without memory: each is evaluated once for each control and state, and then reused."""
-
-    def __init__(
-        self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
-    ) -> None:
-        self._scenario = knowledge.scenario
-        self._states = knowledge.model.states
-        distinct_assets = {id(asset): asset for asset in assets}
-        self._assets = list(distinct_assets.values())
-        numbers = {key: number for number, key in enumerate(distinct_assets)}
-        self._asset_of_twin = np.array([numbers[id(asset)] for asset in assets])
-        self._truth = Truth.stack(truths)
-        self._previous_control: Index | None = None
-        self._previous_state_index: Index | None = None
-        self._previous_sensed: Float | None = None
-        # What an asset shows under a control in a state, or the sentence why it shows nothing.
-        self._observations: dict[tuple[int, int, bytes], Float | str] = {}
-
-    def fly_step(
-        self, step: int, control: Index, is_flying: NDArray[np.bool_], failure: list[str]
-    ) -> tuple[Float, Float]:
-        """Fly one step of all twins.
-
-        Parameters
-        ----------
-        step : int
-            The step, from 0.
-        control : (B,) array
-            The control in force for each twin.
-        is_flying : (B,) array of bool
-            Whether the twin is still flying.
-        failure : list of str
-            The error of each twin, empty if there is none; errors of assets are written into it.
-
-        Returns
-        -------
-        (B, G + I) array
-            The observed values, SI.
-        (B, F) array
-            The true states, SI.
-        """
-        true_states = self._advance(step, control)
-        # Twins with the same asset, control and state share one observation.
-        code = self._asset_of_twin * len(self._scenario.control) + control
-        code = code * self._states.size + true_states.state_index
-        _, first_twins, group_of_twin = np.unique(
-            np.where(is_flying, code, -1), return_index=True, return_inverse=True
-        )
-        observations = np.full((len(first_twins), self._scenario.observation.count), np.nan)
-        for group, twin in enumerate(first_twins.tolist()):
-            asset = int(self._asset_of_twin[twin])
-            observation = self._observe(step, asset, int(control[twin]), true_states.state[twin])
-            if isinstance(observation, str):
-                for failing_twin in np.flatnonzero((group_of_twin == group) & is_flying):
-                    failure[failing_twin] = observation
-            else:
-                observations[group] = observation
-        sensed = self._truth.sense(step, observations[group_of_twin], self._previous_sensed)
-        self._previous_sensed = sensed
-        inspected = self._truth.inspect(step, true_states.state, control)
-        return np.hstack((sensed, inspected)), true_states.state
-
-    def _advance(self, step: int, control: Index) -> _TrueStates:
-        """Return the true states in a step: scripted, or drawn given the previous states."""
-        if self._scenario.truth.kind == "scripted":
-            state = self._truth.state(step, None, None)
-            return _TrueStates(
-                np.zeros_like(control), np.broadcast_to(state, (len(control), len(state)))
-            )
-        state_index = self._truth.growth.next_states(
-            self._previous_control, self._previous_state_index, self._truth.uniform[step]
-        )
-        self._previous_control = control
-        self._previous_state_index = state_index
-        return _TrueStates(state_index, self._states.coordinates[state_index])
-
-    def _observe(self, step: int, asset: int, control_index: int, state: Float) -> Float | str:
-        """Return the values of an asset's G sensors without noise, SI, or the text of its error."""
-        key = (asset, control_index, state.tobytes())
-        if key not in self._observations:
-            control = self._scenario.control[control_index]
-            health = dict(zip(self._scenario.state_names, state.tolist(), strict=True))
-            try:
-                reading = self._assets[asset].step(control.values, health)
-                observation: Float | str = checked_observation(
-                    self._scenario, reading, step, control.name
-                )
-            except FLIGHT_ERRORS as error:
-                observation = str(error)
-            self._observations[key] = observation
-        return self._observations[key]
 
 
 def fly_side_by_side(
@@ -258,109 +173,174 @@ def fly_side_by_side(
     watch = gauge_watch_of(knowledge.estimator)
     if watch is not None:
         size = max(1, _MOST_NUMBERS_TOGETHER // watch.faults.belief_size)
-    flights = []
+    formations = []
     for first in range(0, len(truths), size):
-        formation = _Formation(
-            knowledge, truths[first : first + size], assets[first : first + size]
-        )
-        for step in range(knowledge.scenario.mission.steps):
-            formation.fly_step(step)
-        flights.append(formation.flights)
-    return Flights.concatenate(flights)
+        truth = Truth.stack(truths[first : first + size])
+        plant = knowledge.plant(truth, *assets[first : first + size])
+        flights = Flights.empty(knowledge, *truth.shape)
+        twins = TwinsSideBySide(knowledge, flights)
+        for _ in operate(twins, AssetsSideBySide(plant, flights), flights.store_step):
+            pass
+        formations.append(flights)
+    return Flights.concatenate(formations)
 
 
-class _Formation:
-    """B twins that fly the same step at the same time.
+class AssetsSideBySide:
+    """The source of the observations of B twins: assets without memory, which fly side by side.
+
+    Parameters
+    ----------
+    plant : Plant
+        The assets and their truth, at the start of the mission.
+    flights : Flights
+        The record in which the ends of flights are noted.
+    """
+
+    def __init__(self, plant: Plant, flights: Flights) -> None:
+        self._plant = plant
+        self._flights = flights
+
+    def read(self, twins: "TwinsSideBySide") -> Reading | None:
+        """Fly the next step of all twins; None once all missions are at their ends."""
+        if twins.steps == twins.scenario.mission.steps:
+            return None
+        previous_control = None
+        if twins.steps > 0:
+            previous_control = twins.previous_control
+            self._end_missions(twins)
+        is_flying = self._flights.is_flying
+        reading = self._plant.fly_step(twins.proposed_control, previous_control, is_flying)
+        for twin, sentence in self._plant.failures.items():
+            self._flights.fail(twin, sentence)
+        reading.observed[~is_flying] = np.nan
+        return reading
+
+    def _end_missions(self, twins: "TwinsSideBySide") -> None:
+        """End the missions whose last control was an action that ends them."""
+        scenario = twins.scenario
+        for twin in np.flatnonzero(self._flights.is_flying).tolist():
+            control = int(twins.previous_control[twin])
+            if scenario.ends(control):
+                reason = sentence_of_ending_action(scenario, control)
+                self._flights.end(twin, early_end_sentence(scenario, twins.steps, reason))
+
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Raise the error: a simulated asset showed the reading, whatever its twin believes."""
+        raise error
+
+
+@dataclass(frozen=True)
+class StepOfTwins:
+    """What B twins conclude in a step.
 
     Attributes
     ----------
-    flights : Flights
-        The histories of the twins so far.
+    step : int
+        The number of the step, from 0.
+    control_index : (B,) array
+        The control in force.
+    filtered : (B, S) array
+        The belief p(D_t | o_0..o_t), averaged over the hypotheses about gauges.
+    log_evidence : (B,) array
+        log p(o_t | o_0..o_{t-1}).
+    unexplained : (B,) array
+        The probability that no state explains the sensors.
     """
 
-    def __init__(
-        self, knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
-    ) -> None:
-        scenario = knowledge.scenario
-        count = len(truths)
-        self.flights = Flights.empty(knowledge, count)
+    step: int
+    control_index: Index
+    filtered: Float
+    log_evidence: Float
+    unexplained: Float
+
+
+class TwinsSideBySide:
+    """B twins of one scenario that assimilate and decide together, as `Twin` does alone.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        The knowledge of all twins.
+    flights : Flights
+        The record of the twins, in which failures and notices are noted.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        The scenario of the twins.
+    steps : int
+        The number of steps so far.
+    previous_control, proposed_control : (B,) array
+        The indices of the controls in force in the last step, and of those for the next one.
+    """
+
+    def __init__(self, knowledge: Knowledge, flights: Flights) -> None:
+        self.scenario = knowledge.scenario
+        count = len(flights.is_flying)
+        first_control = self.scenario.control_names.index(self.scenario.mission.first_control)
+        self.steps = 0
+        self.previous_control: Index = np.full(count, NO_CONTROL)
+        self.proposed_control: Index = np.full(count, first_control)
         self._knowledge = knowledge
-        self._assets = _StatelessAssets(knowledge, truths, assets)
-        first_control = scenario.control_names.index(scenario.mission.first_control)
-        self._control = np.full(count, first_control)
-        self._previous_control: Index = np.full(count, NO_CONTROL)
-        self._filter = ExactFilter(knowledge.model, knowledge.sensor_model, scenario.mission.name)
-        self._log_belief: Float = knowledge.model.log_prior
-        self._is_flying = np.ones(count, dtype=bool)
-        self._ends_mission = np.array(
-            [scenario.ends(index) for index in range(len(scenario.control))]
+        self._flights = flights
+        self._filter = ExactFilter(
+            knowledge.model, knowledge.sensor_model, self.scenario.mission.name
         )
+        self._log_belief: Float = knowledge.model.log_prior
         self._inspecting_controls = sorted(
-            {reading.control_index for reading in scenario.inspection_readings}
+            {reading.control_index for reading in self.scenario.inspection_readings}
         )
         self._watch = gauge_watch_of(knowledge.estimator)
         self._watch_state: WatchState | None = None
 
-    def fly_step(self, step: int) -> None:
-        """Fly one step of all twins, filter its observations, and decide on the next control.
+    def step(self, observation: ArrayLike, control: ArrayLike | None = None) -> StepOfTwins:
+        """Filter the observations of a step, and decide on the next controls.
 
-        What was flown is stored in `flights`.
+        Parameters
+        ----------
+        observation : (B, G + I) array
+            The values of G sensors and I inspections, SI; NaN where nothing was received.
+        control : (B,) array, optional
+            The indices of the controls in force; the proposed ones if left out.
+
+        Raises
+        ------
+        InvalidObservationError
+            If an observation is infinite, or so improbable that no belief can be computed.
         """
-        if step > 0:
-            self._end_missions(step)
-        observed_rows, state = self._assets.fly_step(
-            step, self._control, self._is_flying, self.flights.failure
-        )
-        self._is_flying &= np.array(self.flights.failure) == ""
-        observed_rows[~self._is_flying] = np.nan
+        rows = np.asarray(observation)
+        controls = self.proposed_control if control is None else np.asarray(control)
 
         # The beliefs: under the model and, with notices, averaged over the faults of gauges.
         checked = None
         if self._watch is not None:
-            checked = self._watch.leave_out_useless_readings(
-                self._watch_state, observed_rows, self._control
-            )
-        used_rows = observed_rows if checked is None else checked.rows
+            checked = self._watch.leave_out_useless_readings(self._watch_state, rows, controls)
+        used_rows = rows if checked is None else checked.rows
         model_beliefs, errors = self._filter.step_of_twins(
-            self._log_belief, self._previous_control, used_rows, self._control, step
+            self._log_belief, self.previous_control, used_rows, controls, self.steps
         )
         for twin, error in errors.items():
-            self.flights.failure[twin] = self.flights.failure[twin] or str(error)
-            self._is_flying[twin] = False
+            self._flights.fail(twin, str(error))
         beliefs = model_beliefs.filtered
         unexplained = np.zeros(len(beliefs))
         if self._watch is not None and checked is not None:
-            watch_state = self._watch_gauges(self._watch, step, checked, model_beliefs)
+            watch_state = self._watch_gauges(self._watch, checked, model_beliefs)
             beliefs = watch_state.mixed.belief
             unexplained = watch_state.weights.free_gains_probability
 
-        # Store the step of the twins that are still flying.
-        is_flying = self._is_flying
-        flights = self.flights
-        flights.observation_rows[is_flying, step] = observed_rows[is_flying]
-        flights.control_index[is_flying, step] = self._control[is_flying]
-        flights.state[is_flying, step] = state[is_flying]
-        flights.filtered[is_flying, step] = beliefs[is_flying]
-        flights.log_evidence[is_flying, step] = model_beliefs.log_evidence[is_flying]
-        flights.unexplained[is_flying, step] = unexplained[is_flying]
-
+        twin_step = StepOfTwins(
+            self.steps, controls, beliefs, model_beliefs.log_evidence, unexplained
+        )
         self._log_belief = model_beliefs.log_filtered
-        self._previous_control = self._control
-        self._control = self._decide(beliefs, unexplained)
-
-    def _end_missions(self, step: int) -> None:
-        """End the missions whose last control was an action that ends them."""
-        ends_now = self._is_flying & self._ends_mission[self._previous_control]
-        for twin in np.flatnonzero(ends_now).tolist():
-            scenario = self._knowledge.scenario
-            reason = sentence_of_ending_action(scenario, self._previous_control[twin])
-            self.flights.ended[twin] = early_end_sentence(scenario, step, reason)
-            self._is_flying[twin] = False
+        self.steps += 1
+        self.previous_control = controls
+        self.proposed_control = self._decide(beliefs, unexplained)
+        return twin_step
 
     def _watch_gauges(
-        self, watch: GaugeWatch, step: int, checked: CheckedReadings, model_beliefs: Filtered
+        self, watch: GaugeWatch, checked: CheckedReadings, model_beliefs: Filtered
     ) -> WatchState:
-        """Return the state of the watch after a step, and store its notices in `flights.notices`.
+        """Return the state of the watch after a step, and note the notices of flying twins.
 
         Raises
         ------
@@ -372,13 +352,14 @@ class _Formation:
             checked,
             model_beliefs.forecast,
             model_beliefs.filtered,
-            self._previous_control,
-            step,
+            self.previous_control,
+            self.steps,
         )
-        if np.any(self._is_flying & ~state.is_finite(LARGEST_CARRIED)):
-            raise unbelievable_observation(self._knowledge.scenario.mission.name, step)
-        for twin in np.flatnonzero(self._is_flying).tolist():
-            self.flights.notices[twin] += [(step, notice) for notice in notices[twin]]
+        is_flying = self._flights.is_flying
+        if np.any(is_flying & ~state.is_finite(LARGEST_CARRIED)):
+            raise unbelievable_observation(self.scenario.mission.name, self.steps)
+        for twin in np.flatnonzero(is_flying).tolist():
+            self._flights.notices[twin] += [(self.steps, notice) for notice in notices[twin]]
         self._watch_state = state
         return state
 
@@ -396,7 +377,7 @@ class _Formation:
         probability = decision_probability(
             knowledge.model.transition,
             filtered_belief,
-            self._previous_control,
+            self.previous_control,
             knowledge.plan.policy,
             policy_on_belief,
             ahead=planner.decide_on == "predicted",
@@ -405,11 +386,11 @@ class _Formation:
         )
         control = np.argmax(probability, axis=1)
         if planner.inspections_per_step is not None and policy_on_belief is not None:
-            flying = np.flatnonzero(self._is_flying)
+            flying = np.flatnonzero(self._flights.is_flying)
             control[flying] = ration_controls(
                 knowledge.model.transition,
                 filtered_belief[flying],
-                self._previous_control[flying],
+                self.previous_control[flying],
                 control[flying],
                 policy_on_belief,
                 self._inspecting_controls,
@@ -444,7 +425,7 @@ def fly_one_by_one(
             asset = asset_of(number, previous_ended_well)
             fly(knowledge.scenario, twin, knowledge.plant(truth, asset), history=history)
         except FLIGHT_ERRORS as error:
-            flights.failure[number] = str(error)
+            flights.fail(number, str(error))
         flights.store_history(number, history)
-        previous_ended_well = not flights.failure[number] and not history.sentence_of_early_end
+        previous_ended_well = bool(flights.is_flying[number])
     return flights

@@ -13,9 +13,10 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import JsonObject, plain
 from reporting.words import capital, parameter_title
+from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, spans_of_models
-from twin_master.mission.steps import History, Truth
+from twin_master.mission.steps import History
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of

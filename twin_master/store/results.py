@@ -12,8 +12,8 @@ from reporting.arrays import AnyArray, Float
 from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import Expectation, concatenate_expectations
+from twin_master.mission.plant import SensorStatus, Truth
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
-from twin_master.mission.steps import SensorStatus, Truth
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state

@@ -30,7 +30,7 @@ from twin_master.mission.journal import (
     records_backwards,
     short_record,
 )
-from twin_master.mission.loop import operate
+from twin_master.mission.loop import log_notices, operate
 from twin_master.mission.preparation import link_knowledge, prepare_knowledge, save_knowledge
 from twin_master.mission.recent_parts import RecentParts, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
@@ -309,7 +309,7 @@ class Watch:
         """
         while True:
             twin = self.twin
-            for step in operate(twin, self.intake):
+            for step in operate(twin, self.intake, log_notices):
                 yield self.decision_of(self._write_step(step))
                 if twin is not self.twin:  # a patched model was adopted meanwhile
                     break

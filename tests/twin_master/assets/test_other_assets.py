@@ -40,8 +40,8 @@ from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.feeds.message import MessageReader
 from twin_master.fleet.plan import ensemble
+from twin_master.mission.plant import Plant, Truth
 from twin_master.mission.sensor_design import add_candidate_gauges
-from twin_master.mission.steps import Plant, Truth
 from twin_master.network.identified import packed_row
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario

@@ -12,9 +12,9 @@ from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.learning.monitor import gauge_watch_of
 from twin_master.mission import side_by_side
 from twin_master.mission.parts import TwinParts
+from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.steps import Truth
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.tables import Noticing, SensorFault

@@ -38,8 +38,9 @@ from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line
 from twin_master.mission.journal_packing import pack_numbers
 from twin_master.mission.loop import fly, journal_sink, restore_flight
+from twin_master.mission.plant import Plant, SensorStatus, Truth
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, MissionStep, Plant, SensorStatus, Truth
+from twin_master.mission.steps import History, MissionStep
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
@@ -270,7 +271,7 @@ class Heavy(Plant):
         return np.random.default_rng(self.step).bytes(100)
 
     def restore(self, flown: History, asset_state: bytes) -> None:
-        self.step, self._state = len(flown.steps), flown.state[-1]
+        super().restore(flown, b"")
         assert asset_state == self.save_state()
 
 

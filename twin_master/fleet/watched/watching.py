@@ -21,7 +21,7 @@ from twin_master.fleet.configuration import WATCHED_KIND, locked_fleet_folder
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.watched.watch_sources import LARGEST_FLEET, FileSource, Source, TopicSource
 from twin_master.fleet.watched.watched_asset import STATE_NAME, WatchedAsset, read_standing
-from twin_master.mission.side_by_side import FLIGHT_ERRORS
+from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.watch.folder import Watch
 from twin_master.watch.mqtt import Topic
