@@ -145,10 +145,14 @@ def substep_matrices_with_laws(
     steps, ports, states = len(force_by_state) - 1, force_by_state.shape[1], force_by_state.shape[2]
     transition = np.empty((steps, states, states))
     noise = np.empty((steps, states, states))
-    inverse, explicit, work = np.empty((3, states, states))
+    # Each array is made by itself: numba knows its layout, and compiles `multiply` for one alone.
+    inverse = np.empty((states, states))
+    explicit = np.empty((states, states))
+    work = np.empty((states, states))
     coupling = np.empty((ports, ports))
     explicit_drift = np.empty((states, drift.shape[2]))
-    begin, end = np.empty((2, states, ports))
+    begin = np.empty((states, ports))
+    end = np.empty((states, ports))
     for j in range(steps):
         interval = interval_of_sample[j // substeps + 1]
         tangent = force_by_state[j + 1]
@@ -178,7 +182,9 @@ def substep_matrices_with_laws(
         if ports == 1:
             inverse_tangent = tangent / (1.0 - coupling[0, 0])
         else:
-            inverse_tangent = np.linalg.solve(np.eye(ports) - coupling, tangent)
+            inverse_tangent = np.ascontiguousarray(
+                np.linalg.solve(np.eye(ports) - coupling, tangent)
+            )
         multiply(end, inverse_tangent, inverse)
         for i in range(states):
             inverse[i, i] += 1.0
@@ -346,7 +352,8 @@ def filter_record(
 
     mean, covariance = mean.copy(), covariance.copy()
     predicted_mean = np.empty((state_count, weight_count))
-    predicted_covariance, work = np.empty((2, state_count, state_count))
+    predicted_covariance = np.empty((state_count, state_count))
+    work = np.empty((state_count, state_count))
     covariance_at_sample = np.empty((state_count, state_count))
     gains = np.zeros((channel_count, state_count))
     has_one_row = len(output_rows) == 1
@@ -434,7 +441,8 @@ def smooth_record(
     variance = np.empty((stamp_count, state_count))
     adjoint = np.zeros(state_count)
     information = np.zeros((state_count, state_count))
-    work, carried = np.empty((2, state_count, state_count))
+    work = np.empty((state_count, state_count))
+    carried = np.empty((state_count, state_count))
     information_gain = np.empty(state_count)
     for j in range(stamp_count - 1, -1, -1):
         # smoothed state: filtered state + C r, by the later readings; its covariance is C - C N C
