@@ -355,11 +355,15 @@ class ExactFilter:
             If an observation has another shape, is infinite or cannot be weighed, or if there is no
             such control.
         """
+        # A sensor model of a user may take only one observation at a time.
+        of_sequence = getattr(self._sensor_model, "log_likelihood_sequence", None)
+        if of_sequence is not None:
+            likelihoods = of_sequence(observations, control_index)
+        else:
+            pairs = zip(observations, np.asarray(control_index).tolist(), strict=True)
+            likelihoods = [self._sensor_model.log_likelihood(row, u) for row, u in pairs]
         (controls,), (log_likelihood,) = checked_sequence(
-            self.model,
-            control_index,
-            self._log_likelihood(observations, control_index),
-            what="log-likelihood",
+            self.model, control_index, likelihoods, what="log-likelihood"
         )
         # The filter takes sequences of steps; each twin has a sequence of one.
         sequences, failed_step = filter_many(
@@ -380,15 +384,6 @@ class ExactFilter:
             beliefs.filtered[twin] = self.model.prior
             beliefs.log_filtered[twin] = self.model.log_prior
         return beliefs, errors
-
-    def _log_likelihood(self, observations: Float, control_index: ArrayLike) -> Float:
-        """Return log p(o | D, u) of each twin's observation (B, G) for each state: (B, S)."""
-        of_sequence = getattr(self._sensor_model, "log_likelihood_sequence", None)
-        if of_sequence is not None:
-            return np.asarray(of_sequence(observations, control_index))
-        controls = np.asarray(control_index).tolist()
-        pairs = zip(observations, controls, strict=True)
-        return np.stack([self._sensor_model.log_likelihood(row, u) for row, u in pairs])
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""

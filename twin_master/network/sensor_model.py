@@ -361,15 +361,13 @@ class GaussianSensorModel(QuantityModel):
             log_density += other_log_density[..., None]
         return log_density
 
-    def _log_densities(
-        self, observations: ArrayLike, control_index: ArrayLike, draws: int
-    ) -> Float:
+    def _log_densities(self, observations: Float, control_index: ArrayLike, draws: int) -> Float:
         """Return log densities of a sequence of observations.
 
         Parameters
         ----------
         observations : (T, G) array
-            The sensor values, SI; NaN where a sensor is lost.
+            The checked sensor values, SI; NaN where a sensor is lost.
         control_index : (T,) array
             The control in force in each step.
         draws : int
@@ -380,7 +378,6 @@ class GaussianSensorModel(QuantityModel):
         (T, S, draws) array
             The log densities of values in SI.
         """
-        observations = self.check_observation(observations)
         control = checked_controls(control_index, self.control_count)
         check_shape("controls", control.shape, control.size)
         check_shape("observations", observations.shape, control.size, self.sensor_count)
@@ -419,51 +416,28 @@ class GaussianSensorModel(QuantityModel):
         """
         result = np.empty((len(observations), self.state_count, draws))
         for (control_in_force, present_key), steps in _steps_by_group(control, is_present).items():
-            self._fill_log_densities(observations, steps, control_in_force, present_key, result)
+            # Mostly the same sensors are present in the next step, so that the terms are kept.
+            is_present_now = np.frombuffer(present_key, dtype=bool)
+            last_key, terms = self._last_terms.get(control_in_force, (b"", None))
+            if terms is None or last_key != present_key:
+                terms = self._density_terms(control_in_force, is_present_now)
+                self._last_terms[control_in_force] = (present_key, terms)
+            draw_offset = terms.draw_offset
+            if draws == 1:
+                draw_offset = draw_offset - self._log_weight  # the sum over draws is weighted
+            log_densities(
+                np.ascontiguousarray(np.where(is_present_now, observations[steps], 0.0).T),
+                terms.mean,
+                terms.inverse_deviation,
+                terms.interval_directions,
+                terms.draw_directions,
+                self._draw_coefficients,
+                draw_offset,
+                terms.log_scale,
+                steps,
+                result,
+            )
         return result
-
-    def _fill_log_densities(
-        self, observations: Float, steps: Index, control: int, present_key: bytes, result: Float
-    ) -> None:
-        """Fill in log densities of steps with the same control and the same present sensors.
-
-        The terms that they share are kept for each control until other sensors are present: mostly
-        the same sensors are present in the next step.
-
-        Parameters
-        ----------
-        observations : (T, G) array
-            The sensor values, SI; those of absent sensors are ignored.
-        steps : (N,) array
-            The steps with this control and these sensors.
-        control : int
-            The control in force.
-        present_key : bytes
-            Whether each sensor is present, as the bytes of an array of bool (G,).
-        result : (T, S, E) or (T, S, 1) array
-            To be filled in these steps: the log density of each draw, or that of their average, of
-            values in SI.
-        """
-        is_present = np.frombuffer(present_key, dtype=bool)
-        last_key, terms = self._last_terms.get(control, (b"", None))
-        if terms is None or last_key != present_key:
-            terms = self._density_terms(control, is_present)
-            self._last_terms[control] = (present_key, terms)
-        draw_offset = terms.draw_offset
-        if result.shape[-1] == 1:
-            draw_offset = draw_offset - self._log_weight  # the sum over draws is weighted
-        log_densities(
-            np.ascontiguousarray(np.where(is_present, observations[steps], 0.0).T),
-            terms.mean,
-            terms.inverse_deviation,
-            terms.interval_directions,
-            terms.draw_directions,
-            self._draw_coefficients,
-            draw_offset,
-            terms.log_scale,
-            steps,
-            result,
-        )
 
     def _density_terms(self, control: int, is_present: NDArray[np.bool_]) -> _DensityTerms:
         """Return the terms that all observations with the same present sensors share.

@@ -27,7 +27,6 @@ from twin_master.network.estimator import (
     ExactFilter,
     Notice,
     SensorModel,
-    Suspicion,
 )
 from twin_master.network.graphical_model import (
     GraphicalModel,
@@ -348,8 +347,18 @@ class Twin:
         new_steps: list[_KeptStep] = []
         notices: list[Notice] = []
         for step, (observation, control_index) in enumerate(rows, start=first):
-            estimate = self._estimate(previous_carried, observation, control_index, step)
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    estimate = self.estimator.step(
+                        previous_carried, observation, control_index, step
+                    )
+            except (ArithmeticError, np.linalg.LinAlgError):
+                raise unbelievable_observation(self.name, step) from None
             previous_carried = estimate.carried
+            numbers = (estimate.log_evidence, estimate.filtered, *previous_carried.arrays.values())
+            # False for NaN as well.
+            if not all(np.all(np.asarray(part) < LARGEST_CARRIED) for part in numbers):
+                raise unbelievable_observation(self.name, step)
             new_steps.append(_KeptStep(observation, previous_carried))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
@@ -442,29 +451,6 @@ class Twin:
         kept_steps = list(self._kept_steps)
         return kept_steps if self.lag is None else kept_steps[-(self.lag + 1) :]
 
-    def _estimate(
-        self, before: Carried | None, observation: Float, control_index: int, step: int
-    ) -> Estimate:
-        """Return the estimate of a step, or refuse an observation that leaves no finite belief.
-
-        Parameters are those of `Estimator.step`.
-        """
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                estimate = self.estimator.step(before, observation, control_index, step)
-            numbers = (
-                estimate.log_evidence,
-                estimate.filtered,
-                *estimate.carried.arrays.values(),
-            )
-            # False for NaN as well.
-            is_finite = all(np.all(np.asarray(part) < LARGEST_CARRIED) for part in numbers)
-        except (ArithmeticError, np.linalg.LinAlgError):
-            is_finite = False
-        if not is_finite:
-            raise unbelievable_observation(self.name, step)
-        return estimate
-
     def _index_of(self, control: int | str) -> int:
         """Return the index of a control that is given by index or name."""
         controls = self.model.controls
@@ -482,14 +468,44 @@ class Twin:
         With the probability that no state explains the sensors, the safest control is taken.
         """
         control_index = estimate.carried.control_index
+        unexplained = estimate.unexplained
         prediction = predict(
             self.model, estimate.filtered, control_index, self.policy, self.prediction_steps
         )
-        unexplained = estimate.unexplained
-        probability = self._control_probability(estimate.filtered, control_index, unexplained)
         if self._safest is not None:
             prediction = prediction.mix_control(unexplained, self._safest)
+
+        # The next controls by the belief of the step, and by the belief under each hypothesis.
+        believed = [named for named in estimate.hypotheses if named.belief is not None]
+        beliefs = np.array([estimate.filtered, *(named.belief for named in believed)])
+        doubt = np.zeros(len(beliefs))
+        doubt[0] = unexplained
+        probability, *under_hypotheses = decision_probability(
+            self.model.transition,
+            beliefs,
+            np.full(len(beliefs), control_index),
+            self.policy,
+            self._on_belief,
+            ahead=self.decide_on == "predicted",
+            unexplained=doubt,
+            safest=self._safest,
+        )
         self._proposed = int(np.argmax(probability))
+
+        # The hypothesis that decided adds most to the probability of the proposed control.
+        suspicion = estimate.suspicion
+        if suspicion is not None and estimate.hypotheses:
+            names = [named.name for named in believed]
+            controls_by_name = dict(zip(names, under_hypotheses, strict=True))
+            contribution = {}
+            for named in estimate.hypotheses:
+                controls = controls_by_name.get(named.name, self._safest)
+                contribution[named.name] = 0.0
+                if controls is not None:
+                    proposed = float(controls[self._proposed])
+                    contribution[named.name] = named.probability * proposed
+            decided_by = max(contribution, key=contribution.__getitem__)
+            suspicion = replace(suspicion, decided_by=decided_by)
         return TwinStep(
             forecast=estimate.forecast,
             filtered=estimate.filtered,
@@ -497,51 +513,13 @@ class Twin:
             carried=estimate.carried,
             learnt=estimate.learnt,
             notices=estimate.notices,
-            suspicion=self._suspicion_with_decision(estimate),
+            suspicion=suspicion,
             hypotheses=estimate.hypotheses,
             step=self._steps - 1,
             prediction=prediction,
             decision_probability=probability,
             next_control=self._proposed,
         )
-
-    def _suspicion_with_decision(self, estimate: Estimate) -> Suspicion | None:
-        """Return the suspicion of an estimate, with the hypothesis that decided.
-
-        It is the hypothesis that adds most to the probability of the proposed control.
-        """
-        if estimate.suspicion is None or not estimate.hypotheses:
-            return estimate.suspicion
-        contribution = {}
-        for hypothesis in estimate.hypotheses:
-            if hypothesis.belief is None:
-                controls = self._safest
-            else:
-                controls = self._control_probability(
-                    hypothesis.belief, estimate.carried.control_index
-                )
-            contribution[hypothesis.name] = 0.0
-            if controls is not None:
-                proposed = float(controls[self._proposed])
-                contribution[hypothesis.name] = hypothesis.probability * proposed
-        decided_by = max(contribution, key=contribution.__getitem__)
-        return replace(estimate.suspicion, decided_by=decided_by)
-
-    def _control_probability(
-        self, belief: Float, control_index: int, unexplained: float | None = None
-    ) -> Float:
-        """Return the probability of each next control (U,) by the belief (S,) of this step."""
-        probability = decision_probability(
-            self.model.transition,
-            belief[None],
-            np.array([control_index]),
-            self.policy,
-            self._on_belief,
-            ahead=self.decide_on == "predicted",
-            unexplained=None if unexplained is None else np.array([unexplained]),
-            safest=self._safest,
-        )
-        return np.asarray(probability[0])
 
 
 def unbelievable_observation(twin: str, step: int) -> InvalidObservationError:
