@@ -164,7 +164,8 @@ class GaugeWatch:
         )
         observations = Observations(
             used_values,
-            np.ascontiguousarray(inspections_log_density),
+            # A copy, as numba would compile the loops once more for an array that is read only.
+            inspections_log_density.copy(),
             control_index.astype(np.int64),
         )
         return CheckedReadings(used_rows, values, is_absurd, stuck_gauges, observations)
