@@ -16,7 +16,6 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
-    log_likelihood_of_twins,
     transition_evidence,
 )
 from twin_master.fleet.plan import Fleet, ensemble
@@ -44,11 +43,12 @@ def run() -> list[Measurement]:
     together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / steps
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
-    observations = flown.observation_rows, flown.control_index
+    rows = flown.observation_rows.reshape(steps, -1)
+    controls = flown.control_index.ravel()
     sensors = knowledge.sensor_model
-    likelihood = cpu_seconds(lambda: log_likelihood_of_twins(sensors, *observations)) / steps
+    likelihood = cpu_seconds(lambda: sensors.log_likelihood_sequence(rows, controls)) / steps
     worsening = TransitionFamily.learnable(scenario)
-    of_states = log_likelihood_of_twins(sensors, *observations)
+    of_states = sensors.log_likelihood_sequence(rows, controls).reshape(flown.filtered.shape)
     points = np.full((POINTS, 2), 0.1)
     transition_evidence(worsening, points[:1], of_states[:1], flown.control_index[:1])
     learning = cpu_seconds(

@@ -25,7 +25,6 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     grid_evidence,
-    log_likelihood_of_twins,
     scaled,
 )
 from twin_master.fleet.learning.learn import learn_fleet
@@ -78,10 +77,10 @@ def flights(known: Knowledge, first: int, count: int) -> Flights:
 def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     """Return the likelihood of the probabilities to worsen."""
     worsening = TransitionFamily.learnable(known.scenario)
-    log_likelihood_of_states = log_likelihood_of_twins(
-        known.sensor_model, flown.observation_rows, flown.control_index
-    )
-    likelihood = scaled(log_likelihood_of_states).values
+    control = flown.control_index
+    rows = flown.observation_rows.reshape(control.size, -1)
+    log_likelihood_of_states = known.sensor_model.log_likelihood_sequence(rows, control.ravel())
+    likelihood = scaled(log_likelihood_of_states.reshape(flown.filtered.shape)).values
 
     def log_likelihood(axes: Axes) -> Float:
         probabilities = tuple(logistic(axis) for axis in axes)

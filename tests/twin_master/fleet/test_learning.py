@@ -21,7 +21,6 @@ from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.configuration import fleet_config, group_folder
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
-    log_likelihood_of_twins,
     reason_transitions_are_fixed,
     transition_evidence,
 )
@@ -400,7 +399,7 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     assert np.isfinite(rows[:, 0, 24:]).all()
     family = TransitionFamily.learnable(known.scenario)
     model = with_noise_factor(known.sensor_model, 1.0)  # as the lessons are learnt with
-    log_likelihood = log_likelihood_of_twins(model, rows, control)
+    log_likelihood = model.log_likelihood_sequence(rows.reshape(15, -1), control.ravel()).reshape(3, 5, -1)
     found = transition_evidence(family, family.assumed[None], log_likelihood, control)[:, 0]
     np.testing.assert_allclose(found, stored["filtered/log_evidence"].values.sum(axis=1), rtol=1e-5)
 

@@ -93,6 +93,26 @@ def test_every_second_node_gives_a_fleet_the_likelihood_of_all_nodes(springs):
     np.testing.assert_allclose(found - found[1], expected - expected[1], atol=0.02)
 
 
+def test_draws_of_a_calibration_give_a_fleet_the_likelihood_of_all_nodes(springs):
+    """An average over the draws in each step anew would be off by one."""
+    draws = np.random.default_rng(5).standard_normal(300)
+    strain = springs.values[0] * (1.0 + 0.05 * NODES[0])
+    model = GaussianSensorModel(strain / (1.0 + 0.05 * draws[:, None, None, None]), NOISE)
+    rates = np.array([0.177, 0.2, 0.225])
+    axes = (np.array([0.07]), rates)
+    likelihood = likelihood_at_nodes(
+        springs.family,
+        np.array([0.07, 0.2]),
+        model.draw_weight,
+        model,
+        springs.observed,
+        springs.control,
+    )
+    found = likelihood.evidence_on_grid(springs.family, axes).sum(axis=0)
+    expected = np.array([springs.by_all_nodes(np.array([0.07, rate])).sum() for rate in rates])
+    np.testing.assert_allclose(found - found[1], expected - expected[1], atol=0.1)
+
+
 def test_twins_whose_observations_are_impossible_are_left_out(springs):
     """Readings without noise say that damage of the second twin goes back, which is impossible."""
     state = springs.state[:3].copy()

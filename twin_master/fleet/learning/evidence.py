@@ -22,7 +22,6 @@ from twin_master.fleet.learning.evidence_kernels import (
 )
 from twin_master.fleet.learning.posterior import GRID_POINTS, Axes
 from twin_master.network.kernels import PredecessorLists
-from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
@@ -217,26 +216,6 @@ class ScaledLikelihood(NamedTuple):
 
     values: Float
     log_scale: Float
-
-
-def log_likelihood_of_twins(
-    model: GaussianSensorModel, observations: Float, control: Index
-) -> Float:
-    """Return log p(o_t | D_t, u_t) of the observations of B twins in T steps: (B, T, S).
-
-    Parameters
-    ----------
-    model : GaussianSensorModel
-        The model of the G sensors.
-    observations : (B, T, G) array
-        The observations in SI units; NaN where one was lost.
-    control : (B, T) array
-        The control in force in each step.
-    """
-    twin_count, step_count = control.shape
-    all_steps = observations.reshape(-1, observations.shape[-1])
-    log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
-    return log_likelihood.reshape(twin_count, step_count, -1)
 
 
 def scaled(log_likelihood: Float) -> ScaledLikelihood:

@@ -21,11 +21,7 @@ from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import TaskPool
 from twin_master.fleet.learning.evidence import TransitionFamily
-from twin_master.fleet.learning.parameter_evidence import (
-    averaged_likelihood,
-    likelihood_at_nodes,
-    parameter_evidence,
-)
+from twin_master.fleet.learning.parameter_evidence import likelihood_at_nodes, parameter_evidence
 from twin_master.fleet.learning.posterior import Axes
 from twin_master.fleet.storage.store import open_group
 from twin_master.fleet.storage.store_layout import BLOCK_TWINS, ObservedTwins, StoredObservations
@@ -171,20 +167,17 @@ def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
     if blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
+    if prior is None:
+        prior = kit.sensor_model.draw_weight
     # Which values of the parameter are probable is found out at the centre of the grid.
     centre = np.array([axis[len(axis) // 2] for axis in axes])
     probability = with_all_transitions_possible(centre)
     total = np.zeros([len(axis) for axis in axes])
     explained = 0
     for observed, control in blocks:
-        if prior is None:
-            likelihood = averaged_likelihood(
-                kit.family, probability, kit.sensor_model, observed, control
-            )
-        else:
-            likelihood = likelihood_at_nodes(
-                kit.family, probability, prior, kit.sensor_model, observed, control
-            )
+        likelihood = likelihood_at_nodes(
+            kit.family, probability, prior, kit.sensor_model, observed, control
+        )
         log_evidence = likelihood.evidence_on_grid(kit.family, axes)
         total += log_evidence.sum(axis=0).reshape(total.shape)
         explained += len(log_evidence)
@@ -255,8 +248,8 @@ class GroupEvidence:
         axes : tuple of (N,) array
             The values of each probability.
         prior : (E,) array or None
-            The probability of each draw of the sensor model, which holds in all steps; if it is
-            None, the likelihood is averaged over the draws in each step anew.
+            The probability of each draw of the sensor model, which holds in all steps; None takes
+            the weight that the draw has in the calibration.
         """
         log_likelihood = np.zeros([len(axis) for axis in axes])
         explained = 0

@@ -12,11 +12,7 @@ from reporting.progress import SilentProgress
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.checks import source_of
-from twin_master.fleet.learning.evidence import (
-    TransitionFamily,
-    log_likelihood_of_twins,
-    transition_evidence,
-)
+from twin_master.fleet.learning.evidence import TransitionFamily
 from twin_master.fleet.learning.evidence_tasks import with_all_transitions_possible
 from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.learning.posterior import (
@@ -177,8 +173,9 @@ def noise_factor(
     """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
 
     The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
-    it in each step separately would attribute a part of the noise to the parameter. With nodes, the
-    evidence of all steps is computed at each value first and averaged over the values then.
+    it in each step separately would attribute a part of the noise to the parameter. So the evidence
+    of all steps is computed at each value first and averaged over the values then: over the nodes
+    or, if there are none, over the draws of the calibration.
     """
     flights_of_first_twins = [
         flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
@@ -214,13 +211,9 @@ def _evidence_of_noise(
     for flights in flights_by_scenario:
         value_per_draw = None if nodes is None else nodes.predicted
         model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
+        prior = model.draw_weight if nodes is None else nodes.prior
         for observed, control in flights.blocks():
-            if nodes is None:
-                log_likelihood = log_likelihood_of_twins(model, observed, control)
-                at_point = transition_evidence(family, probability[None], log_likelihood, control)
-                log_evidence = at_point[:, 0]
-            else:
-                at_nodes = parameter_evidence(family, probability, model, observed, control)
-                log_evidence = logsumexp(at_nodes, b=nodes.prior, axis=1)
+            at_nodes = parameter_evidence(family, probability, model, observed, control)
+            log_evidence = logsumexp(at_nodes, b=prior, axis=1)
             total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
     return total_log_evidence

@@ -1,7 +1,8 @@
 """The log evidence of twins whose calibrated parameter is unknown, but the same in all steps.
 
 At each of E values of the parameter, the nodes, the evidence of a twin is that of a hidden Markov
-model. Over the nodes it is averaged with the prior of the parameter. A likelihood that averages
+model. Over the nodes it is averaged with the prior of the parameter. Where the readings at chosen
+values are unknown, the nodes are the draws of the calibration. A likelihood that averages
 over the parameter in each step anew would take a stiffer asset for a less damaged one: it finds
 damage to grow 2.4 % too fast in a fleet whose stiffness is spread by 1 %.
 """
@@ -15,9 +16,7 @@ from reporting.arrays import Float, Index
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
     grid_evidence,
-    log_likelihood_of_twins,
     scaled,
-    transition_evidence,
 )
 from twin_master.fleet.learning.evidence_kernels import evidence_in_lanes
 from twin_master.fleet.learning.posterior import Axes
@@ -159,43 +158,6 @@ def likelihood_at_nodes(
         control=control[np.concatenate(rows_of_nodes)],
         log_weight=np.concatenate(log_weights),
         first_row=np.cumsum(count) - count,
-    )
-
-
-def averaged_likelihood(
-    family: TransitionFamily,
-    probability: Float,
-    model: GaussianSensorModel,
-    observations: Float,
-    control: Index,
-) -> TwinLikelihood:
-    """Return the likelihood of twins from a model that averages over draws in each step by itself.
-
-    This takes the place of `likelihood_at_nodes` where the readings at chosen values of the
-    parameter are unknown. Twins whose observations are impossible are left out.
-
-    Parameters
-    ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
-    probability : (K,) array
-        Probabilities to worsen under which any course of the state is possible.
-    model : GaussianSensorModel
-        The model of the G sensors.
-    observations : (B, T, G) array
-        The observations in SI units; NaN where one was lost.
-    control : (B, T) array
-        The control in force in each step.
-    """
-    log_likelihood = log_likelihood_of_twins(model, observations, control)
-    evidence = transition_evidence(family, probability[None], log_likelihood, control)
-    is_explained = np.isfinite(evidence[:, 0])
-    likelihood = scaled(log_likelihood[is_explained])
-    return TwinLikelihood(
-        values=likelihood.values,
-        control=control[is_explained],
-        log_weight=likelihood.log_scale,
-        first_row=np.arange(is_explained.sum()),  # each twin has a single row
     )
 
 
