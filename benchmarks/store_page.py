@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from reporting.files import atomic_write_text
-from twin_master.store.mission_result import SCHEMA
+from twin_master.store.schema import SCHEMA
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "stores.md"
 _GROUPS = (

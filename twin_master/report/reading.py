@@ -23,8 +23,8 @@ from twin_master.store.mission_result import (
     LearntQuantity,
     printed_unit_of_quantity,
     quantity_titles,
-    variable_paths,
 )
+from twin_master.store.schema import variable_paths
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:

@@ -1,11 +1,9 @@
 """Everything that a mission yields, before it is stored, and what its twin has learnt."""
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,39 +18,13 @@ from twin_master.mission.steps import History
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
+from twin_master.store.schema import SCHEMA, SEVERAL_UNITS, scenario_fields
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 """The stored moments of each posterior; the last two bound the central 90 % interval."""
 
 _NAME_WITH_SENSOR = re.compile(r"(?P<quantity>\w+)\[(?P<sensor>\d+)\]")
 """The name of a quantity of one sensor, such as `noise_scale[3]`."""
-SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
-    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
-)
-"""Axes, unit and meaning of every variable of `run.nc`, by its group.
-
-The table `quantities` holds the titles of learnt quantities, see `quantity_titles`.
-"""
-SEVERAL_UNITS = "see sensor_unit"
-"""The unit of a variable over sensors of different units."""
-
-
-def variable_paths(role: str) -> list[str]:
-    """Return the paths in `run.nc` of the variables that every run has, such as "filtered/mean".
-
-    Parameters
-    ----------
-    role : str
-        The role of the observation, such as "strain".
-    """
-    paths = [f"observed/{role}"]
-    for group in ("observed", "filtered", "smoothed", "predicted", "policy", "calibration"):
-        variables = SCHEMA[group]
-        if group in ("filtered", "smoothed", "predicted"):
-            variables = SCHEMA["belief"] | variables
-        # A name with braces is a template, such as "{input}": its variables differ between runs.
-        paths += [f"{group}/{name}" for name in variables if "{" not in name]
-    return paths
 
 
 class QuantityTitles(NamedTuple):
@@ -150,7 +122,7 @@ def _learnt_quantities(
     scenario = result.scenario
     units = {
         scenario.calibration.parameter: result.parameter_unit,
-        "gauge_offset": result.observation_unit,
+        "gauge_offset": scenario_fields(scenario)["sensor_unit"],
     }
     # The four moments of each quantity, before the first and after each of T steps:
     # (1 + T, 4) for the whole asset, (1 + T, G, 4) for G sensors
@@ -349,17 +321,6 @@ class MissionResult:
         """What the twin knew, each with the steps in which it did."""
         models = self.models or [BelievedModel(0, self.knowledge)]
         return spans_of_models(self.flight, models)
-
-    @property
-    def state_unit(self) -> str:
-        """The unit of the state factors; if they have several, all of them with commas."""
-        return ", ".join(dict.fromkeys(factor.unit for factor in self.scenario.state))
-
-    @property
-    def observation_unit(self) -> str:
-        """The unit of the sensors; `SEVERAL_UNITS` if they have different ones."""
-        units = dict.fromkeys(self.scenario.observation.sensor_units)
-        return next(iter(units)) if len(units) == 1 else SEVERAL_UNITS
 
     @property
     def parameter_unit(self) -> str:

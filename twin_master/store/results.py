@@ -17,7 +17,14 @@ from twin_master.mission.residuals import expected_ahead, expected_in_steps
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
+from twin_master.store.mission_result import MOMENTS, MissionResult
+from twin_master.store.schema import (
+    SCHEMA,
+    coordinate_variables,
+    coordinates_of_axes,
+    described_variable,
+    scenario_fields,
+)
 
 SchemaFields = Mapping[str, str]
 """The words that take the place of the fields in braces of the schema, the file `run.toml`."""
@@ -87,14 +94,16 @@ class _GroupBuilder:
     """Builds groups by the schema, each with the coordinates of its axes."""
 
     def __init__(self, result: MissionResult) -> None:
-        self._fields = {
-            "role": result.scenario.observation.role,
-            "sensor_unit": result.observation_unit,
-            "state_unit": result.state_unit,
-            "parameter_unit": result.parameter_unit,
+        scenario = result.scenario
+        self._fields = scenario_fields(scenario) | {"parameter_unit": result.parameter_unit}
+        steps = result.flight.first_step + np.arange(len(result.flight.steps))
+        labels: dict[str, ArrayLike] = {
+            "control": scenario.control_names,
+            "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
+            "reward": REWARD_NAMES,
+            "draw": np.arange(len(result.knowledge.draws.values)),
         }
-        coordinates = self._variables("coordinates", _coordinate_entries(result), _NO_FIELDS)
-        self._coordinates = dict(coordinates)
+        self._coordinates = coordinate_variables(scenario, steps, labels)
 
     def _variables(
         self, group: str, entries: Iterable[Entry], fields: SchemaFields
@@ -111,10 +120,7 @@ class _GroupBuilder:
             schema = SCHEMA["belief"] | SCHEMA["noise"] | schema
         for entry in entries:
             all_fields = {**self._fields, **fields, **entry.fields}
-            axes, unit, description = (text.format(**all_fields) for text in schema[entry.name])
-            attributes = {"units": unit} if unit else {}
-            attributes["long_name"] = description
-            variable = Variable(tuple(axes.split()), entry.values, attributes)
+            variable = described_variable(schema[entry.name], entry.values, all_fields)
             yield entry.name.format(**all_fields), variable
 
     def group(
@@ -138,41 +144,10 @@ class _GroupBuilder:
             The attributes of the group.
         """
         variables = dict(self._variables(name, entries, fields))
-        # Coordinates all of whose axes occur in this group
         axes: set[str] = set()
         for variable in variables.values():
             axes.update(variable.dims)
-        coordinates = {}
-        for coordinate_name, coordinate in self._coordinates.items():
-            if axes.issuperset(coordinate.dims):
-                coordinates[coordinate_name] = coordinate
-        return NetcdfGroup(variables, coordinates, attributes)
-
-
-def _coordinate_entries(result: MissionResult) -> list[Entry]:
-    """Return the coordinates of all axes, and the value of each state factor in each state."""
-    scenario = result.scenario
-    flight = result.flight
-    labels: dict[str, ArrayLike] = {
-        "step": flight.first_step + np.arange(len(flight.steps)),
-        "sensor": np.arange(1, scenario.observation.count + 1),
-        "region": scenario.state_names,
-        "control": scenario.control_names,
-        "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
-        "reward": REWARD_NAMES,
-        "draw": np.arange(len(result.knowledge.draws.values)),
-    }
-    if result.observation_unit == SEVERAL_UNITS:
-        labels["sensor_unit"] = scenario.observation.sensor_units
-    if scenario.observation.titles:
-        labels["sensor_title"] = scenario.observation.titles
-    entries = _plain_entries(labels)
-    # A row for each state factor, a column for each state
-    levels_of_states = result.knowledge.model.states.coordinates.T
-    for levels, factor in zip(levels_of_states, scenario.state, strict=True):
-        fields = {"factor": factor.name, "factor_unit": factor.unit}
-        entries.append(Entry("{factor}", levels, fields))
-    return entries
+        return NetcdfGroup(variables, coordinates_of_axes(self._coordinates, axes), attributes)
 
 
 def _observed_entries(result: MissionResult) -> Iterator[Entry]:

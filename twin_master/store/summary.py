@@ -16,12 +16,12 @@ from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
     MOMENTS,
-    SEVERAL_UNITS,
     LearntQuantity,
     MissionResult,
     printed_unit_of_quantity,
     quantity_titles,
 )
+from twin_master.store.schema import SEVERAL_UNITS
 
 _MOST_CHANGES = 3
 """The number of changes of the control that the summary names."""

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks import store_page
-from twin_master.store.mission_result import SCHEMA
+from twin_master.store.schema import SCHEMA
 
 ONLY_IN_FLEETS = {"filtered/last_probability", "notice/count", "notice/first_step", "truth/{parameter}"}
 """Variables of fleets, inside the groups of a run, that a run does not have under this name."""

@@ -28,7 +28,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import SCHEMA
+from twin_master.store.schema import SCHEMA
 from twin_master.store.summary import find_fallback
 
 if TYPE_CHECKING:

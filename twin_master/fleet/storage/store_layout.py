@@ -6,17 +6,22 @@ under other names, are read in the present layout.
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from itertools import product
 from math import prod
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Float, Index
 from reporting.json_file import JsonObject
+from reporting.netcdf import Variable
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import SCHEMA, SEVERAL_UNITS
+from twin_master.store.schema import (
+    SCHEMA,
+    coordinate_variables,
+    coordinates_of_axes,
+    described_variable,
+    scenario_fields,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -86,31 +91,6 @@ class StoredVariable(NamedTuple):
         return {"units": self.unit, "long_name": self.title}
 
 
-class Coordinate(NamedTuple):
-    """A coordinate of the store.
-
-    Attributes
-    ----------
-    axis : str
-        Its dimension.
-    unit, title : str
-        Its unit, empty for names, and what it is in words.
-    values : (N,) array
-        Its values.
-    """
-
-    axis: str
-    unit: str
-    title: str
-    values: AnyArray
-
-    @property
-    def attributes(self) -> dict[str, str]:
-        """The attributes of the coordinate, as those of a run."""
-        units = {"units": self.unit} if self.unit else {}
-        return {**units, "long_name": self.title}
-
-
 def dimension_sizes(scenario: Scenario) -> dict[str, int]:
     """Return the sizes of the store's dimensions for a scenario, by name."""
     observation = scenario.observation
@@ -143,13 +123,7 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
     dict of str to StoredVariable
         The variables by their paths in the group.
     """
-    observation = scenario.observation
-    distinct_units = set(observation.sensor_units)
-    common_fields = {
-        "role": observation.role,
-        "sensor_unit": SEVERAL_UNITS if len(distinct_units) > 1 else observation.sensor_units[0],
-        "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
-    }
+    common_fields = scenario_fields(scenario)
     layout = {}
     for path_template, row_templates in SCHEMA["fleet"].items():
         for own_fields in _fields_of_entries(path_template, scenario, parameters):
@@ -176,41 +150,15 @@ def _fields_of_entries(
         yield {}
 
 
-def twin_coordinate(names: Sequence[str]) -> Coordinate:
+def twin_coordinate(names: Sequence[str]) -> Variable:
     """Return the coordinate with the names of twins."""
-    axis, unit, title = SCHEMA["fleet_coordinates"][TWIN_AXIS]
-    return Coordinate(axis, unit, title, np.array(names, dtype=np.dtypes.StringDType()))
-
-
-def store_coordinates(scenario: Scenario) -> dict[str, Coordinate]:
-    """Return the coordinates of the store of a group beside the names of twins, by their names."""
-    observation = scenario.observation
-    values: dict[str, ArrayLike] = {
-        "step": np.arange(scenario.mission.steps),
-        "sensor": np.arange(1, observation.count + 1),
-        "region": scenario.state_names,
-        "notice_kind": NOTICE_KINDS,
-    }
-    if len({*observation.sensor_units}) > 1:
-        values["sensor_unit"] = observation.sensor_units
-    if observation.titles:
-        values["sensor_title"] = observation.titles
-    rows = SCHEMA["coordinates"] | SCHEMA["fleet_coordinates"]
-    coordinates = {}
-    for name, labels in values.items():
-        axis, unit, title = rows[name]
-        coordinates[name] = Coordinate(axis, unit, title, np.asarray(labels))
-    # The levels of each factor in each joint state, of which the last factor varies fastest.
-    levels = np.array(list(product(*[factor.levels for factor in scenario.state])))
-    axis, _, _ = rows["{factor}"]
-    for column, factor in enumerate(scenario.state):
-        coordinates[factor.name] = Coordinate(axis, factor.unit, factor.name, levels[:, column])
-    return coordinates
+    labels = np.array(names, dtype=np.dtypes.StringDType())
+    return described_variable(SCHEMA["fleet_coordinates"][TWIN_AXIS], labels, {})
 
 
 def coordinates_of_groups(
-    layout: Mapping[str, StoredVariable], coordinates: Mapping[str, Coordinate]
-) -> dict[str, dict[str, Coordinate]]:
+    layout: Mapping[str, StoredVariable], scenario: Scenario
+) -> dict[str, dict[str, Variable]]:
     """Return for each group of a store the coordinates of all axes that its variables have.
 
     The names of the twins are not among them: the outermost group alone has them, and the groups
@@ -220,22 +168,21 @@ def coordinates_of_groups(
     ----------
     layout : mapping of str to StoredVariable
         The variables by their paths.
-    coordinates : mapping of str to Coordinate
-        The coordinates by their names.
+    scenario : Scenario
+        The scenario of the group of assets.
 
     Returns
     -------
     dict of str to dict
         The coordinates by name, for each group by its path; the path of the outermost one is empty.
     """
+    steps = np.arange(scenario.mission.steps)
+    coordinates = coordinate_variables(scenario, steps, {"notice_kind": NOTICE_KINDS})
     axes_of_group: dict[str, set[str]] = {}
     for path, variable in layout.items():
         group, _, _ = path.rpartition("/")
         axes_of_group.setdefault(group, set()).update(variable.axes)
-    return {
-        group: {name: entry for name, entry in coordinates.items() if entry.axis in axes}
-        for group, axes in axes_of_group.items()
-    }
+    return {group: coordinates_of_axes(coordinates, axes) for group, axes in axes_of_group.items()}
 
 
 def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
@@ -345,12 +292,12 @@ def in_present_layout(
         entry.attrs = layout[path].attributes
         groups.setdefault(group, {})[name] = entry
     datasets = {}
-    coordinates = coordinates_of_groups(layout, store_coordinates(scenario))
+    coordinates = coordinates_of_groups(layout, scenario)
     if twins is not None:
         coordinates[""][TWIN_AXIS] = twin_coordinate(twins)
     for group, entries in groups.items():
         labels = {
-            name: xr.Variable((coordinate.axis,), coordinate.values, coordinate.attributes)
+            name: xr.Variable(coordinate.dims, coordinate.values, dict(coordinate.attrs))
             for name, coordinate in coordinates[group].items()
         }
         datasets[f"/{group}"] = xr.Dataset(entries, labels)

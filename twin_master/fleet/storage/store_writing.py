@@ -13,15 +13,14 @@ import numpy as np
 
 from reporting.arrays import AnyArray
 from reporting.files import explained_write_errors
+from reporting.netcdf import Variable
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.storage.chunk_file import CHUNKS_PER_FILE, ChunkFile
 from twin_master.fleet.storage.store_address import STORE_NAME, StoreAddress
 from twin_master.fleet.storage.store_layout import (
     TWIN_AXIS,
-    Coordinate,
     coordinates_of_groups,
     dimension_sizes,
-    store_coordinates,
     stored_layout,
     twin_coordinate,
 )
@@ -100,7 +99,7 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
             attributes=variable.attributes,
             overwrite=True,
         )
-    coordinates = coordinates_of_groups(layout, store_coordinates(scenario))
+    coordinates = coordinates_of_groups(layout, scenario)
     for inner_group, group_coordinates in coordinates.items():
         _create_coordinates(zarr_group, inner_group, group_coordinates)
     _write_names(zarr_group, group, partition)
@@ -118,7 +117,7 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
 
 
 def _create_coordinates(
-    zarr_group: "zarr.Group", path: str, coordinates: Mapping[str, Coordinate]
+    zarr_group: "zarr.Group", path: str, coordinates: Mapping[str, Variable]
 ) -> None:
     """Write the coordinates of one of the groups inside a group of the fleet.
 
@@ -128,7 +127,7 @@ def _create_coordinates(
         The group of the fleet.
     path : str
         The path of the group inside it; empty for the group itself.
-    coordinates : mapping of str to Coordinate
+    coordinates : mapping of str to Variable
         The coordinates by their names.
     """
     inner_group = zarr_group.require_group(path) if path else zarr_group
@@ -138,13 +137,13 @@ def _create_coordinates(
             name,
             shape=values.shape,
             dtype="str" if values.dtype.kind == "U" else values.dtype,
-            dimension_names=(coordinate.axis,),
-            attributes=coordinate.attributes,
+            dimension_names=coordinate.dims,
+            attributes=dict(coordinate.attrs),
             overwrite=True,
         )
         array[:] = values
     # By the CF conventions this attribute names the coordinates that are not dimensions.
-    beside_dimensions = [name for name, entry in coordinates.items() if name != entry.axis]
+    beside_dimensions = [name for name, entry in coordinates.items() if entry.dims != (name,)]
     if beside_dimensions:
         inner_group.attrs["coordinates"] = " ".join(beside_dimensions)
 
@@ -163,7 +162,7 @@ def _write_names(zarr_group: "zarr.Group", group: Group, partition: _Partition) 
         shards=(partition.file_rows,),
         dtype="str",
         dimension_names=(TWIN_AXIS,),
-        attributes=label.attributes,
+        attributes=dict(label.attrs),
         overwrite=True,
     )
     for first_row in range(0, twin_count, partition.file_rows):

@@ -1,0 +1,105 @@
+"""The schema of stored results, `run.toml`, for the `run.nc` of a run and the store of a fleet."""
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reporting.arrays import Index
+from reporting.netcdf import Variable
+from twin_master.scenario.schema import Scenario
+
+SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
+    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
+)
+"""Axes, unit and meaning of every variable of `run.nc` and of a fleet's store, by its group.
+
+The table `quantities` holds the titles of learnt quantities, see `quantity_titles`.
+"""
+SEVERAL_UNITS = "see sensor_unit"
+"""The unit of a variable over sensors of different units."""
+
+
+def variable_paths(role: str) -> list[str]:
+    """Return the paths in `run.nc` of the variables that every run has, such as "filtered/mean".
+
+    Parameters
+    ----------
+    role : str
+        The role of the observation, such as "strain".
+    """
+    paths = [f"observed/{role}"]
+    for group in ("observed", "filtered", "smoothed", "predicted", "policy", "calibration"):
+        variables = SCHEMA[group]
+        if group in ("filtered", "smoothed", "predicted"):
+            variables = SCHEMA["belief"] | variables
+        # A name with braces is a template, such as "{input}": its variables differ between runs.
+        paths += [f"{group}/{name}" for name in variables if "{" not in name]
+    return paths
+
+
+def scenario_fields(scenario: Scenario) -> dict[str, str]:
+    """Return the words of a scenario that take the place of fields in braces of the schema.
+
+    They are the role of the observation and the units of sensors and state. Sensors of different
+    units have the unit `SEVERAL_UNITS`, and factors of different units all of these with commas.
+    """
+    sensor_units = {*scenario.observation.sensor_units}
+    return {
+        "role": scenario.observation.role,
+        "sensor_unit": SEVERAL_UNITS if len(sensor_units) > 1 else sensor_units.pop(),
+        "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
+    }
+
+
+def described_variable(
+    row: Iterable[str], values: ArrayLike, fields: Mapping[str, str]
+) -> Variable:
+    """Return a variable with axes, unit and title of a row of the schema, fields filled in."""
+    axes, unit, title = (template.format(**fields) for template in row)
+    units = {"units": unit} if unit else {}
+    return Variable(tuple(axes.split()), np.asarray(values), {**units, "long_name": title})
+
+
+def coordinate_variables(
+    scenario: Scenario, steps: Index, labels: Mapping[str, ArrayLike]
+) -> dict[str, Variable]:
+    """Return the coordinates of stored results by name.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario: it has sensors, regions and the levels of the state.
+    steps : (T,) array
+        The numbers of the steps.
+    labels : mapping of str to array
+        The labels of the other axes that only a run or only a fleet has.
+    """
+    observation = scenario.observation
+    all_labels: dict[str, ArrayLike] = {
+        "step": steps,
+        "sensor": np.arange(1, observation.count + 1),
+        "region": scenario.state_names,
+        **labels,
+    }
+    if len({*observation.sensor_units}) > 1:
+        all_labels["sensor_unit"] = observation.sensor_units
+    if observation.titles:
+        all_labels["sensor_title"] = observation.titles
+    rows = SCHEMA["coordinates"] | SCHEMA["fleet_coordinates"]
+    coordinates = {
+        name: described_variable(rows[name], values, {}) for name, values in all_labels.items()
+    }
+    # The level of each factor in each joint state, of which the last factor varies fastest.
+    grids = np.meshgrid(*(factor.levels for factor in scenario.state), indexing="ij")
+    for grid, factor in zip(grids, scenario.state, strict=True):
+        fields = {"factor": factor.name, "factor_unit": factor.unit}
+        coordinates[factor.name] = described_variable(rows["{factor}"], grid.ravel(), fields)
+    return coordinates
+
+
+def coordinates_of_axes(coordinates: Mapping[str, Variable], axes: set[str]) -> dict[str, Variable]:
+    """Return the coordinates whose axes are all among some axes."""
+    return {name: entry for name, entry in coordinates.items() if axes.issuperset(entry.dims)}
