@@ -37,6 +37,7 @@ from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.parts import GivenEstimator, GivenPolicy, GivenSensorModel, TwinParts
 from twin_master.mission.planning import encode_policy, read_policy
 from twin_master.mission.preparation import Knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.kinds import WATCHED_KIND
@@ -322,12 +323,12 @@ def _fly(
         JournalFile(folder, hash_record(config)) as journal,
     ):
         plant = knowledge.plant(truth, asset)
-        earlier_steps = loop.restore_flight(journal, knowledge, plant)
+        earlier_steps = restore_flight(journal, knowledge, plant)
         flight = loop.fly(
             scenario,
             earlier_steps.twin,
             plant,
-            loop.journal_sink(journal, plant),
+            journal_sink(journal, plant),
             history=earlier_steps,
             progress=progress,
         )

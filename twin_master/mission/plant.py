@@ -15,7 +15,7 @@ from fmu_asset.errors import FmuEndedError, FmuError
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.steps import GroundTruth, History, Reading
+from twin_master.mission.steps import GroundTruth, History, Reading, Source
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
@@ -305,7 +305,7 @@ def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 
-class Plant:
+class Plant(Source[Twin]):
     """The simulated asset of a mission, driven by its truth and flown under given controls.
 
     The assets of B missions fly side by side if they have no memory. Then the arrays of controls,
@@ -378,10 +378,6 @@ class Plant:
                 raise  # a mission without a single step is an error, and no early end
             self.reason_of_end = error.sentence
             return None
-
-    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Raise the error: a simulated asset showed the reading, whatever the twin believes."""
-        raise error
 
     def fly_step(
         self,

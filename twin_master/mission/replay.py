@@ -1,4 +1,7 @@
-"""The steps of a journal, filtered again: for a run or watch that is resumed, taught or stored."""
+"""The steps of a journal, filtered again: for a run or watch that is resumed, taught or stored.
+
+A mission writes its steps into the journal with states of its asset, from which it is resumed.
+"""
 
 import math
 import zlib
@@ -10,16 +13,25 @@ from typing import NamedTuple
 from reporting.json_file import JsonObject
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import (
+    JournalFile,
     JournalLine,
     NoiseFree,
     damaged_line_error,
     decode_state,
+    encode_state,
+    large_parts,
     reading_from_line,
     records_backwards,
+    short_record,
+    step_record,
+    with_short_truth,
 )
+from twin_master.mission.loop import StepSink, operate
+from twin_master.mission.plant import Plant
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.recent_parts import RecentParts
-from twin_master.mission.steps import History, MissionStep, Reading
+from twin_master.mission.recent_parts import BLOCK_STEPS, RecentParts, is_whole_step
+from twin_master.mission.steps import History, MissionStep, Reading, Source
+from twin_master.network.twin import Twin
 
 
 @dataclass(frozen=True)
@@ -232,6 +244,18 @@ def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
     return in_force
 
 
+class _StoredReadings(Source[Twin]):
+    """The readings of consecutive steps, up to a step whose reading belongs to another model."""
+
+    def __init__(self, readings: Mapping[int, Reading], end: float) -> None:
+        self._readings = readings
+        self._end = end
+
+    def read(self, twin: Twin) -> Reading | None:
+        """Return the reading of the next step; None if there is none."""
+        return self._readings.get(twin.steps) if twin.steps < self._end else None
+
+
 def refilter(
     readings: Mapping[int, Reading],
     models: Sequence[BelievedModel],
@@ -253,23 +277,22 @@ def refilter(
     """
     models = models_in_force(models)
     first_step = 0 if settled is None else max(settled.step, 0)
-    model_index = 0
-    while model_index + 1 < len(models) and models[model_index + 1].from_step <= first_step:
-        model_index += 1
-    twin = models[model_index].knowledge.twin(lag=lag)
+    while len(models) > 1 and models[1].from_step <= first_step:
+        models = models[1:]
+    twin = models[0].knowledge.twin(lag=lag)
     if settled is not None:
         twin.restore_state(settled.twin_state)
-    history = History(twin, models[model_index].knowledge.scenario.observation.count)
-    while twin.steps in readings:
-        if model_index + 1 < len(models) and models[model_index + 1].from_step <= twin.steps:
-            # The twin goes on with the next model, from the belief that it has reached.
-            model_index += 1
-            state = twin.save_state()
-            twin = models[model_index].knowledge.twin(lag=lag)
-            twin.restore_state(state)
-            history.twin = twin
-        reading = readings[twin.steps]
-        history.add(MissionStep(reading, twin.step(reading.observed, reading.control)))
+    history = History(twin, models[0].knowledge.scenario.observation.count)
+    for next_model in [*models[1:], None]:
+        end = math.inf if next_model is None else next_model.from_step
+        for _ in operate(history.twin, _StoredReadings(readings, end), history.add):
+            pass
+        if next_model is None or history.twin.steps not in readings:
+            break
+        # The twin goes on with the next model, from the belief that it has reached.
+        twin = next_model.knowledge.twin(lag=lag)
+        twin.restore_state(history.twin.save_state())
+        history.twin = twin
     return history
 
 
@@ -292,3 +315,86 @@ def spans_of_models(
     for model, begin, end in zip(models, begins, ends, strict=True):
         spans.append((model.knowledge, slice(begin, end)))
     return spans
+
+
+STATE_ALLOWANCE = 16_000_000
+"""Size of a file up to which every state of the asset is kept in it, in bytes.
+
+This holds for the files of recent parts, which have the state of every step, and for the journal,
+which has those of every `BLOCK_STEPS`-th step.
+"""
+STATE_SHARE = 4_000
+"""Largest size of a state beyond it, in bytes for each step since the last state that was kept.
+
+An asset that is replayed keeps the inputs of all its steps in its state. If every step kept it, the
+files would grow with the square of the number of steps. Steps after the last kept state are flown
+again when a mission is resumed.
+"""
+
+
+def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
+    """Return the steps of an earlier process, and set plant and journal to the end of these steps.
+
+    Lines after the last saved state of the asset are removed from the journal; their steps must be
+    flown again.
+
+    Parameters
+    ----------
+    journal : JournalFile
+        The journal of the run folder.
+    knowledge : Knowledge
+        The knowledge of the twin.
+    plant : Plant
+        The plant at its start.
+
+    Raises
+    ------
+    NotResumableError
+        If the journal is damaged, or if the twin now decides otherwise than the earlier process.
+    """
+    for line in records_backwards(journal.path, recent=journal.recent):
+        is_header = line.begin == 0
+        if is_header or line.record.get("asset_state") is not None:
+            journal.truncate(line.end)
+            break
+    models = [BelievedModel(0, knowledge)]
+    history, _ = replay(journal.path, models, None, noise_free=plant.noise_free)
+    if history.steps:
+        try:
+            plant.restore(history, decode_state(line.record.get("asset_state", "")))
+        except (TypeError, ValueError, zlib.error) as error:
+            reason = f"it has another layout, {error}"
+            raise damaged_line_error(journal.path, line.begin, reason) from error
+    return history
+
+
+def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
+    """Return a sink that appends steps to a journal, and the state of the asset after each.
+
+    If the process is killed, the steps after the last state are flown again, with the same results
+    to the last bit. A state is left out if it would make the files too large.
+    """
+    steps_since_state = 0
+
+    def append_step(step: MissionStep) -> None:
+        nonlocal steps_since_state
+        steps_since_state += 1
+        number = step.twin_step.step
+        record = with_short_truth(step_record(step), plant.noise_free)
+        parts = large_parts(record)
+        state = encode_state(plant.save_state())
+        if _may_keep(state, journal.recent.size_before(number), steps_since_state):
+            parts["asset_state"] = state
+            steps_since_state = 0
+        record = short_record(record, is_whole=is_whole_step(number))
+        if number % BLOCK_STEPS == 0 and _may_keep(state, journal.size, BLOCK_STEPS):
+            record["asset_state"] = state
+        journal.append(record, parts)
+
+    return append_step
+
+
+def _may_keep(state: str, file_size: int, steps_since_state: int) -> bool:
+    """Return whether a state is small enough for a file of a size, see `STATE_ALLOWANCE`."""
+    is_within_allowance = file_size + len(state) <= STATE_ALLOWANCE
+    return is_within_allowance or len(state) <= STATE_SHARE * steps_since_state

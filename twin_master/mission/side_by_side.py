@@ -13,14 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
-from twin_master.errors import TwinMasterError
 from twin_master.learning.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.learning.monitor import gauge_watch_of
 from twin_master.learning.watch_state import WatchState
 from twin_master.mission.loop import early_end_sentence, fly, operate
 from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth, sentence_of_ending_action
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, OperatedStep, Reading
+from twin_master.mission.steps import History, OperatedStep, Reading, Source
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
 from twin_master.network.planner import decision_probability, ration_controls
@@ -185,7 +184,7 @@ def fly_side_by_side(
     return Flights.concatenate(formations)
 
 
-class AssetsSideBySide:
+class AssetsSideBySide(Source["TwinsSideBySide"]):
     """The source of the observations of B twins: assets without memory, which fly side by side.
 
     Parameters
@@ -223,10 +222,6 @@ class AssetsSideBySide:
             if scenario.ends(control):
                 reason = sentence_of_ending_action(scenario, control)
                 self._flights.end(twin, early_end_sentence(scenario, twins.steps, reason))
-
-    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Raise the error: a simulated asset showed the reading, whatever its twin believes."""
-        raise error
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from reporting.arrays import AnyArray, Float
+from twin_master.errors import TwinMasterError
 from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinStep
 
@@ -58,6 +59,20 @@ class Reading:
     revises: int | None = None
     unreadable: Mapping[int, str] = field(default_factory=dict)
     ground_truth: GroundTruth | None = None
+
+
+AnyTwin = TypeVar("AnyTwin", contravariant=True)
+
+
+class Source(Protocol[AnyTwin]):
+    """Where observations come from: simulated assets, a file, a broker, a journal."""
+
+    def read(self, twin: AnyTwin) -> Reading | None:
+        """Act on the decision of the twin, and return its next observation; None at the end."""
+
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+        """Return the observation that replaces one that the twin refused, or raise the error."""
+        raise error
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,11 @@ from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line, record_of_line, records
 from twin_master.mission.journal_packing import full_record, pack_numbers, unpack_numbers
-from twin_master.mission.loop import fly, journal_sink, restore_flight
+from twin_master.mission.loop import fly
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.recent_parts import BLOCK_STEPS, RECENT_NAMES, RecentPartsFile, is_whole_step
+from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight

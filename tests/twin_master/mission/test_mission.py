@@ -34,12 +34,13 @@ from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import ensemble
 from twin_master.fleet.storage.store import ENDED
-from twin_master.mission import loop
+from twin_master.mission import replay
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line
 from twin_master.mission.journal_packing import pack_numbers
-from twin_master.mission.loop import fly, journal_sink, restore_flight
+from twin_master.mission.loop import fly
 from twin_master.mission.plant import Plant, SensorStatus, Truth
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History, MissionStep
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
@@ -320,8 +321,8 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
 
 @pytest.mark.parametrize("known", [12], indirect=True)
 def test_large_states_are_kept_less_often_and_their_steps_flown_again(known, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "STATE_ALLOWANCE", 5000)
-    monkeypatch.setattr(loop, "STATE_SHARE", 50)
+    monkeypatch.setattr(replay, "STATE_ALLOWANCE", 5000)
+    monkeypatch.setattr(replay, "STATE_SHARE", 50)
     part(known, tmp_path, kind=Heavy)
     journal_before = (tmp_path / JOURNAL_NAME).read_bytes()
     has_state = ["asset_state" in record for record in journal(tmp_path)]
