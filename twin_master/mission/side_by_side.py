@@ -22,8 +22,9 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, OperatedStep, Reading, Source
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
-from twin_master.network.planner import decision_probability, ration_controls
-from twin_master.network.twin import LARGEST_CARRIED, unbelievable_observation
+from twin_master.network.planner import ration_controls
+from twin_master.network.twin import LARGEST_CARRIED, Twin, unbelievable_observation
+from twin_master.scenario.schema import Scenario
 
 _MOST_NUMBERS_TOGETHER = 10_000_000
 """Numbers of four bytes in the beliefs about gauges of the twins that fly together."""
@@ -168,6 +169,7 @@ def fly_side_by_side(
     """
     if not all(isinstance(asset, StatelessAsset) for asset in assets):
         return fly_one_by_one(knowledge, truths, lambda twin, _previous_ended_well: assets[twin])
+    scenario = knowledge.scenario
     size = len(truths)
     watch = gauge_watch_of(knowledge.estimator)
     if watch is not None:
@@ -177,8 +179,9 @@ def fly_side_by_side(
         truth = Truth.stack(truths[first : first + size])
         plant = knowledge.plant(truth, *assets[first : first + size])
         flights = Flights.empty(knowledge, *truth.shape)
-        twins = TwinsSideBySide(knowledge, flights)
-        for _ in operate(twins, AssetsSideBySide(plant, flights), flights.store_step):
+        twins = TwinsSideBySide(scenario, knowledge.twin(), flights)
+        assets_side_by_side = AssetsSideBySide(scenario, plant, flights)
+        for _ in operate(twins, assets_side_by_side, flights.store_step):
             pass
         formations.append(flights)
     return Flights.concatenate(formations)
@@ -189,19 +192,25 @@ class AssetsSideBySide(Source["TwinsSideBySide"]):
 
     Parameters
     ----------
+    scenario : Scenario
+        The scenario of the missions.
     plant : Plant
         The assets and their truth, at the start of the mission.
     flights : Flights
         The record in which the ends of flights are noted.
     """
 
-    def __init__(self, plant: Plant, flights: Flights) -> None:
+    def __init__(self, scenario: Scenario, plant: Plant, flights: Flights) -> None:
+        self._scenario = scenario
+        self._ends_mission = np.array(
+            [scenario.ends(index) for index in range(len(scenario.control))]
+        )
         self._plant = plant
         self._flights = flights
 
     def read(self, twins: "TwinsSideBySide") -> Reading | None:
         """Fly the next step of all twins; None once all missions are at their ends."""
-        if twins.steps == twins.scenario.mission.steps:
+        if twins.steps == self._scenario.mission.steps:
             return None
         previous_control = None
         if twins.steps > 0:
@@ -216,12 +225,10 @@ class AssetsSideBySide(Source["TwinsSideBySide"]):
 
     def _end_missions(self, twins: "TwinsSideBySide") -> None:
         """End the missions whose last control was an action that ends them."""
-        scenario = twins.scenario
-        for twin in np.flatnonzero(self._flights.is_flying).tolist():
-            control = int(twins.previous_control[twin])
-            if scenario.ends(control):
-                reason = sentence_of_ending_action(scenario, control)
-                self._flights.end(twin, early_end_sentence(scenario, twins.steps, reason))
+        ends_now = self._flights.is_flying & self._ends_mission[twins.previous_control]
+        for twin in np.flatnonzero(ends_now).tolist():
+            reason = sentence_of_ending_action(self._scenario, twins.previous_control[twin])
+            self._flights.end(twin, early_end_sentence(self._scenario, twins.steps, reason))
 
 
 @dataclass(frozen=True)
@@ -254,38 +261,35 @@ class TwinsSideBySide:
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of all twins.
+    scenario : Scenario
+        The scenario of the twins.
+    twin : Twin
+        A twin before its first observation: all have its model, sensors and policy.
     flights : Flights
         The record of the twins, in which failures and notices are noted.
 
     Attributes
     ----------
-    scenario : Scenario
-        The scenario of the twins.
     steps : int
         The number of steps so far.
     previous_control, proposed_control : (B,) array
         The indices of the controls in force in the last step, and of those for the next one.
     """
 
-    def __init__(self, knowledge: Knowledge, flights: Flights) -> None:
-        self.scenario = knowledge.scenario
+    def __init__(self, scenario: Scenario, twin: Twin, flights: Flights) -> None:
+        self._scenario = scenario
         count = len(flights.is_flying)
-        first_control = self.scenario.control_names.index(self.scenario.mission.first_control)
         self.steps = 0
         self.previous_control: Index = np.full(count, NO_CONTROL)
-        self.proposed_control: Index = np.full(count, first_control)
-        self._knowledge = knowledge
+        self.proposed_control: Index = np.full(count, twin.proposed_control)
+        self._twin = twin
         self._flights = flights
-        self._filter = ExactFilter(
-            knowledge.model, knowledge.sensor_model, self.scenario.mission.name
-        )
-        self._log_belief: Float = knowledge.model.log_prior
+        self._filter = ExactFilter(twin.model, twin.sensor_model, twin.name)
+        self._log_belief: Float = twin.model.log_prior
         self._inspecting_controls = sorted(
-            {reading.control_index for reading in self.scenario.inspection_readings}
+            {reading.control_index for reading in self._scenario.inspection_readings}
         )
-        self._watch = gauge_watch_of(knowledge.estimator)
+        self._watch = gauge_watch_of(twin.estimator)
         self._watch_state: WatchState | None = None
 
     def step(self, observation: ArrayLike, control: ArrayLike | None = None) -> StepOfTwins:
@@ -352,44 +356,28 @@ class TwinsSideBySide:
         )
         is_flying = self._flights.is_flying
         if np.any(is_flying & ~state.is_finite(LARGEST_CARRIED)):
-            raise unbelievable_observation(self.scenario.mission.name, self.steps)
+            raise unbelievable_observation(self._twin.name, self.steps)
         for twin in np.flatnonzero(is_flying).tolist():
             self._flights.notices[twin] += [(self.steps, notice) for notice in notices[twin]]
         self._watch_state = state
         return state
 
-    def _decide(self, filtered_belief: Float, unexplained: Float) -> Index:
-        """Return the next control of each of B twins, within the budget of inspections.
-
-        With the probability (B,) that no state explains the sensors, the safest control is taken.
-        """
-        knowledge = self._knowledge
-        planner = knowledge.scenario.planner
-        policy_on_belief = knowledge.plan.on_belief
-        safest = None
-        if self._watch is not None:
-            safest = np.eye(len(knowledge.model.controls))[knowledge.safest_control]
-        probability = decision_probability(
-            knowledge.model.transition,
-            filtered_belief,
-            self.previous_control,
-            knowledge.plan.policy,
-            policy_on_belief,
-            ahead=planner.decide_on == "predicted",
-            unexplained=unexplained,
-            safest=safest,
-        )
+    def _decide(self, beliefs: Float, unexplained: Float) -> Index:
+        """Return the next control of each of B twins, within the budget of inspections."""
+        probability = self._twin.control_probabilities(beliefs, self.previous_control, unexplained)
         control = np.argmax(probability, axis=1)
-        if planner.inspections_per_step is not None and policy_on_belief is not None:
+        budget = self._scenario.planner.inspections_per_step
+        policy_on_belief = self._twin.on_belief
+        if budget is not None and policy_on_belief is not None:
             flying = np.flatnonzero(self._flights.is_flying)
             control[flying] = ration_controls(
-                knowledge.model.transition,
-                filtered_belief[flying],
+                self._twin.model.transition,
+                beliefs[flying],
                 self.previous_control[flying],
                 control[flying],
                 policy_on_belief,
                 self._inspecting_controls,
-                planner.inspections_per_step,
+                budget,
             )
         return np.asarray(control)
 

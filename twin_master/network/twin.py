@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from reporting.arrays import AnyArray, Float, nan_where_masked
+from reporting.arrays import AnyArray, Float, Index, nan_where_masked
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
@@ -229,7 +229,7 @@ class Twin:
         self.policy = model.policy(policy(model) if callable(policy) else policy)
         self.prediction_steps = prediction_steps
         self.decide_on = decide_on
-        self._on_belief = on_belief
+        self.on_belief = on_belief
         self.lag = lag
         # The present step, `lag` steps before it, and one more: to filter the first of these again,
         # the arrays carried on from the step before it are needed.
@@ -462,6 +462,35 @@ class Twin:
             return controls.index(control)
         return int(checked_controls(control, len(controls)))
 
+    def control_probabilities(self, beliefs: Float, control: Index, unexplained: Float) -> Float:
+        """Return the probability of each next control for each of B beliefs.
+
+        Parameters
+        ----------
+        beliefs : (B, S) array
+            p(D_t | o_0..o_t) of several twins, or of one under several hypotheses.
+        control : (B,) array
+            The indices of the controls in force.
+        unexplained : (B,) array
+            The probability that no state explains the sensors, with which the safest control is
+            taken.
+
+        Returns
+        -------
+        (B, U) array
+            The probabilities.
+        """
+        return decision_probability(
+            self.model.transition,
+            beliefs,
+            control,
+            self.policy,
+            self.on_belief,
+            ahead=self.decide_on == "predicted",
+            unexplained=unexplained,
+            safest=self._safest,
+        )
+
     def _decide(self, estimate: Estimate) -> TwinStep:
         """Return an estimate with prediction and decision, and set the proposed control.
 
@@ -480,15 +509,9 @@ class Twin:
         beliefs = np.array([estimate.filtered, *(named.belief for named in believed)])
         doubt = np.zeros(len(beliefs))
         doubt[0] = unexplained
-        probability, *under_hypotheses = decision_probability(
-            self.model.transition,
-            beliefs,
-            np.full(len(beliefs), control_index),
-            self.policy,
-            self._on_belief,
-            ahead=self.decide_on == "predicted",
-            unexplained=doubt,
-            safest=self._safest,
+        controls_in_force = np.full(len(beliefs), control_index)
+        probability, *under_hypotheses = self.control_probabilities(
+            beliefs, controls_in_force, doubt
         )
         self._proposed = int(np.argmax(probability))
 
