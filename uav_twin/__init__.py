@@ -39,7 +39,7 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.fleet.learning.learn import learn_from_fleet as learn_from_fleet
     from twin_master.fleet.plan import ensemble as ensemble
     from twin_master.fleet.reading import open_fleet as open_fleet
-    from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
+    from twin_master.gauges.monitor import WatchfulEstimator as WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin as prepare_twin
     from twin_master.network.estimator import Carried as Carried
     from twin_master.network.estimator import Estimate as Estimate
@@ -98,7 +98,7 @@ _HOMES = {
     "learn_from_fleet": "twin_master.fleet.learning.learn",
     "ensemble": "twin_master.fleet.plan",
     "open_fleet": "twin_master.fleet.reading",
-    "WatchfulEstimator": "twin_master.learning.monitor",
+    "WatchfulEstimator": "twin_master.gauges.monitor",
     "prepare_twin": "twin_master.mission.preparation",
     "Carried": "twin_master.network.estimator",
     "Estimate": "twin_master.network.estimator",

@@ -27,7 +27,7 @@ from reporting.progress import SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.learning.monitor import WatchfulEstimator
+from twin_master.gauges.monitor import WatchfulEstimator
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Carried, ExactFilter
 from twin_master.network.twin import build_graphical_model

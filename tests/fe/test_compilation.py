@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from fe import compilation
-from twin_master.learning import exchanged_densities, fault_evidence, fault_kernels
+from twin_master.gauges import exchanged_densities, fault_evidence, fault_kernels
 
 ROOT = Path(__file__).parents[2]
 

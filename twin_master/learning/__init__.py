@@ -1,1 +1,1 @@
-"""Learning of what does not change in time, and the watch over gauges and model."""
+"""Learning of what does not change in time, as an axis of the belief or by regression."""

@@ -26,9 +26,9 @@ from twin_master.assets.resolution import (
     resolve_scenario,
 )
 from twin_master.errors import RunFolderError
+from twin_master.gauges.monitor import WatchfulEstimator
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.plant import Plant, Truth

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
-from twin_master.learning.gauge_watch import CheckedReadings, GaugeWatch
-from twin_master.learning.monitor import gauge_watch_of
-from twin_master.learning.watch_state import WatchState
+from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch
+from twin_master.gauges.monitor import gauge_watch_of
+from twin_master.gauges.watch_state import WatchState
 from twin_master.mission.loop import early_end_sentence, fly, operate
 from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth, sentence_of_ending_action
 from twin_master.mission.preparation import Knowledge

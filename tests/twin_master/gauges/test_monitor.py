@@ -13,8 +13,8 @@ from scipy.stats import t as student
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import changed_scenario, estimates_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
-from twin_master.learning import hypothesis_weights
-from twin_master.learning.hypothesis_weights import HypothesisWeights
+from twin_master.gauges import hypothesis_weights
+from twin_master.gauges.hypothesis_weights import HypothesisWeights
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.journal import encode_line, step_record
 from twin_master.mission.preparation import Knowledge
@@ -222,7 +222,7 @@ def test_a_fault_that_showed_under_a_control_is_mended_by_that_control():
 
 def test_evidence_is_the_sum_over_states_draws_gains_and_first_steps(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
-    monkeypatch.setattr("twin_master.learning.fault_filter._GAIN_DEVIATIONS", (0.0,) * 4)
+    monkeypatch.setattr("twin_master.gauges.fault_filter._GAIN_DEVIATIONS", (0.0,) * 4)
     step_count = 4
     observation = drawn(np.random.default_rng(8), step_count)
     observation[2, 1] = np.nan  # one gauge is lost
@@ -384,7 +384,7 @@ def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late(absurd
 
 
 def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
-    monkeypatch.setattr("twin_master.learning.fault_filter._MOST_BELIEF_NUMBERS", 71)
+    monkeypatch.setattr("twin_master.gauges.fault_filter._MOST_BELIEF_NUMBERS", 71)
     with pytest.raises(InvalidModelError, match=r"3 states and 2 draws for each of 12 faults .* leave out"):
         watchful()
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
-from twin_master.learning.gauge_watch import GaugeWatch
-from twin_master.learning.watch_state import MODEL_KEY, StoredBelief
+from twin_master.gauges.gauge_watch import GaugeWatch
+from twin_master.gauges.watch_state import MODEL_KEY, StoredBelief
 from twin_master.network.estimator import Carried, Estimate, Estimator, NoticeWording
 from twin_master.network.inference import smooth
 from twin_master.network.sensor_model import GaussianSensorModel

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
-from twin_master.learning.watch_state import WatchState
+from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.sensor_model import GaussianSensorModel
 

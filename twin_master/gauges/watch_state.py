@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index, Unsigned
-from twin_master.learning.fault_kernels import Beliefs, FreeGainStatistics
-from twin_master.learning.hypothesis_weights import HypothesisWeights, MixedBelief
-from twin_master.learning.stuck_gauges import FROM_THE_START, StuckGauges
+from twin_master.gauges.fault_kernels import Beliefs, FreeGainStatistics
+from twin_master.gauges.hypothesis_weights import HypothesisWeights, MixedBelief
+from twin_master.gauges.stuck_gauges import FROM_THE_START, StuckGauges
 from twin_master.network.estimator import CarriedArrays
 
 _Number = TypeVar("_Number", bound=np.floating[Any])

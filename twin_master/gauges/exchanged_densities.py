@@ -11,8 +11,8 @@ import numpy as np
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index, Single
-from twin_master.learning.fault_kernels import StandardizedObservation
-from twin_master.learning.model_likelihood import ModelLikelihood
+from twin_master.gauges.fault_kernels import StandardizedObservation
+from twin_master.gauges.model_likelihood import ModelLikelihood
 
 _DIGITS_TOGETHER = 6
 """Binary digits of an exponent that are treated in one loop."""

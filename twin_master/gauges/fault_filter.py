@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
-from twin_master.learning import hypothesis_weights
-from twin_master.learning.belief_transitions import Onsets, Recoveries, advance_beliefs
-from twin_master.learning.fault_evidence import correct_beliefs
-from twin_master.learning.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
-from twin_master.learning.hypothesis_weights import HypothesisWeights, log_of_sum
-from twin_master.learning.stuck_gauges import FROM_THE_START
-from twin_master.learning.watch_state import FREE_GAIN_PROBABILITY, WatchState
+from twin_master.gauges import hypothesis_weights
+from twin_master.gauges.belief_transitions import Onsets, Recoveries, advance_beliefs
+from twin_master.gauges.fault_evidence import correct_beliefs
+from twin_master.gauges.fault_kernels import FaultPriors, LogEvidence, Observations, Predictions
+from twin_master.gauges.hypothesis_weights import HypothesisWeights, log_of_sum
+from twin_master.gauges.stuck_gauges import FROM_THE_START
+from twin_master.gauges.watch_state import FREE_GAIN_PROBABILITY, WatchState
 from twin_master.network.estimator import Carried
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fe.compilation import compiled, compiled_with_reordered_sums
 from reporting.arrays import Float, Index, Single
-from twin_master.learning.fault_kernels import NEGLIGIBLE_UNDER_FAULT, Beliefs
+from twin_master.gauges.fault_kernels import NEGLIGIBLE_UNDER_FAULT, Beliefs
 from twin_master.network.kernels import PredecessorLists
 
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from twin_master.learning.exchanged_densities import GaugeDensities
-from twin_master.learning.fault_kernels import (
+from twin_master.gauges.exchanged_densities import GaugeDensities
+from twin_master.gauges.fault_kernels import (
     StandardizedObservation,
     log_density_of_sound_gauges,
     multiply_by_power,
     number_products,
     update_sound_gauges,
 )
-from twin_master.learning.free_gains import weigh_free_gains, weigh_free_gains_in_logs
-from twin_master.learning.gauge_faults import SumsOfFaults, weigh_gauge_fault_in_logs, weigh_gauge_faults
-from twin_master.learning.model_likelihood import ModelLikelihood, model_likelihood
+from twin_master.gauges.free_gains import weigh_free_gains, weigh_free_gains_in_logs
+from twin_master.gauges.gauge_faults import SumsOfFaults, weigh_gauge_fault_in_logs, weigh_gauge_faults
+from twin_master.gauges.model_likelihood import ModelLikelihood, model_likelihood
 
 PAIRS, GAUGES, GAINS = 40, 3, 4
 FAULTS = GAUGES * GAINS

@@ -9,7 +9,7 @@ import numpy as np
 
 from fe.compilation import compiled, compiled_with_reordered_sums
 from reporting.arrays import Float, Single
-from twin_master.learning.exchanged_densities import (
+from twin_master.gauges.exchanged_densities import (
     ExchangeWork,
     GaugeDensities,
     exchange_densities,
@@ -17,14 +17,14 @@ from twin_master.learning.exchanged_densities import (
     log_exchanged_density,
     log_reference_density,
 )
-from twin_master.learning.fault_kernels import (
+from twin_master.gauges.fault_kernels import (
     NEGLIGIBLE_UNDER_FAULT,
     Beliefs,
     FaultPriors,
     StandardizedObservation,
     log_density_of_sound_gauges,
 )
-from twin_master.learning.model_likelihood import ModelLikelihood
+from twin_master.gauges.model_likelihood import ModelLikelihood
 from twin_master.scenario.tables import GAINS_PER_SENSOR
 
 _LEAST_TOTAL = 1e-9

@@ -9,7 +9,7 @@ import numpy as np
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.learning.fault_kernels import (
+from twin_master.gauges.fault_kernels import (
     LEAST_TOTAL,
     NEGLIGIBLE_UNDER_FAULT,
     NEGLIGIBLE_UNDER_MODEL,

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
-from twin_master.learning import hypothesis_weights
-from twin_master.learning.fault_filter import FaultFilter
-from twin_master.learning.fault_kernels import Observations
-from twin_master.learning.hypothesis_weights import log_of_sum, log_of_sums
-from twin_master.learning.notices import NoticeWriter
-from twin_master.learning.stuck_gauges import StandstillTest, StuckGauges
-from twin_master.learning.watch_state import WatchState
+from twin_master.gauges import hypothesis_weights
+from twin_master.gauges.fault_filter import FaultFilter
+from twin_master.gauges.fault_kernels import Observations
+from twin_master.gauges.hypothesis_weights import log_of_sum, log_of_sums
+from twin_master.gauges.notices import NoticeWriter
+from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
+from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel

@@ -4,8 +4,8 @@ import numba
 import numpy as np
 import pytest
 
-from twin_master.learning.hypothesis_weights import HypothesisWeights, MixedBelief
-from twin_master.learning.watch_state import WatchState
+from twin_master.gauges.hypothesis_weights import HypothesisWeights, MixedBelief
+from twin_master.gauges.watch_state import WatchState
 
 SENSORS, GAINS, DRAWS, STATES = 3, 4, 2, 5
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from twin_master.learning.hypothesis_weights import log_of_sum
+from twin_master.gauges.hypothesis_weights import log_of_sum
 from twin_master.scenario.tables import Noticing
 
 FROM_THE_START = 0.5

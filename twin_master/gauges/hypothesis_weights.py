@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from reporting.arrays import Float, Index
-from twin_master.learning.belief_transitions import average_competing_beliefs
-from twin_master.learning.fault_kernels import Beliefs
+from twin_master.gauges.belief_transitions import average_competing_beliefs
+from twin_master.gauges.fault_kernels import Beliefs
 from twin_master.network.estimator import Hypothesis
 
 MODEL = 0

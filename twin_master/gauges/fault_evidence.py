@@ -7,7 +7,7 @@ import numpy as np
 
 from fe.compilation import compiled
 from reporting.arrays import Float
-from twin_master.learning.fault_kernels import (
+from twin_master.gauges.fault_kernels import (
     Beliefs,
     FaultPriors,
     FreeGainStatistics,
@@ -19,9 +19,9 @@ from twin_master.learning.fault_kernels import (
     standardize,
     update_sound_gauges,
 )
-from twin_master.learning.free_gains import update_free_gains
-from twin_master.learning.gauge_faults import update_gauge_faults
-from twin_master.learning.model_likelihood import (
+from twin_master.gauges.free_gains import update_free_gains
+from twin_master.gauges.gauge_faults import update_gauge_faults
+from twin_master.gauges.model_likelihood import (
     model_likelihood,
     pairs_of_faults,
     pairs_of_hypotheses,

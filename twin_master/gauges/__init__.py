@@ -1,0 +1,1 @@
+"""The watch over the gauges of a twin: faults as hypotheses, useless readings, notices."""
