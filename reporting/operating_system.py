@@ -9,10 +9,11 @@ import math
 import os
 import queue
 import select
+import signal
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -262,6 +263,25 @@ def lower_priority(niceness: int, process_id: int = 0) -> None:
         present_niceness = os.getpriority(os.PRIO_PROCESS, process_id)
         # Only a privileged process may lower its niceness again
         os.setpriority(os.PRIO_PROCESS, process_id, max(niceness, present_niceness))
+
+
+@contextmanager
+def call_on_end_signal(request_end: Callable[[], None]) -> Iterator[None]:
+    """Call a function when SIGINT or SIGTERM comes, and restore the former handlers at the end.
+
+    Only the main thread of a process may set handlers. In another thread nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former_handlers = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        former_handlers[number] = signal.signal(number, lambda *_: request_end())
+    try:
+        yield
+    finally:
+        for number, handler in former_handlers.items():
+            signal.signal(number, handler)
 
 
 def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:

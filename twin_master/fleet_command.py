@@ -97,11 +97,11 @@ def watch(
 
     Example: `uav-twin fleet watch fleet.toml --follow`
     """
+    from reporting.operating_system import call_on_end_signal
     from twin_master.fleet.page.view import is_fleet, serve_fleet
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.watched.watching import FleetWatch
     from twin_master.watch.metrics import serve_metrics
-    from twin_master.watch.signals import call_on_end_signal
 
     fleet = load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name

@@ -32,11 +32,10 @@ from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.plant import Plant, Truth
-from twin_master.network.decision_problem import DecisionProblem
+from twin_master.network.decision_problem import DecisionProblem, observation_classes
 from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
-from twin_master.network.observation_classes import observation_classes
 from twin_master.network.planner import (
     BeliefPolicy,
     PlannedPolicy,

@@ -12,6 +12,7 @@ from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.json_file import JsonObject
+from reporting.operating_system import call_on_end_signal
 from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
@@ -54,7 +55,6 @@ from twin_master.watch.patch_trial import (
     patched_model,
 )
 from twin_master.watch.records import ModelRecord
-from twin_master.watch.signals import call_on_end_signal
 from twin_master.watch.teaching import Teaching
 
 WATCHED_ASSET = "watched asset"
