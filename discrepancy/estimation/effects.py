@@ -13,9 +13,11 @@ from discrepancy.fits.problem import Problem
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
+from reporting.arrays import LEAST_DIVISOR
 
 from .laws import LawForce, force_and_tangents, holds_at_rest
 from .sensor_errors import ReadingChanges
+from .simulated import motion_under_laws
 from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
 from .trial import PortedTrial
 
@@ -88,6 +90,29 @@ class EffectLaws:
         except (DiscrepancyError, InvalidPatchError):
             return None
 
+    def motion_under_laws(
+        self, arguments: LawArguments, local_values: FloatArray
+    ) -> Trajectory | None:
+        """Return the motion of a trial under all laws, without missing forces.
+
+        See `HypothesisLaws.motion_under_laws`.
+        """
+        try:
+            laws = self._laws_in_patch(self._patch_of_all_laws(arguments))
+        except (DiscrepancyError, InvalidPatchError):
+            return None
+        # Windows are half as wide as those of the linear laws: there, a body that is held at rest
+        # is then well within the window.
+        rms_speeds = np.sqrt(np.mean(arguments.trajectory.speeds**2, axis=0))
+        return motion_under_laws(
+            self.trials[arguments.trial_index],
+            laws,
+            arguments.shared,
+            local_values,
+            start=arguments.trajectory.added_state[0],
+            least_half_widths=0.5 * arguments.speed_window * np.maximum(rms_speeds, LEAST_DIVISOR),
+        )
+
     # ------------------------------------------------------------ laws
 
     def effect_forces_along_trajectory(self, arguments: LawArguments) -> dict[int, LawForce]:
@@ -109,9 +134,13 @@ class EffectLaws:
 
     def _checked_forces(self, arguments: LawArguments) -> dict[int, LawForce]:
         """Return the forces of all laws, by port; raise an error if an effect is not possible."""
+        return self._forces_of_patch(arguments, self._patch_of_all_laws(arguments))
+
+    def _patch_of_all_laws(self, arguments: LawArguments) -> ModelPatch:
+        """Return the laws of the model and of the effects; raise an error if one is impossible."""
         laws_of_model = self.evaluate_model_laws(arguments.shared)
         changes = self._patch_in_trial(arguments.trial_index, arguments.effect)
-        return self._forces_of_patch(arguments, laws_of_model + changes.of(PortForce))
+        return laws_of_model + changes.of(PortForce)
 
     def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
         """Return the forces of all laws, by port, with their derivatives by unknowns.
@@ -209,15 +238,12 @@ class EffectLaws:
     def _forces_of_patch(self, arguments: LawArguments, patch: ModelPatch) -> dict[int, LawForce]:
         """Return the forces of a patch's laws along a trajectory, by the number of the port.
 
-        The forces of several laws at one port are added. Other changes in the patch, such as those
-        of stiffness, are not forces at ports, and are ignored here.
+        The forces of several laws at one port are added.
         """
         trial = self.trials[arguments.trial_index]
         trajectory = arguments.trajectory
         forces: dict[int, LawForce] = {}
-        for law in self.problem.model.forces_at_ports(patch):
-            if not isinstance(law, PortForce):
-                continue
+        for law in self._laws_in_patch(patch):
             port_number = trial.system.ports.index(law.port)
             force = force_and_tangents(
                 law,
@@ -230,6 +256,11 @@ class EffectLaws:
                 force = force.plus(forces[port_number])
             forces[port_number] = force
         return forces
+
+    def _laws_in_patch(self, patch: ModelPatch) -> list[PortForce]:
+        """Return the laws of a patch at ports; other changes, as of stiffness, are left out."""
+        laws = self.problem.model.forces_at_ports(patch)
+        return [law for law in laws if isinstance(law, PortForce)]
 
     # ------------------------------------------------------------ sensors
 

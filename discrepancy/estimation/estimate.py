@@ -20,6 +20,8 @@ NO_EFFECT_VALUES = np.zeros(0)
 HIDDEN_SHARE = 0.5
 """Share of the unexplained force that may look like a law of the hypothesis. Without it, the
 intervals of a weaker law contain only 4 of 9 true values."""
+LEAST_EVIDENCE = 3.0
+"""Log evidence over no missing force from which on a force is missing [nat]."""
 NEGLIGIBLE_SIZE = 1e-9
 """Factor on the size of a missing force that stands for none: a process of size zero is
 singular."""
@@ -52,6 +54,9 @@ class Estimate:
         the rms speed.
     converged : bool
         Whether the last step was short enough.
+    follows_laws : bool
+        Whether the trials are linear along the motion of the laws alone, which is that of the last
+        step but for the missing forces.
     """
 
     candidate: Candidate
@@ -64,6 +69,7 @@ class Estimate:
     linearisation: Linearisation
     speed_window: float = 0.0
     converged: bool = True
+    follows_laws: bool = False
 
     @property
     def local(self) -> tuple[FloatArray, ...]:
@@ -90,6 +96,11 @@ class Estimate:
         """The log evidence of the same trials and laws if no force is missing [nat]."""
         no_force = scale_processes(self.processes, NEGLIGIBLE_SIZE, 1.0)
         return self.linearisation.solve(no_force).log_evidence
+
+    @property
+    def leaves_no_force(self) -> bool:
+        """Whether the trials do not show that any force is missing beside the effects."""
+        return self.log_evidence < self.log_evidence_without_force + LEAST_EVIDENCE
 
     @cached_property
     def covariance(self) -> FloatArray:

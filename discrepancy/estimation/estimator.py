@@ -35,6 +35,13 @@ iteration astray as long as the missing force is large, and in a wide one a body
 creeps, which only a missing force can undo. Which beginning is better depends on the record."""
 NARROWEST_WINDOW = 2e-4
 """Narrowest half width of this window."""
+WINDOW_AT_REST = 1e-5
+"""Half width of this window along the motion of the laws alone."""
+MOST_FOLLOWED_FORCES = 4
+"""Largest number of missing forces with which the motion of the laws is followed."""
+SMALL_FRACTION = 0.03
+"""Standard deviation of the missing force beside laws whose motion is followed, divided by that
+without any law."""
 ROUGH_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01)
 """These standard deviations in a rough estimate."""
 MOST_ROUGH_ITERATIONS = 3
@@ -65,9 +72,12 @@ class MotionEstimator:
     ----------
     gauss_newton : GaussNewton
         The iteration under given missing forces.
+    small_processes : mapping of int to Process
+        The missing forces with which an estimate along the motion of the laws alone begins.
     """
 
     gauss_newton: GaussNewton
+    small_processes: Processes
 
     def estimate_from_far(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that may be far from them.
@@ -153,8 +163,47 @@ class MotionEstimator:
         Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
+        followed_estimate = self.follow_laws(laws, replace(start, processes=self.small_processes))
+        if followed_estimate is not None and followed_estimate.leaves_no_force:
+            return followed_estimate
         estimate = self._estimate_with_smaller_forces(laws, start, speed_window)
-        return None if estimate is None else self.tune_processes(laws, estimate)
+        if estimate is None:
+            return followed_estimate
+        tuned_estimate = self.tune_processes(laws, estimate)
+        next_start = replace(start_from_estimate(tuned_estimate), processes=self.small_processes)
+        return _more_probable(tuned_estimate, self.follow_laws(laws, next_start))
+
+    def follow_laws(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
+        """Return an estimate along the motion of the laws alone, with small missing forces.
+
+        The missing forces and the motion are estimated in turn, as long as the evidence rises.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The unknowns to begin with, and small missing forces.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible.
+        """
+        best_estimate: Estimate | None = None
+        speed_window = WINDOW_AT_REST if laws.hold_at_rest else USUAL_WINDOW
+        for _ in range(MOST_FOLLOWED_FORCES):
+            estimate = self.gauss_newton.iterate_along_laws(laws, start, speed_window)
+            if estimate is None or _more_probable(best_estimate, estimate) is best_estimate:
+                break
+            best_estimate = estimate
+            processes, rise = self._more_probable_processes(
+                estimate.linearisation, estimate.processes
+            )
+            if rise < LEAST_RISE:
+                break
+            start = replace(start_from_estimate(estimate), processes=processes)
+        return best_estimate
 
     def polish(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
@@ -177,12 +226,19 @@ class MotionEstimator:
         Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        estimate = self.gauss_newton.iterate(laws, start, speed_window, MOST_LAST_ITERATIONS)
+        followed_estimate = self.follow_laws(laws, start)
+        if followed_estimate is not None and followed_estimate.leaves_no_force:
+            return followed_estimate
+        smallest_window = NARROWEST_WINDOW if laws.hold_at_rest else USUAL_WINDOW
+        estimate = self.gauss_newton.iterate(
+            laws, start, max(speed_window, smallest_window), MOST_LAST_ITERATIONS
+        )
         if estimate is None:
-            return None
-        return self.tune_processes(
+            return followed_estimate
+        tuned_estimate = self.tune_processes(
             laws, estimate, LAST_FACTORS, repetitions=1, most_iterations=MOST_LAST_ITERATIONS
         )
+        return _more_probable(tuned_estimate, followed_estimate)
 
     def _estimate_with_smaller_forces(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
@@ -248,8 +304,8 @@ class MotionEstimator:
     ) -> Estimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
-        This is a pattern search with decreasing factors, in which the trials stay linear along one
-        trajectory. The result is then estimated anew, and returned if it is more probable.
+        They are searched in trials that stay linear along one trajectory. The result is then
+        estimated anew, and returned if it is more probable.
 
         Parameters
         ----------
@@ -268,7 +324,48 @@ class MotionEstimator:
         linearisation = self.gauss_newton.linearise(laws, start, estimate.speed_window)
         if linearisation is None:
             return estimate
-        processes = dict(start.processes)
+        processes, rise = self._more_probable_processes(
+            linearisation, start.processes, factors, repetitions
+        )
+        if rise < LEAST_RISE:
+            return estimate
+        tuned_estimate = self.gauss_newton.iterate(
+            laws, replace(start, processes=processes), estimate.speed_window, most_iterations
+        )
+        if tuned_estimate is None or tuned_estimate.log_evidence <= estimate.log_evidence:
+            return estimate
+        return tuned_estimate
+
+    def _more_probable_processes(
+        self,
+        linearisation: Linearisation,
+        first_processes: Processes,
+        factors: Sequence[float] = PATTERN_FACTORS,
+        repetitions: int = MOST_REPETITIONS,
+    ) -> tuple[dict[int, Process], float]:
+        """Return more probable sizes and times of missing forces in linear trials.
+
+        This is a pattern search with decreasing factors.
+
+        Parameters
+        ----------
+        linearisation : Linearisation
+            All trials, linear about an estimate.
+        first_processes : mapping of int to Process
+            The missing forces to begin with, by the number of the port.
+        factors : sequence of float
+            The factors on size and time that are tried in turn.
+        repetitions : int
+            The largest number of times in a row that one factor is tried.
+
+        Returns
+        -------
+        processes : dict of int to Process
+            The missing forces.
+        rise : float
+            The rise of the log evidence from the first ones [nat].
+        """
+        processes = dict(first_processes)
         first_evidence = self.gauss_newton.log_evidence(linearisation, processes)
         largest_evidence = first_evidence
         for factor in factors:
@@ -279,14 +376,7 @@ class MotionEstimator:
                 )
                 if largest_evidence < last_evidence + LEAST_RISE:
                     break
-        if largest_evidence < first_evidence + LEAST_RISE:
-            return estimate
-        tuned_estimate = self.gauss_newton.iterate(
-            laws, replace(start, processes=processes), estimate.speed_window, most_iterations
-        )
-        if tuned_estimate is None or tuned_estimate.log_evidence <= estimate.log_evidence:
-            return estimate
-        return tuned_estimate
+        return processes, largest_evidence - first_evidence
 
     def _try_factor(
         self,
@@ -331,3 +421,10 @@ class MotionEstimator:
                     processes, largest_evidence = changed_processes, evidence
                     break
         return processes, largest_evidence
+
+
+def _more_probable(estimate: Estimate | None, other_estimate: Estimate | None) -> Estimate | None:
+    """Return the more probable one of two estimates, or the one that there is."""
+    if estimate is None or other_estimate is None:
+        return estimate or other_estimate
+    return max(estimate, other_estimate, key=lambda either: either.log_evidence)

@@ -18,7 +18,7 @@ from fe.runtime.patch import ModelPatch
 
 from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimate import NO_EFFECT_VALUES, NO_EFFECTS, Estimate, estimate_of_processes
-from .estimator import USUAL_WINDOW, MotionEstimator
+from .estimator import SMALL_FRACTION, USUAL_WINDOW, MotionEstimator
 from .force_states import Process
 from .gauss_newton import EstimatorStart, GaussNewton, linearise_trials, start_from_estimate
 from .linearisation import Linearisation, plain_linearisation
@@ -271,7 +271,8 @@ class ForceSearch:
             The values of the shared unknowns.
         """
         precision = self.problem.shared.precision
-        start = EstimatorStart(NO_EFFECT_VALUES, shared_values, trajectories, {})
+        no_local_values = tuple(np.zeros(0) for _ in trials)
+        start = EstimatorStart(NO_EFFECT_VALUES, shared_values, no_local_values, trajectories, {})
         laws = self.trial_set.laws(NO_EFFECTS, trials)
         linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, precision)
         return linearisation or plain_linearisation(trials, precision)
@@ -348,9 +349,11 @@ class ForceSearch:
 
     def estimator(self, trials: Sequence[PortedTrial]) -> MotionEstimator:
         """Return the estimator of hypotheses in some trials."""
-        prior_medians = self.prior_processes(self.estimate_without_effects.processes)
+        processes = self.estimate_without_effects.processes
+        prior_medians = self.prior_processes(processes)
         return MotionEstimator(
-            GaussNewton(tuple(trials), self.problem.shared.precision, prior_medians)
+            GaussNewton(tuple(trials), self.problem.shared.precision, prior_medians),
+            small_processes=scale_processes(processes, SMALL_FRACTION, 1.0),
         )
 
     def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
@@ -444,6 +447,24 @@ class ForceSearch:
         speed_window = base.speed_window or USUAL_WINDOW
         return self.estimator(trials).polish(self.laws(candidate, trials), start, speed_window)
 
+    def follow_laws(self, estimate: Estimate) -> Estimate | None:
+        """Return an estimate along the motion of its laws alone, from the values of another one.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The estimate whose unknowns are those to begin with.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible.
+        """
+        trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
+        estimator = self.estimator(trials)
+        start = replace(start_from_estimate(estimate), processes=estimator.small_processes)
+        return estimator.follow_laws(self.laws(estimate.candidate, trials), start)
+
     def estimate_about_own_values(self, estimate: Estimate) -> Estimate:
         """Return an estimate in trials that are linear about its own unknowns.
 
@@ -468,7 +489,7 @@ class ForceSearch:
             laws = self.laws(estimate.candidate, next_trials)
             estimator = self.estimator(next_trials)
             start = start_in_other_trials(estimate, next_trials)
-            if number == 0:
+            if number == 0 and not estimate.follows_laws:
                 next_estimate = estimator.estimate_nearby(laws, start, estimate.speed_window)
             else:
                 next_estimate = estimator.polish(laws, start, estimate.speed_window)

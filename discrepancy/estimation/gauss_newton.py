@@ -7,7 +7,7 @@ Laplace's approximation.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Protocol
 
@@ -84,6 +84,24 @@ class HypothesisLaws(Protocol):
     def model_forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, FloatArray]:
         """Return the forces (F,) of the model's own laws along a trajectory, by port."""
 
+    def motion_under_laws(
+        self, arguments: LawArguments, local_values: FloatArray
+    ) -> Trajectory | None:
+        """Return the motion of a trial under all laws, without missing forces.
+
+        Parameters
+        ----------
+        arguments : LawArguments
+            The trial, the values of unknowns, and a motion that begins in the same state.
+        local_values : (L,) array
+            The values of the unknowns of this trial alone.
+
+        Returns
+        -------
+        Trajectory or None
+            The motion; None if an effect is not possible at these values.
+        """
+
 
 @dataclass(frozen=True, eq=False)
 class EstimatorStart:
@@ -93,6 +111,8 @@ class EstimatorStart:
     ----------
     effect, shared : (E,), (K,) ndarray
         The unknowns of effects, and those that all trials share.
+    local : tuple of (L,) ndarray
+        The unknowns of each trial alone.
     trajectories : tuple of Trajectory
         The trajectory of each trial.
     processes : mapping of int to Process
@@ -102,6 +122,7 @@ class EstimatorStart:
 
     effect: FloatArray
     shared: FloatArray
+    local: tuple[FloatArray, ...]
     trajectories: tuple[Trajectory, ...]
     processes: Processes
 
@@ -117,6 +138,7 @@ def start_from_estimate(estimate: Estimate) -> EstimatorStart:
     return EstimatorStart(
         estimate.effect,
         estimate.shared,
+        estimate.local,
         tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials),
         estimate.processes,
     )
@@ -170,6 +192,44 @@ def linearise_trials(
     # the unknowns of effects have standard normal priors, of precision one
     precision = np.concatenate((shared_precision, np.ones(laws.candidate.parameter_count)))
     return Linearisation(tuple(linear_trials), precision)
+
+
+def linearise_along_laws(
+    laws: HypothesisLaws,
+    trials: Sequence[PortedTrial],
+    start: EstimatorStart,
+    speed_window: float,
+    shared_precision: FloatArray,
+) -> Linearisation | None:
+    """Return all trials linearised along the motion that a hypothesis' laws alone give them.
+
+    Parameters
+    ----------
+    laws : HypothesisLaws
+        The laws and sensor errors of the hypothesis.
+    trials : sequence of PortedTrial
+        The trials as linear systems with ports.
+    start : EstimatorStart
+        The values of unknowns, and trajectories that begin in the same states.
+    speed_window : float
+        The half width of the window of speeds, see `LawArguments`.
+    shared_precision : (K,) array
+        The prior precisions of the shared unknowns.
+
+    Returns
+    -------
+    Linearisation or None
+        The linear trials; None if the laws are not possible in one of them.
+    """
+    trajectories = []
+    for trial_index, local_values in enumerate(start.local):
+        arguments = start.law_arguments(trial_index, speed_window)
+        trajectory = laws.motion_under_laws(arguments, local_values)
+        if trajectory is None:
+            return None
+        trajectories.append(trajectory)
+    start_along_laws = replace(start, trajectories=tuple(trajectories))
+    return linearise_trials(laws, trials, start_along_laws, speed_window, shared_precision)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +315,60 @@ class GaussNewton:
                 return estimate
             current_start = next_start
         return estimate
+
+    def iterate_along_laws(
+        self,
+        laws: HypothesisLaws,
+        start: EstimatorStart,
+        speed_window: float,
+        most_iterations: int = MOST_ITERATIONS,
+    ) -> Estimate | None:
+        """Return the most probable of several estimates, each along the motion of the laws alone.
+
+        This is a shooting method: each trajectory is simulated with the unknowns of the last
+        estimate, so that laws with kinks, such as dry friction, are linear about a motion that they
+        make. It is meant for small missing forces, which the simulation leaves out.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The unknowns to begin with, trajectories that begin in the same states, and the missing
+            forces, which are small.
+        speed_window : float
+            The half width of the window of speeds, see `LawArguments`.
+        most_iterations : int
+            The largest number of simulations.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if the laws are not possible at the first unknowns.
+        """
+        best_estimate: Estimate | None = None
+        last_evidence = -inf
+        for _ in range(most_iterations):
+            linearisation = linearise_along_laws(
+                laws, self.trials, start, speed_window, self.shared_precision
+            )
+            if linearisation is None:
+                return best_estimate
+            estimate = self._estimate_of_linearisation(
+                laws.candidate, linearisation, start, last_evidence, speed_window
+            )
+            if estimate is None:
+                return best_estimate
+            estimate = replace(estimate, follows_laws=True)
+            if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
+                best_estimate = estimate
+            rise = estimate.log_evidence - last_evidence
+            if estimate.converged or rise < LEAST_RISE:
+                return best_estimate
+            last_evidence = estimate.log_evidence
+            effect = laws.candidate.within_range(estimate.effect)
+            start = replace(start_from_estimate(estimate), effect=effect)
+        return best_estimate
 
     def _estimate_of_linearisation(
         self,
@@ -360,6 +474,7 @@ class GaussNewton:
                 effect=laws.candidate.within_range(current_start.effect + fraction_taken * change),
                 shared=current_start.shared
                 + fraction_taken * (estimate.shared - current_start.shared),
+                local=estimate.local,
                 trajectories=trajectories,
                 processes=current_start.processes,
             )

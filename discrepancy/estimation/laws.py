@@ -7,15 +7,20 @@ from functools import cache
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from fe.compilation import compiled, law_functions
+from fe.compilation import callable_when_compiled, compiled, law_functions
 from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
-from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import EXPONENT, POSITION_EXPONENT, steady_force
+from fe.runtime.laws.interface import PARAMETERS, PortForce, power
+from fe.runtime.laws.speed import (
+    COEFFICIENT,
+    EXPONENT,
+    LEVEL,
+    ONE_SIDED,
+    POSITION_EXPONENT,
+    steady_force,
+)
 from reporting.arrays import LEAST_DIVISOR
 
-WINDOW_NODES = 8
-"""Number of speeds in the window over which a law of the speed is averaged."""
 LARGEST_HOLDING_EXPONENT = 0.3
 """Exponent of the speed below which a law may hold a body at rest."""
 RELATIVE_HALF_DIFFERENCE = 1e-4
@@ -50,13 +55,42 @@ class LawForce:
         )
 
 
+@callable_when_compiled
+def mean_force(law: FloatArray, x: float, speed: float, half_width: float) -> float:
+    """Return the mean of a law of the speed over a window of speeds, at a position of its port.
+
+    The law is a power of the speed above a level, so that the mean is a difference of the next
+    higher powers.
+
+    Parameters
+    ----------
+    law : (R,) array
+        The parameters of the law, as `PortForce.parameter_row`.
+    x : float
+        The position [m or rad].
+    speed, half_width : float
+        The middle of the window, and half its width [m/s or rad/s].
+    """
+    if half_width == 0.0:
+        return steady_force(law, x, speed)
+    low = speed - half_width - law[LEVEL]
+    high = speed + half_width - law[LEVEL]
+    if law[ONE_SIDED] == 1.0:
+        low = max(low, 0.0)
+        high = max(high, 0.0)
+    next_exponent = law[EXPONENT] + 1.0
+    difference = power(abs(high), next_exponent) - power(abs(low), next_exponent)
+    size = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
+    return float(size * difference / (2.0 * half_width * next_exponent))
+
+
 def fill_force_and_tangents(
     law_index: int,
     of_speed: bool,
     law: FloatArray,
     positions: FloatArray,
     speeds: FloatArray,
-    half_width: float,
+    half_widths: FloatArray,
     half_difference: float,
     memory: FloatArray,
     force: FloatArray,
@@ -79,7 +113,7 @@ def fill_force_and_tangents(
         The parameters of the law, as `PortForce.parameter_row`.
     positions, speeds : (F,) array
         The motion of the port [m or rad, and per s].
-    half_width : float
+    half_widths : (F,) array
         The half width of the window of speeds [m/s or rad/s].
     half_difference : float
         Half the difference of the position in a tangent [m or rad].
@@ -89,18 +123,13 @@ def fill_force_and_tangents(
         The force and its derivatives by position and speed, which are filled.
     """
     for j in range(len(positions)):
-        x, v = positions[j], speeds[j]
+        x, v, half_width = positions[j], speeds[j], half_widths[j]
         if not of_speed:
             advance(law_index, law, memory, x)
             memory[POSITION] = x
             force[j], by_position[j] = force_and_slope(law_index, law, memory, x, 1.0)
             continue
-        force_sum = 0.0
-        for i in range(WINDOW_NODES):
-            # midpoints of `WINDOW_NODES` equal parts of the window
-            offset = half_width * ((2.0 * i + 1.0) / WINDOW_NODES - 1.0)
-            force_sum += steady_force(law, x, v + offset)
-        force[j] = force_sum / WINDOW_NODES
+        force[j] = mean_force(law, x, v, half_width)
         # the exact derivative of the mean over the window: d/dv of the integral of f from v - h to
         # v + h is f(v + h) - f(v - h), divided by the width 2 h
         difference_over_window = steady_force(law, x, v + half_width) - steady_force(
@@ -108,9 +137,9 @@ def fill_force_and_tangents(
         )
         by_speed[j] = difference_over_window / (2.0 * half_width)
         if law[POSITION_EXPONENT] != 0.0:
-            difference_by_position = steady_force(law, x + half_difference, v) - steady_force(
-                law, x - half_difference, v
-            )
+            difference_by_position = mean_force(
+                law, x + half_difference, v, half_width
+            ) - mean_force(law, x - half_difference, v, half_width)
             by_position[j] = difference_by_position / (2.0 * half_difference)
 
 
@@ -134,8 +163,8 @@ def force_and_tangents(
     time, positions, speeds : (F,) ndarray
         The fine stamps [s], and the motion of the port there [m or rad, and per s].
     speed_window : float
-        The half width of the window of speeds over which a law of the speed is averaged, divided
-        by the rms speed.
+        The least half width of the window of speeds over which a law of the speed is averaged,
+        divided by the rms speed; see `half_widths_of_windows`.
     """
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
@@ -148,7 +177,7 @@ def force_and_tangents(
         row,
         np.ascontiguousarray(positions),
         np.ascontiguousarray(speeds),
-        speed_window * rms_speed,
+        half_widths_of_windows(speeds, speed_window * rms_speed),
         RELATIVE_HALF_DIFFERENCE * rms_position,
         memory,
         force,
@@ -157,6 +186,23 @@ def force_and_tangents(
     )
     is_acting = law.acts_at(time)
     return LawForce(force * is_acting, by_position * is_acting, by_speed * is_acting)
+
+
+def half_widths_of_windows(speeds: FloatArray, least_half_width: float) -> FloatArray:
+    """Return the half widths (F,) of the windows over which laws of the speed are averaged.
+
+    A window contains at least the speeds that the port passes from the middle of one substep to
+    that of the next. The mean over them is the mean over this time, so that dry friction whose sign
+    changes within a substep has the right impulse.
+
+    Parameters
+    ----------
+    speeds : (F,) array
+        The speeds of the port at the fine stamps [m/s or rad/s].
+    least_half_width : float
+        The least half width [m/s or rad/s].
+    """
+    return np.maximum(0.5 * np.abs(np.gradient(speeds)), least_half_width)
 
 
 def holds_at_rest(law: PortForce) -> bool:

@@ -179,7 +179,11 @@ class _Ranking:
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         self.on_progress(f"comparing all effects{base_in_words} with the missing force")
-        promising_effects = screen_effects(self.search, base, self.effects)[:followed_count]
+        screened_effects = screen_effects(self.search, base, self.effects)
+        if base.leaves_no_force:
+            # the screen is exact for effects that are small, as any further one is
+            screened_effects = [effect for effect in screened_effects if effect.rise > 0.0]
+        promising_effects = screened_effects[:followed_count]
         rough_estimates = []
         for number, screened_effect in enumerate(promising_effects):
             candidate = base.candidate.with_term(screened_effect.term)
@@ -219,8 +223,20 @@ class _Ranking:
         for rough_estimate in rough_estimates[:beam_width]:
             if self.score(rough_estimate) < self.score(rough_estimates[0]) - ESTIMATED_RANGE:
                 break
+            # where nothing is left to explain, another effect cannot explain more
+            best_estimate = self.best
+            if (
+                best_estimate.leaves_no_force
+                and self.score(rough_estimate) < self.score(best_estimate) - ESTIMATED_RANGE
+            ):
+                break
             candidate = rough_estimate.candidate
             self.on_progress(f"estimating {candidate.description} together with the motion")
+            followed_estimate = self.search.follow_laws(rough_estimate)
+            if followed_estimate is not None and followed_estimate.leaves_no_force:
+                self.record(self.search.estimate_about_own_values(followed_estimate))
+                self.estimated_in_full.add(candidate.key)
+                continue
             estimate = self.search.estimate_effects(base, candidate, rough_estimate.effect)
             if estimate is not None:
                 self.record(estimate)

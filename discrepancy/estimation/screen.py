@@ -7,6 +7,7 @@ factor is one more unknown, and one pass of the filter weighs the columns of all
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -106,15 +107,16 @@ class ScreenedEffect(NamedTuple):
 
     Attributes
     ----------
-    log_evidence : float
-        The largest log evidence of the screening, at the best of the tried values [nat].
+    rise : float
+        The largest log evidence of the screening, at the best of the tried values, minus that
+        without the effect [nat].
     term : EffectTerm
         The effect at its place.
     starts : list of ScreenedStart
         The values from which estimates of the effect begin.
     """
 
-    log_evidence: float
+    rise: float
     term: EffectTerm
     starts: list[ScreenedStart]
 
@@ -139,8 +141,9 @@ def screen_effects(
         The effects that may be missing in the model.
     """
     tried_effects = _try_effects(search, base, effects)
+    evidence_of_base, weighed_effects = _weigh_effects(base, tried_effects)
     starts_by_term: dict[EffectTerm, list[ScreenedStart]] = {}
-    for tried_effect, start in _weigh_effects(base, tried_effects):
+    for tried_effect, start in weighed_effects:
         starts_by_term.setdefault(tried_effect.term, []).append(start)
     screened_effects = []
     for term, starts in starts_by_term.items():
@@ -148,8 +151,8 @@ def screen_effects(
         tied_starts = [
             start for start in starts if start.log_evidence > best_evidence - TIED_EVIDENCE
         ]
-        screened_effects.append(ScreenedEffect(best_evidence, term, tied_starts))
-    return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
+        screened_effects.append(ScreenedEffect(best_evidence - evidence_of_base, term, tied_starts))
+    return sorted(screened_effects, key=lambda effect: -effect.rise)
 
 
 def values_to_try(term: EffectTerm) -> list[FloatArray]:
@@ -263,14 +266,22 @@ def _force_that_holds(
 
 def _weigh_effects(
     base: Estimate, tried_effects: Sequence[TriedEffect]
-) -> list[tuple[TriedEffect, ScreenedStart]]:
+) -> tuple[float, list[tuple[TriedEffect, ScreenedStart]]]:
     """Return effects with their best evidence and values, each added alone to an estimate.
 
     The best is taken over several deviations and times of the remaining missing forces. An effect
     is left out if its factor always has a sign that the effect cannot have.
+
+    Returns
+    -------
+    evidence_of_base : float
+        The best log evidence without any of the effects [nat].
+    starts : list of (TriedEffect, ScreenedStart)
+        The effects, with the values from which an estimate may begin.
     """
+    evidence_of_base = -inf
     if not tried_effects:
-        return []
+        return evidence_of_base, []
     with_columns = _with_columns(base, tried_effects)
     base_count = len(base.linearisation.prior_precision)
     best_starts: dict[int, ScreenedStart] = {}
@@ -280,6 +291,9 @@ def _weigh_effects(
             with_columns.correlation_time_range,
         )
         normal_equations = with_columns.regression(with_columns.filter(processes))
+        of_base = range(base_count)
+        without_effect = normal_equations.solve(of_base, with_columns.prior_precision[of_base])
+        evidence_of_base = max(evidence_of_base, without_effect.log_evidence)
         for index, tried_effect in enumerate(tried_effects):
             # the unknowns of the base are fitted again, with this column alone
             unknowns = [*range(base_count), base_count + index]
@@ -293,7 +307,7 @@ def _weigh_effects(
                     tried_effect.values, factor
                 )
                 best_starts[index] = ScreenedStart(solution.log_evidence, effect, processes)
-    return [(tried_effects[index], start) for index, start in best_starts.items()]
+    return evidence_of_base, [(tried_effects[index], start) for index, start in best_starts.items()]
 
 
 def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linearisation:

@@ -266,6 +266,16 @@ class PortedTrial:
         added_speeds = added_state @ self.system.speeds.T
         return response_positions + added_positions, response_speeds + added_speeds
 
+    def system_at(self, shared_values: FloatArray) -> PortedSystem:
+        """Return the linear system at values (K,) of the shared unknowns, in which it is linear."""
+        generator, actions = self.system.generator, self.system.actions
+        changes = shared_values - self.linearisation_point[: len(shared_values)]
+        for change, derivative in zip(changes, self.system_derivatives, strict=True):
+            if derivative is not None:
+                generator = generator + change * derivative.generator
+                actions = actions + change * derivative.actions
+        return replace(self.system, generator=generator, actions=actions)
+
     def state_under_force(self, port: int, force: FloatArray) -> FloatArray:
         """Return the state (F, n) that a force at a port adds to the response of the model.
 

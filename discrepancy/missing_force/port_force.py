@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
-from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.estimate import LEAST_EVIDENCE, Estimate
 from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -93,9 +93,6 @@ def ordering_variables(
 
 
 # ---------------------------------------------------------------- the missing force at a port
-
-LEAST_EVIDENCE = 3.0
-"""Log evidence over no missing force from which on a force is missing [nat]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,11 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
 from discrepancy.estimation.filtered import SmoothedTrial
 from discrepancy.estimation.force_search import WIDE_WINDOW, ForceSearch, TrialSet
-from discrepancy.estimation.gauss_newton import EstimatorStart, linearise_trials
+from discrepancy.estimation.gauss_newton import (
+    EstimatorStart,
+    linearise_along_laws,
+    linearise_trials,
+)
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
 from discrepancy.estimation.trial import PortedTrial
@@ -238,19 +242,24 @@ class ForceShares:
         laws = self._held_out.laws(estimate.candidate, trials)
         # an estimate without effects has no window, but the model may have laws of its own
         speed_window = estimate.speed_window or WIDE_WINDOW
-        for _ in range(SMOOTHING_ROUNDS):
+        # first along the smoothed motion; then, if the estimate is, along that of the laws alone
+        rounds = [(linearise_trials, processes)] * SMOOTHING_ROUNDS
+        if estimate.follows_laws:
+            rounds += [(linearise_along_laws, estimate.processes)] * SMOOTHING_ROUNDS
+        for linearise, remaining_processes in rounds:
             start = EstimatorStart(
                 effect=estimate.effect,
                 shared=estimate.shared,
+                local=tuple(trial.local for trial in smoothed_trials),
                 trajectories=tuple(trial.trajectory for trial in smoothed_trials),
-                processes=processes,
+                processes=remaining_processes,
             )
-            with_laws = linearise_trials(laws, trials, start, speed_window, precision)
+            with_laws = linearise(laws, trials, start, speed_window, precision)
             if with_laws is None:
                 break
             linearisation = with_laws
-            smoothed_trials = linearisation.smooth(processes, estimate.solution)
-        return linearisation, smoothed_trials
+            smoothed_trials = linearisation.smooth(remaining_processes, estimate.solution)
+        return linearisation, linearisation.smooth(processes, estimate.solution)
 
     def _held_out_linearised_as(self, estimate: Estimate) -> tuple[PortedTrial, ...]:
         """Return the held-out trials, linearised about the same values as the fitted trials."""

@@ -1,0 +1,105 @@
+"""A mass on a spring that dry friction brings to rest, simulated in the substeps of the estimator."""
+
+import numpy as np
+import pytest
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.estimation.simulated import motion_under_laws
+from discrepancy.estimation.trajectory import Trajectory
+from discrepancy.estimation.trial import PortedTrial
+from discrepancy.system.response import PortedSystem
+from fe.runtime.patch import PowerDamping
+
+FRICTION = 0.11
+TURNING_POINTS = 1.0, -0.78, 0.56, -0.34, 0.12, 0.10
+"""Positions of the mass each time that it turns: friction takes 2 F / k in each half cycle, and from
+0.12 the spring no longer pulls it through zero. At 0.10 it stays."""
+HELD = slice(-200, None)
+
+
+def released_mass(interval: float) -> PortedTrial:
+    """Return a mass and a spring of 1 kg and 1 N/m, released at 1 m, over ten half cycles."""
+    time = np.arange(0.0, 10.0 * np.pi, interval)
+    fine_time = np.linspace(0.0, time[-1], 4 * (len(time) - 1) + 1)
+    return PortedTrial(
+        name="release",
+        time=time,
+        residual=np.zeros((len(time), 1)),
+        used=np.ones((len(time), 1), dtype=bool),
+        deviation=np.ones(1),
+        coloured_noises=(),
+        shared_derivatives=np.zeros((0, len(time), 1)),
+        local_derivatives=np.zeros((0, len(time), 1)),
+        local_precision=np.zeros(0),
+        system=PortedSystem(
+            generator=np.array([[0.0, 1.0], [-1.0, 0.0]]),
+            ports=("slide",),
+            actions=np.array([[0.0, 1.0]]),
+            positions=np.array([[1.0, 0.0]]),
+            speeds=np.array([[0.0, 1.0]]),
+            outputs=np.array([[1.0, 0.0]]),
+            through=np.zeros((1, 1)),
+        ),
+        system_derivatives=(),
+        substeps=4,
+        port_positions=np.cos(fine_time)[:, None],
+        port_speeds=-np.sin(fine_time)[:, None],
+        begins_at_rest=False,
+    )
+
+
+def simulated(interval: float, friction: float = FRICTION) -> Trajectory:
+    """Return the motion of the mass with dry friction [N]."""
+    trial = released_mass(interval)
+    law = PowerDamping(
+        port="slide",
+        coefficient=friction,
+        velocity_exponent=0.0,
+        displacement_exponent=0.0,
+        reference_velocity=1.0,
+        reference_displacement=1.0,
+    )
+    no_unknowns = np.zeros(0)
+    least_half_widths = np.array([1e-7])
+    return motion_under_laws(trial, [law], no_unknowns, no_unknowns, np.zeros(2), least_half_widths)
+
+
+def at_half_cycles(trajectory: Trajectory) -> FloatArray:
+    """Return the position at the end of each half cycle."""
+    count = len(trajectory.positions) - 1
+    stamps = [round(number * count / 10.0) for number in range(len(TURNING_POINTS))]
+    return trajectory.positions[stamps, 0]
+
+
+def test_friction_takes_the_same_length_in_each_half_cycle():
+    np.testing.assert_allclose(at_half_cycles(simulated(0.05)), TURNING_POINTS, atol=2e-4)
+
+
+def test_friction_holds_the_mass_where_it_comes_to_rest():
+    trajectory = simulated(0.05)
+    assert np.ptp(trajectory.positions[HELD]) < 1e-5
+    np.testing.assert_allclose(trajectory.speeds[HELD], 0.0, atol=1e-6)
+
+
+def test_the_force_of_friction_at_rest_is_that_of_the_spring():
+    trajectory = simulated(0.05)
+    np.testing.assert_allclose(trajectory.forces[0][HELD], -trajectory.positions[HELD, 0], atol=1e-5)
+
+
+def test_a_shorter_step_gives_a_more_accurate_motion():
+    errors = [
+        np.abs(at_half_cycles(simulated(interval)) - TURNING_POINTS).max() for interval in (0.2, 0.1, 0.05)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[2] < 0.5 * errors[1]
+
+
+def test_the_added_state_moves_the_port_as_the_motion_says():
+    trajectory = simulated(0.1)
+    positions, speeds = released_mass(0.1).port_motion(np.zeros(0), trajectory.added_state)
+    np.testing.assert_allclose(trajectory.positions, positions, atol=1e-12)
+    np.testing.assert_allclose(trajectory.speeds, speeds, atol=1e-12)
+
+
+def test_friction_that_is_larger_than_the_spring_holds_the_mass_from_the_start():
+    assert simulated(0.1, friction=1.5).positions == pytest.approx(1.0, abs=1e-4)
