@@ -4,7 +4,7 @@ The substeps are those of `linearised`: the laws' force is linear over each of t
 But the laws themselves are not made linear, so that dry friction brings a body to rest, and holds
 it there.
 
-Shapes: F fine stamps, N samples, n states, P ports, L laws, J lengths of substeps.
+Shapes: F fine stamps, N samples, n states, P ports, L laws, J different lengths of substeps.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,8 +28,10 @@ from .trial import PortedTrial
 
 LEAST_CHANGE = 1e-12
 """Change of a force at which the search for it ends, as a fraction of the force."""
-MOST_REPETITIONS, MOST_EVALUATIONS = 6, 90
-"""Largest number of repetitions, and of all evaluations of the laws, in this search."""
+MOST_REPETITIONS = 6
+"""Largest number of repetitions in this search, as long as the force does not overshoot."""
+MOST_EVALUATIONS = 90
+"""Largest number of evaluations of the laws in this search."""
 SWEEPS = 4
 """Number of times that the forces at several ports are found, each in turn (Gauss-Seidel)."""
 
@@ -59,6 +61,27 @@ class LawArrays(NamedTuple):
     memories: FloatArray
 
 
+class SystemArrays(NamedTuple):
+    """A linear system with ports, as compiled loops take it.
+
+    Attributes
+    ----------
+    transitions : (J, n, n) array
+        The transition of a substep without laws, for each length.
+    by_force_at_begin, by_force_at_end : (J, n, P) array
+        The change of the state over a substep for a unit force at a port, at the start and at the
+        end of the step.
+    position_rows, speed_rows : (P, n) array
+        The motion of the ports for a unit of each state.
+    """
+
+    transitions: FloatArray
+    by_force_at_begin: FloatArray
+    by_force_at_end: FloatArray
+    position_rows: FloatArray
+    speed_rows: FloatArray
+
+
 @callable_when_compiled
 def force_at_port(
     laws: LawArrays, port: int, stamp: int, position: float, speed: float, half_width: float
@@ -68,7 +91,9 @@ def force_at_port(
     Laws of the speed are averaged over a window, see `mean_force`; their tangents by the position,
     which are small, are left out.
     """
-    force, by_position, by_speed = 0.0, 0.0, 0.0
+    force = 0.0
+    by_position = 0.0
+    by_speed = 0.0
     for k in range(len(laws.ports)):
         if laws.ports[k] != port or not laws.acting[k, stamp]:
             continue
@@ -106,9 +131,17 @@ def force_at_end(
     as dry friction does that stops a body, two values are on both sides of the solution, which lies
     where the line between them is zero (regula falsi).
     """
-    force, by_position, by_speed = 0.0, 0.0, 0.0
-    guess, excess = 0.0, 0.0
-    low, excess_at_low, high, excess_at_high = 0.0, 0.0, 0.0, 0.0
+    # the force that the laws have, and its excess over the guess that gave the motion
+    force = 0.0
+    by_position = 0.0
+    by_speed = 0.0
+    guess = 0.0
+    excess = 0.0
+    # two guesses on both sides of the solution
+    low = 0.0
+    excess_at_low = 0.0
+    high = 0.0
+    excess_at_high = 0.0
     is_bracketed = False
     for count in range(MOST_EVALUATIONS):
         last_guess, last_excess = guess, excess
@@ -132,7 +165,8 @@ def force_at_end(
             break
         if not is_bracketed and excess * last_excess < 0.0:
             is_bracketed = True
-            low, excess_at_low, high, excess_at_high = last_guess, last_excess, guess, excess
+            low, excess_at_low = last_guess, last_excess
+            high, excess_at_high = guess, excess
         elif is_bracketed and excess * excess_at_low > 0.0:
             low, excess_at_low = guess, excess
         elif is_bracketed:
@@ -146,16 +180,93 @@ def force_at_end(
     return force, by_position, by_speed
 
 
+@callable_when_compiled
+def solve_forces(
+    system: SystemArrays,
+    laws: LawArrays,
+    stamp: int,
+    state: FloatArray,
+    by_force: FloatArray,
+    positions: FloatArray,
+    speeds: FloatArray,
+    half_widths: FloatArray,
+    forces: FloatArray,
+    tangents: FloatArray,
+) -> None:
+    """Fill the laws' forces (P,) at the end of a substep, and their tangents (P, n) by the state.
+
+    Parameters
+    ----------
+    system : SystemArrays
+        The linear system.
+    laws : LawArrays
+        The laws.
+    stamp : int
+        The fine stamp at the end of the substep.
+    state : (n,) array
+        The state there without these forces.
+    by_force : (n, P) array
+        The change of the state for a unit of each of them.
+    positions, speeds : (P,) array
+        The motion of the ports that the laws do not cause.
+    half_widths : (P,) array
+        The half width of the window of speeds at each port.
+    forces, tangents : (P,), (P, n) array
+        The forces, which contain first guesses where there are several ports, and their tangents.
+    """
+    ports = len(forces)
+    position_by_force, speed_by_force = np.zeros((2, ports, ports))
+    multiply(system.position_rows, by_force, position_by_force)
+    multiply(system.speed_rows, by_force, speed_by_force)
+    free_positions, free_speeds = positions.copy(), speeds.copy()
+    add_motion(system, state, free_positions, free_speeds)
+    for _ in range(1 if ports == 1 else SWEEPS):
+        for p in range(ports):
+            position, speed = free_positions[p], free_speeds[p]
+            for q in range(ports):
+                if q != p:
+                    position += position_by_force[p, q] * forces[q]
+                    speed += speed_by_force[p, q] * forces[q]
+            forces[p], by_position, by_speed = force_at_end(
+                laws,
+                p,
+                stamp,
+                position,
+                speed,
+                position_by_force[p, p],
+                speed_by_force[p, p],
+                half_widths[p],
+            )
+            tangents[p] = by_position * system.position_rows[p] + by_speed * system.speed_rows[p]
+
+
+@callable_when_compiled
+def add_motion(
+    system: SystemArrays, state: FloatArray, positions: FloatArray, speeds: FloatArray
+) -> None:
+    """Add what a state (n,) adds to the positions and speeds (P,) of the ports, in place."""
+    for p in range(len(positions)):
+        for i in range(len(state)):
+            positions[p] += system.position_rows[p, i] * state[i]
+            speeds[p] += system.speed_rows[p, i] * state[i]
+
+
+@callable_when_compiled
+def advance_memories(laws: LawArrays, positions: FloatArray) -> None:
+    """Carry the memories of laws to the positions (P,) of the ports, in place."""
+    for k in range(len(laws.ports)):
+        if not laws.of_speed[k]:
+            position = positions[laws.ports[k]]
+            advance(laws.numbers[k], laws.parameters[k], laws.memories[k], position)
+            laws.memories[k, POSITION] = position
+
+
 def simulate_laws(
     substeps: int,
     interval_of_sample: IntArray,
-    transitions: FloatArray,
-    by_force_at_begin: FloatArray,
-    by_force_at_end: FloatArray,
-    position_rows: FloatArray,
-    speed_rows: FloatArray,
-    least_half_widths: FloatArray,
+    system: SystemArrays,
     laws: LawArrays,
+    least_half_widths: FloatArray,
     states: FloatArray,
     positions: FloatArray,
     speeds: FloatArray,
@@ -169,17 +280,12 @@ def simulate_laws(
         The number of substeps between two samples.
     interval_of_sample : (N,) array of int
         The index of the length of the interval that ends at each sample.
-    transitions : (J, n, n) array
-        The transition of a substep without laws, for each length.
-    by_force_at_begin, by_force_at_end : (J, n, P) array
-        The change of the state over a substep for a unit force at a port, at the start and at the
-        end of the step.
-    position_rows, speed_rows : (P, n) array
-        The motion of the ports for a unit of each state.
-    least_half_widths : (P,) array
-        The least half width of the window of speeds at each port, see `half_widths_of_windows`.
+    system : SystemArrays
+        The linear system.
     laws : LawArrays
         The laws; their memories are changed.
+    least_half_widths : (P,) array
+        The least half width of the window of speeds at each port, see `half_widths_of_windows`.
     states : (F, n) array
         The state that the laws add, which is filled; the first one is given.
     positions, speeds : (F, P) array
@@ -191,70 +297,50 @@ def simulate_laws(
     count = states.shape[1]
     tangents, last_tangents = np.zeros((2, ports, count))
     begin, end = np.zeros((2, count, ports))
-    position_by_force, speed_by_force = np.zeros((2, ports, ports))
-    free = states[0].copy()
+    free_state = states[0].copy()
     half_widths = least_half_widths.copy()
     for j in range(stamps):
         interval = interval_of_sample[(j + substeps - 1) // substeps]
+        at_begin, at_end = system.by_force_at_begin[interval], system.by_force_at_end[interval]
         last_tangents[:] = tangents
         # first with equal weights of the force at both ends, then with those of a stiff law
         moved = 0.0
         for _ in range(2):
             if j > 0:
-                begin[:] = (1.0 - moved) * by_force_at_begin[interval]
-                end[:] = by_force_at_end[interval] + moved * by_force_at_begin[interval]
+                begin[:] = (1.0 - moved) * at_begin
+                end[:] = at_end + moved * at_begin
                 for i in range(count):
-                    free[i] = 0.0
+                    free_state[i] = 0.0
                     for k in range(count):
-                        free[i] += transitions[interval, i, k] * states[j - 1, k]
+                        free_state[i] += system.transitions[interval, i, k] * states[j - 1, k]
                     for p in range(ports):
-                        free[i] += begin[i, p] * forces[j - 1, p]
-                multiply(position_rows, end, position_by_force)
-                multiply(speed_rows, end, speed_by_force)
-            for _ in range(1 if ports == 1 else SWEEPS):
-                for p in range(ports):
-                    position, speed = positions[j, p], speeds[j, p]
-                    for i in range(count):
-                        position += position_rows[p, i] * free[i]
-                        speed += speed_rows[p, i] * free[i]
-                    for q in range(ports):
-                        if q != p:
-                            position += position_by_force[p, q] * forces[j, q]
-                            speed += speed_by_force[p, q] * forces[j, q]
-                    forces[j, p], by_position, by_speed = force_at_end(
-                        laws,
-                        p,
-                        j,
-                        position,
-                        speed,
-                        position_by_force[p, p],
-                        speed_by_force[p, p],
-                        half_widths[p],
-                    )
-                    tangents[p] = by_position * position_rows[p] + by_speed * speed_rows[p]
-            if j == 0:
-                break
-            moved = weight_moved_to_end(
-                by_force_at_begin[interval], by_force_at_end[interval], last_tangents, tangents
+                        free_state[i] += begin[i, p] * forces[j - 1, p]
+                forces[j] = forces[j - 1]
+            solve_forces(
+                system,
+                laws,
+                j,
+                free_state,
+                end,
+                positions[j],
+                speeds[j],
+                half_widths,
+                forces[j],
+                tangents,
             )
-            if moved == 0.0:
+            moved = weight_moved_to_end(at_begin, at_end, last_tangents, tangents)
+            if j == 0 or moved == 0.0:
                 break
         for i in range(count):
-            states[j, i] = free[i]
+            states[j, i] = free_state[i]
             for p in range(ports):
                 states[j, i] += end[i, p] * forces[j, p]
-        for p in range(ports):
-            for i in range(count):
-                positions[j, p] += position_rows[p, i] * states[j, i]
-                speeds[j, p] += speed_rows[p, i] * states[j, i]
-            if j > 0:
+        add_motion(system, states[j], positions[j], speeds[j])
+        advance_memories(laws, positions[j])
+        if j > 0:
+            for p in range(ports):
                 passed_speeds = 0.5 * abs(speeds[j, p] - speeds[j - 1, p])
                 half_widths[p] = max(least_half_widths[p], passed_speeds)
-        for k in range(len(laws.ports)):
-            if not laws.of_speed[k]:
-                position = positions[j, laws.ports[k]]
-                advance(laws.numbers[k], laws.parameters[k], laws.memories[k], position)
-                laws.memories[k, POSITION] = position
 
 
 @cache
@@ -287,26 +373,17 @@ def motion_under_laws(
         The least half width of the window of speeds over which laws of the speed are averaged, at
         each port [m/s or rad/s].
     """
-    stamp_count, count = len(trial.fine_time), len(start)
-    states = np.zeros((stamp_count, count))
+    states = np.zeros((len(trial.fine_time), len(start)))
     states[0] = start
     unknowns = np.concatenate((shared_values, local_values))
     positions, speeds = trial.port_motion(unknowns, np.zeros_like(states))
     forces = np.zeros_like(positions)
-    system = trial.system_at(shared_values)
-    transitions, by_input_at_begin, by_input_at_end = respond_to_inputs(
-        system.generator, trial.intervals.lengths / trial.substeps
-    )
     _compiled_simulation()(
         trial.substeps,
         trial.intervals.length_of_sample,
-        transitions,
-        np.ascontiguousarray(by_input_at_begin @ -system.actions.T),
-        np.ascontiguousarray(by_input_at_end @ -system.actions.T),
-        np.ascontiguousarray(system.positions),
-        np.ascontiguousarray(system.speeds),
-        least_half_widths,
+        _system_arrays(trial, shared_values),
         _law_arrays(trial, laws),
+        least_half_widths,
         states,
         positions,
         speeds,
@@ -314,6 +391,22 @@ def motion_under_laws(
     )
     ports = sorted({trial.system.ports.index(law.port) for law in laws})
     return Trajectory(states, positions, speeds, {port: forces[:, port] for port in ports})
+
+
+def _system_arrays(trial: PortedTrial, shared_values: FloatArray) -> SystemArrays:
+    """Return the linear system of a trial at values (K,) of the shared unknowns."""
+    system = trial.system_at(shared_values)
+    transitions, by_input_at_begin, by_input_at_end = respond_to_inputs(
+        system.generator, trial.intervals.lengths / trial.substeps
+    )
+    # a force acts against the motion: s' = A s - b force, see `PortedSystem`
+    return SystemArrays(
+        transitions=transitions,
+        by_force_at_begin=np.ascontiguousarray(by_input_at_begin @ -system.actions.T),
+        by_force_at_end=np.ascontiguousarray(by_input_at_end @ -system.actions.T),
+        position_rows=np.ascontiguousarray(system.positions),
+        speed_rows=np.ascontiguousarray(system.speeds),
+    )
 
 
 def _law_arrays(trial: PortedTrial, laws: Sequence[PortForce]) -> LawArrays:
