@@ -82,14 +82,9 @@ class Piece(NamedTuple):
     members: tuple[Member, ...]
 
 
-class FlownPiece(NamedTuple):
-    """A piece with its result."""
-
-    piece: Piece
-    result: ShardResult
-
-
-def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[FlownPiece]:
+def fly_pieces(
+    engine: Engine, pieces: Iterator[Piece], progress: Progress
+) -> Iterator[tuple[Piece, ShardResult]]:
     """Fly pieces with the processes of an engine, and yield each with its result once it is done.
 
     Parameters
@@ -108,14 +103,16 @@ def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> I
     """
     if not engine.needs_dask:
         for piece in pieces:
-            yield FlownPiece(piece, _fly_piece(piece))
+            yield piece, _fly_piece(piece)
         return
     with _connected_client(engine) as client:
         progress.note(f"Dask dashboard: {client.dashboard_link}")
         yield from _fly_by_workers(client, pieces)
 
 
-def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[FlownPiece]:
+def _fly_by_workers(
+    client: "Client", pieces: Iterator[Piece]
+) -> Iterator[tuple[Piece, ShardResult]]:
     """Fly pieces by workers.
 
     If more than `ALLOWED_DEATHS` workers died while they flew a piece, its twins are flown one by
@@ -156,7 +153,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
                 "the scheduler was lost: what was flown is kept, "
                 "repeat the command to go on from there."
             ) from None
-        yield FlownPiece(piece, result)
+        yield piece, result
         del future  # lets the workers forget the result
         running_flights.update(submit(islice(pieces, 1)))
 

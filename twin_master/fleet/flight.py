@@ -198,7 +198,8 @@ def fly_fleet(
         _note_fixed_transitions(fleet, progress)
         _note_slow_flights(fleet, progress)
         with JournalFile(folder, hash_record(config)) as journal:
-            counts = _FleetFlight(fleet, folder, journal).fly(engine, progress)
+            flight = _FleetFlight(fleet, folder, journal)
+            flight.fly(engine, progress)
         failures, early_ends = endings_of(folder)
         result = fleet.head.model_dump(exclude={"shard"})
         result |= {"twins": fleet.size, "failures": failures, "ended": early_ends}
@@ -209,8 +210,8 @@ def fly_fleet(
         failures=failures,
         ended=early_ends,
         seconds=time.perf_counter() - start,
-        shards_flown=counts.flown,
-        shards_kept=counts.kept,
+        shards_flown=len(flight.remaining_shards),
+        shards_kept=flight.shards_kept,
     )
 
 
@@ -401,13 +402,6 @@ class _StoredRows:
         return bool(self._is_stored[group_number][rows.start : rows.stop].all())
 
 
-class _ShardCounts(NamedTuple):
-    """Numbers of shards that this call flew, and of those that an earlier call had flown."""
-
-    flown: int
-    kept: int
-
-
 class _FleetFlight:
     """The flight of a fleet into its store.
 
@@ -419,6 +413,13 @@ class _FleetFlight:
         The folder of the fleet.
     journal : JournalFile
         The journal, in which a shard is recorded after it is in the store.
+
+    Attributes
+    ----------
+    remaining_shards : list of Shard
+        The shards that were not in the store at the beginning.
+    shards_kept : int
+        The number of those that an earlier call had flown.
     """
 
     def __init__(self, fleet: Fleet, folder: Path, journal: JournalFile) -> None:
@@ -429,11 +430,13 @@ class _FleetFlight:
         address = StoreAddress(folder, fleet.store)
         self._writers = [GroupWriter(address, fleet, group) for group in fleet.groups]
         self._packed_kit = lru_cache(maxsize=_PACKED_KITS)(self._pack_kit)
+        shards = list(_shards(fleet))
+        self.remaining_shards = [shard for shard in shards if not self._stored_rows.has_all(*shard)]
+        self.shards_kept = len(shards) - len(self.remaining_shards)
 
-    def fly(self, engine: Engine, progress: Progress) -> _ShardCounts:
+    def fly(self, engine: Engine, progress: Progress) -> None:
         """Fly the shards that are not in the store yet."""
-        shards = list(_shards(self._fleet))
-        remaining = [shard for shard in shards if not self._stored_rows.has_all(*shard)]
+        remaining = self.remaining_shards
         remaining_twins = sum(len(shard.rows) for shard in remaining)
         # A kill may have come between the last twin of a file and the end of the file.
         for number in range(len(self._fleet.groups)):
@@ -444,7 +447,6 @@ class _FleetFlight:
                 for piece, result in fly_pieces(engine, self._pieces(remaining), progress):
                     self._store(piece.group_number, piece.members, result)
                     stage.advance(len(piece.members))
-        return _ShardCounts(flown=len(remaining), kept=len(shards) - len(remaining))
 
     def _pieces(self, shards: Sequence[Shard]) -> Iterator[Piece]:
         """Yield the shards, each with the knowledge and the recordings that a worker needs.
