@@ -50,7 +50,7 @@ SHARED = ("coarse_reduction", "coarse_patch_arrays", "virtual_model", "beam_redu
 LARGEST, COMPILING = "wing", "compiling"
 """The group of tests that takes longest, and the one that compiles loops, which takes more than a minute."""
 
-COMPILED = ("benchmarks", "discrepancy", "twin_master", "uav_twin", "test_documented_python.py")
+COMPILED = ("benchmarks", "discrepancy", "portable", "twin_master", "uav_twin", "test_documented_python.py")
 """Folders and a file whose tests need loops: they come once the workers of the first two groups have compiled
 them."""
 
