@@ -35,6 +35,8 @@ LEAST_RISE, MOST_STAGNANT_ITERATIONS = 0.5, 2
 without progress after which the iteration ends."""
 STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Fractions of a step that are tried in turn."""
+SHORTEST_FRACTION = 0.1
+"""Fraction of a step below which an iteration along the motion of laws ends."""
 LONGEST_STEP = 2.0
 """Longest step of the unknown of an effect, in prior standard deviations."""
 
@@ -232,6 +234,43 @@ def linearise_along_laws(
     return linearise_trials(laws, trials, start_along_laws, speed_window, shared_precision)
 
 
+def _start_after_step(
+    laws: HypothesisLaws, start: EstimatorStart, estimate: Estimate, fraction: float
+) -> EstimatorStart:
+    """Return the values and trajectories a fraction of the way from a start to an estimate.
+
+    No unknown of an effect moves by more than `LONGEST_STEP`.
+
+    Parameters
+    ----------
+    laws : HypothesisLaws
+        The laws of the hypothesis.
+    start : EstimatorStart
+        The values and trajectories before the step.
+    estimate : Estimate
+        Those at the end of the whole step.
+    fraction : float
+        The fraction of the step that is taken.
+    """
+    change = estimate.effect - start.effect
+    longest_change = float(np.max(np.abs(change), initial=0.0))
+    if longest_change > LONGEST_STEP:
+        fraction = min(fraction, LONGEST_STEP / longest_change)
+    return EstimatorStart(
+        effect=laws.candidate.within_range(start.effect + fraction * change),
+        shared=start.shared + fraction * (estimate.shared - start.shared),
+        local=tuple(
+            before + fraction * (after - before)
+            for before, after in zip(start.local, estimate.local, strict=True)
+        ),
+        trajectories=tuple(
+            trajectory.interpolate(smoothed_trial.trajectory, fraction)
+            for trajectory, smoothed_trial in zip(start.trajectories, estimate.trials, strict=True)
+        ),
+        processes=start.processes,
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class GaussNewton:
     """Gauss-Newton iterations of hypotheses on the same trials, under given missing forces.
@@ -327,7 +366,8 @@ class GaussNewton:
 
         This is a shooting method: each trajectory is simulated with the unknowns of the last
         estimate, so that laws with kinks, such as dry friction, are linear about a motion that they
-        make. It is meant for small missing forces, which the simulation leaves out.
+        make. It is meant for small missing forces, which the simulation leaves out. A step is
+        halved where the evidence at its end is lower.
 
         Parameters
         ----------
@@ -347,7 +387,8 @@ class GaussNewton:
             The estimate; None if the laws are not possible at the first unknowns.
         """
         best_estimate: Estimate | None = None
-        last_evidence = -inf
+        best_start = start
+        fraction = 1.0
         for _ in range(most_iterations):
             linearisation = linearise_along_laws(
                 laws, self.trials, start, speed_window, self.shared_precision
@@ -355,19 +396,27 @@ class GaussNewton:
             if linearisation is None:
                 return best_estimate
             estimate = self._estimate_of_linearisation(
-                laws.candidate, linearisation, start, last_evidence, speed_window
+                laws.candidate, linearisation, start, -inf, speed_window
             )
             if estimate is None:
                 return best_estimate
-            estimate = replace(estimate, follows_laws=True)
+            # the laws are linear about the unknowns of the start, where the evidence is lower
+            decrement = _newton_decrement(start, estimate)
+            estimate = replace(
+                estimate,
+                log_evidence=estimate.log_evidence - decrement,
+                converged=decrement < CONVERGED_EVIDENCE,
+                follows_laws=True,
+            )
             if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
                 best_estimate = estimate
-            rise = estimate.log_evidence - last_evidence
-            if estimate.converged or rise < LEAST_RISE:
+                best_start = start
+                fraction = 1.0
+            else:
+                fraction = 0.5 * fraction
+            if best_estimate.converged or fraction < SHORTEST_FRACTION:
                 return best_estimate
-            last_evidence = estimate.log_evidence
-            effect = laws.candidate.within_range(estimate.effect)
-            start = replace(start_from_estimate(estimate), effect=effect)
+            start = _start_after_step(laws, best_start, best_estimate, fraction)
         return best_estimate
 
     def _estimate_of_linearisation(
@@ -457,27 +506,9 @@ class GaussNewton:
         EstimatorStart or None
             The next start; None if the laws are not possible after any of the fractions.
         """
-        # no unknown of an effect moves by more than `LONGEST_STEP`
-        change = estimate.effect - current_start.effect
-        longest_change = float(np.max(np.abs(change), initial=0.0))
-        largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
         next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
-            fraction_taken = min(fraction, largest_fraction)
-            trajectories = tuple(
-                trajectory.interpolate(smoothed_trial.trajectory, fraction_taken)
-                for trajectory, smoothed_trial in zip(
-                    current_start.trajectories, estimate.trials, strict=True
-                )
-            )
-            stepped_start = EstimatorStart(
-                effect=laws.candidate.within_range(current_start.effect + fraction_taken * change),
-                shared=current_start.shared
-                + fraction_taken * (estimate.shared - current_start.shared),
-                local=estimate.local,
-                trajectories=trajectories,
-                processes=current_start.processes,
-            )
+            stepped_start = _start_after_step(laws, current_start, estimate, fraction)
             # admissible if the error is at most one; None if the laws are not possible there
             error = self._linearisation_error(
                 laws, current_start, stepped_start, linearisation, speed_window
@@ -544,3 +575,14 @@ class GaussNewton:
                 error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
                 largest_ratio = max(largest_ratio, error / largest_deviation)
         return largest_ratio
+
+
+def _newton_decrement(start: EstimatorStart, estimate: Estimate) -> float:
+    """Return by how much the log posterior rises from the unknowns of a start to an estimate's.
+
+    The trials are linear about the start, so that the log of likelihood times prior is quadratic in
+    the unknowns. Half the squared step in the metric of its curvature is the Newton decrement.
+    """
+    unknowns = np.concatenate((start.shared, start.effect))
+    change = estimate.solution.mean - unknowns
+    return 0.5 * float(change @ np.linalg.solve(estimate.conditional_covariance, change))
