@@ -391,10 +391,37 @@ class ForceSearch:
             for port, process in base.processes.items()
         }
         laws = self.laws(candidate, trials)
-        first_estimate = self.estimator(trials).estimate_from_far(
-            laws, replace(start, processes=processes)
+        estimator = self.estimator(trials)
+        # without effects, the shared unknowns have taken the place of laws
+        first_shared = base.shared if base.candidate.terms else np.zeros_like(base.shared)
+        explained = self._estimate_that_leaves_no_force(
+            estimator, laws, replace(start, shared=first_shared)
         )
+        if explained is not None:
+            return explained
+        first_estimate = estimator.estimate_from_far(laws, replace(start, processes=processes))
         return None if first_estimate is None else self.estimate_about_own_values(first_estimate)
+
+    def _estimate_that_leaves_no_force(
+        self, estimator: MotionEstimator, laws: EffectLaws, start: EstimatorStart
+    ) -> Estimate | None:
+        """Return an estimate along the motion of the laws alone if they leave no force.
+
+        Parameters
+        ----------
+        estimator : MotionEstimator
+            The estimator of the trials.
+        laws : EffectLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values to begin with.
+        """
+        estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
+        if estimate is not None:
+            estimate = self.estimate_about_own_values(estimate)
+            if estimate.leaves_no_force:
+                return estimate
+        return None
 
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
@@ -446,24 +473,6 @@ class ForceSearch:
         # the estimate without effects has no window
         speed_window = base.speed_window or USUAL_WINDOW
         return self.estimator(trials).polish(self.laws(candidate, trials), start, speed_window)
-
-    def follow_laws(self, estimate: Estimate) -> Estimate | None:
-        """Return an estimate along the motion of its laws alone, from the values of another one.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            The estimate whose unknowns are those to begin with.
-
-        Returns
-        -------
-        Estimate or None
-            The estimate; None if the laws are not possible.
-        """
-        trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
-        estimator = self.estimator(trials)
-        start = replace(start_from_estimate(estimate), processes=estimator.small_processes)
-        return estimator.follow_laws(self.laws(estimate.candidate, trials), start)
 
     def estimate_about_own_values(self, estimate: Estimate) -> Estimate:
         """Return an estimate in trials that are linear about its own unknowns.

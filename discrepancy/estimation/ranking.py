@@ -232,11 +232,6 @@ class _Ranking:
                 break
             candidate = rough_estimate.candidate
             self.on_progress(f"estimating {candidate.description} together with the motion")
-            followed_estimate = self.search.follow_laws(rough_estimate)
-            if followed_estimate is not None and followed_estimate.leaves_no_force:
-                self.record(self.search.estimate_about_own_values(followed_estimate))
-                self.estimated_in_full.add(candidate.key)
-                continue
             estimate = self.search.estimate_effects(base, candidate, rough_estimate.effect)
             if estimate is not None:
                 self.record(estimate)
