@@ -40,7 +40,7 @@ CREEP = 2e-5
 """Speed over which the friction of the true axis changes its sign; the law of the catalogue jumps [m/s]."""
 
 
-def pushed_axis(friction: float, samples: int = 700) -> Campaign:
+def pushed_axis(friction: float, samples: int = 350) -> Campaign:
     """Return three trials of an axis that a force pushes back and forth, the last one held out."""
     generator = np.random.default_rng(2)
     mass = 10.0 * (1.0 + 0.04 * generator.standard_normal())
