@@ -33,13 +33,13 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.estimation.kernel import filter_record
-from discrepancy.estimation.steps import discretise
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.two_filters import RecordFilter
 from discrepancy.system.lumped_file import LumpedDescription
 from discrepancy.system.lumped_model import LumpedModel
+from discrepancy.trials_in_motion.steps import discretise
 from fe.runtime.patch import PowerStiffness
 
 Float = NDArray[np.float64]

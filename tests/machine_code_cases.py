@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
-from discrepancy.estimation.steps import respond_to_inputs
+from discrepancy.trials_in_motion.steps import respond_to_inputs
 from fe.reduction.reduced_basis import reduce_structure
 from fe.structure.operators import load_and_assemble
 from tests.command_line import said

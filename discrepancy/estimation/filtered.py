@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.trials_in_motion.steps import discretise, respond_to_inputs
+from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .force_states import ForceStates
 from .kernel import filter_record, smooth_record, substep_matrices_with_laws
 from .linearised import LinearisedTrial
 from .process_search import Processes
-from .steps import discretise, respond_to_inputs
-from .trajectory import Trajectory
-from .trial import PortedTrial
 
 LEAST_INNOVATION_VARIANCE = 0.5
 """Least variance of an innovation over that of the noise. The exact variance is at least one; with

@@ -13,20 +13,20 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
+from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
+from discrepancy.trials_in_motion.ported_trial import ported_trial, thin_trial
+from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimate import NO_EFFECT_VALUES, NO_EFFECTS, Estimate, estimate_of_processes
 from .estimator import SMALL_FRACTION, USUAL_WINDOW, MotionEstimator
 from .force_states import Process
 from .gauss_newton import EstimatorStart, GaussNewton, linearise_trials, start_from_estimate
 from .linearisation import Linearisation, plain_linearisation
 from .log_prior import log_prior
-from .ported_trial import ported_trial, thin_trial
 from .process_search import Processes, scale_processes
-from .trajectory import Trajectory
-from .trial import PortedTrial
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.trials_in_motion.trial import PortedTrial
 from reporting.arrays import LEAST_DIVISOR
-
-from .trial import PortedTrial
 
 
 @dataclass(frozen=True)

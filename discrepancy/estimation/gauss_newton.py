@@ -15,14 +15,19 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
+from discrepancy.trials_in_motion.laws import LawForce
+from discrepancy.trials_in_motion.trajectory import (
+    LawArguments,
+    LinearisedForce,
+    LinearisedSensorErrors,
+    Trajectory,
+)
+from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .estimate import Estimate
-from .laws import LawForce
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
 from .process_search import Processes, prior_log_density
-from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors, Trajectory
-from .trial import PortedTrial
 
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""

@@ -21,25 +21,12 @@ law.
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
+from discrepancy.trials_in_motion.steps import multiply, weight_moved_to_end
 from fe.compilation import callable_when_compiled, compiled
 
 STEADY = 1e-9
 """Largest change of an entry of a converged covariance, over the standard deviations of its row and
 column."""
-
-
-@callable_when_compiled
-def multiply(left_matrix: FloatArray, right_matrix: FloatArray, product: FloatArray) -> None:
-    """Fill `product` with the product of two small matrices.
-
-    For these, a loop is several times faster than a call of BLAS.
-    """
-    for i in range(left_matrix.shape[0]):
-        for k in range(right_matrix.shape[1]):
-            element = 0.0
-            for j in range(left_matrix.shape[1]):
-                element += left_matrix[i, j] * right_matrix[j, k]
-            product[i, k] = element
 
 
 @callable_when_compiled
@@ -59,37 +46,6 @@ def propagate_covariance(
                 element += work[i, j] * transition[k, j]
             propagated[i, k] = element
             propagated[k, i] = element
-
-
-@callable_when_compiled
-def weight_moved_to_end(
-    begin: FloatArray, end: FloatArray, tangent_at_begin: FloatArray, tangent_at_end: FloatArray
-) -> float:
-    """Return the fraction of a force's weight at the start of a substep that moves to its end.
-
-    Let s be the stiffness of a law over the substep: the decrease of its force by the motion that
-    a unit of the force causes. An error e of the force becomes
-    e (1 - (1 - theta) s) / (1 + theta s) in the theta scheme, which keeps the sign of e if theta is
-    at least 1 - 1 / s. The weights at start and end are equal at first, theta = 1/2. If a fraction
-    w of the weight at the start moves to the end, theta is (1 + w) / 2, so that w must be 1 - 2 / s
-    for s > 2, and zero below.
-
-    Parameters
-    ----------
-    begin, end : (n, P) ndarray
-        The change of the state by a unit force at the start and at the end of the substep.
-    tangent_at_begin, tangent_at_end : (P, n) ndarray
-        The derivative of the laws' force at a port by the state, at both ends.
-    """
-    largest_stiffness = 0.0
-    for p in range(len(tangent_at_begin)):
-        stiffness_at_begin, stiffness_at_end = 0.0, 0.0
-        for i in range(len(begin)):
-            change = begin[i, p] + end[i, p]
-            stiffness_at_begin -= tangent_at_begin[p, i] * change
-            stiffness_at_end -= tangent_at_end[p, i] * change
-        largest_stiffness = max(largest_stiffness, stiffness_at_begin, stiffness_at_end)
-    return 1.0 - 2.0 / largest_stiffness if largest_stiffness > 2.0 else 0.0
 
 
 @compiled

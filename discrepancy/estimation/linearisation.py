@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.trials_in_motion.trajectory import NO_SENSOR_ERRORS, Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial, correlation_time_range
 
 from .filtered import FilteredTrial, SmoothedTrial
 from .force_states import Process
 from .linearised import LinearisedTrial
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
 from .regression import LEAST_PRECISION, Regression, Solution, integrate_out_last
-from .trajectory import NO_SENSOR_ERRORS, Trajectory
-from .trial import PortedTrial, correlation_time_range
 
 
 @dataclass(frozen=True, eq=False)

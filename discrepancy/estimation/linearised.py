@@ -20,10 +20,14 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, IntArray
+from discrepancy.trials_in_motion.trajectory import (
+    LinearisedForce,
+    LinearisedSensorErrors,
+    Trajectory,
+)
+from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .kernel import respond_to_drift, substep_matrices_with_laws
-from .trajectory import LinearisedForce, LinearisedSensorErrors, Trajectory
-from .trial import PortedTrial
 
 CONSTANT = 0
 """Number of the constant among the weights (1, unknowns)."""

@@ -17,19 +17,23 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.trials_in_motion.effects import EffectLaws
+from discrepancy.trials_in_motion.laws import LawForce
+from discrepancy.trials_in_motion.trajectory import (
+    LawArguments,
+    LinearisedForce,
+    LinearisedSensorErrors,
+)
 from fe.runtime.errors import InvalidPatchError
 from reporting.arrays import LEAST_DIVISOR
 
-from .effects import EffectLaws
 from .estimate import Estimate
 from .estimator import NARROWEST_WINDOW
 from .filtered import SmoothedTrial
 from .force_search import WIDE_WINDOW, ForceSearch
-from .laws import LawForce
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
 from .process_search import Processes, processes_within_range, scale_processes
-from .trajectory import LawArguments, LinearisedForce, LinearisedSensorErrors
 
 SHAPE_VALUES = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which a parameter that is not a magnitude is tried."""

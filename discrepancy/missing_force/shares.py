@@ -18,8 +18,8 @@ from discrepancy.estimation.gauss_newton import (
 )
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
-from discrepancy.estimation.trial import PortedTrial
 from discrepancy.fits.candidate import Point
+from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
 

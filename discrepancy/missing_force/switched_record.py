@@ -16,7 +16,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.estimation.force_states import ForceStates, ForceStateSpace, Process
 from discrepancy.estimation.linearisation import Linearisation
 from discrepancy.estimation.regression import integrate_out_last
-from discrepancy.estimation.steps import discretise
+from discrepancy.trials_in_motion.steps import discretise
 
 from .two_filters import FilterState, RecordFilter, StateInformation, join_filters
 

@@ -20,11 +20,11 @@ from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
-from discrepancy.estimation.trial import PortedTrial
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.system.response import PortedSystem
+from discrepancy.trials_in_motion.trial import PortedTrial
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import LEAST_EVIDENCE, MOST_EVENTS, Events, events_throughout, find_events

@@ -10,7 +10,7 @@ from discrepancy.estimation.kernel import (
     smooth_record,
     substep_matrices_with_laws,
 )
-from discrepancy.estimation.steps import respond_to_inputs
+from discrepancy.trials_in_motion.steps import respond_to_inputs
 
 PARTS, SAMPLES, STATES, CHANNELS, WIDTH = 2, 6, 3, 2, 3
 STAMPS = PARTS * (SAMPLES - 1) + 1

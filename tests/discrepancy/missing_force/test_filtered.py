@@ -13,11 +13,7 @@ from discrepancy.estimation.filtered import FilteredTrial
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import plain_linearisation
 from discrepancy.estimation.linearised import LinearisedTrial
-from discrepancy.estimation.ported_trial import correlated_noise_part
 from discrepancy.estimation.regression import Regression
-from discrepancy.estimation.steps import discretise
-from discrepancy.estimation.trajectory import NO_SENSOR_ERRORS, Trajectory
-from discrepancy.estimation.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.shares import _simulated_noise
@@ -26,6 +22,10 @@ from discrepancy.missing_force.two_filters import FilterState, RecordFilter, joi
 from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
+from discrepancy.trials_in_motion.ported_trial import correlated_noise_part
+from discrepancy.trials_in_motion.steps import discretise
+from discrepancy.trials_in_motion.trajectory import NO_SENSOR_ERRORS, Trajectory
+from discrepancy.trials_in_motion.trial import ColouredNoise, PortedTrial, SampleIntervals
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench

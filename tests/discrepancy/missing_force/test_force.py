@@ -19,10 +19,8 @@ from discrepancy.estimation.estimate import Estimate
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.linearisation import plain_linearisation
 from discrepancy.estimation.log_prior import log_prior
-from discrepancy.estimation.ported_trial import ported_trial
 from discrepancy.estimation.ranking import rank_hypotheses
 from discrepancy.estimation.screen import screen_effects
-from discrepancy.estimation.trajectory import Trajectory
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
@@ -39,6 +37,8 @@ from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
+from discrepancy.trials_in_motion.ported_trial import ported_trial
+from discrepancy.trials_in_motion.trajectory import Trajectory
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness

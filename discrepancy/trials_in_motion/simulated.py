@@ -20,9 +20,8 @@ from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.laws.speed import steady_force
 
-from .kernel import multiply, weight_moved_to_end
 from .laws import mean_force
-from .steps import respond_to_inputs
+from .steps import multiply, respond_to_inputs, weight_moved_to_end
 from .trajectory import Trajectory
 from .trial import PortedTrial
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from discrepancy.estimation.laws import force_and_tangents, mean_force
+from discrepancy.trials_in_motion.laws import force_and_tangents, mean_force
 from fe.runtime.laws.speed import Overflow, steady_force
 from fe.runtime.patch import PowerDamping, PowerStiffness
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.estimation.simulated import motion_under_laws
-from discrepancy.estimation.trajectory import Trajectory
-from discrepancy.estimation.trial import PortedTrial
 from discrepancy.system.response import PortedSystem
+from discrepancy.trials_in_motion.simulated import motion_under_laws
+from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial
 from fe.runtime.patch import PowerDamping
 
 FRICTION = 0.11

@@ -1,0 +1,1 @@
+"""Trials in motion as linear systems with ports, and the laws of a hypothesis along them."""
