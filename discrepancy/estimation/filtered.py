@@ -213,7 +213,7 @@ class FilteredTrial:
             trajectory=Trajectory(added_state, positions, speeds, forces),
             missing_forces=missing_forces,
             missing_force_deviations=self.missing_forces(np.sqrt(variance)),
-            model_forces=linear_trial.model_forces,
+            effect_forces=linear_trial.effect_forces,
             local=local_values,
         )
 
@@ -287,8 +287,10 @@ class SmoothedTrial:
         the port's flow].
     missing_force_deviations : mapping of int to (F,) ndarray
         The posterior standard deviation of `missing_forces`.
-    model_forces : mapping of int to (F,) ndarray
-        The forces of the model's own laws, by port.
+    effect_forces : mapping of int to (F,) ndarray
+        The forces of the hypothesis' effects, by port, along the trajectory about which they are
+        linear. The smoothed motion differs little from it, but where dry friction changes its sign,
+        a linear law goes beyond the friction.
     local : (L,) ndarray
         The unknowns of this trial alone.
     """
@@ -297,24 +299,16 @@ class SmoothedTrial:
     trajectory: Trajectory
     missing_forces: Mapping[int, FloatArray]
     missing_force_deviations: Mapping[int, FloatArray]
-    model_forces: Mapping[int, FloatArray]
+    effect_forces: Mapping[int, FloatArray]
     local: FloatArray
 
     @cached_property
     def lacking_forces(self) -> dict[int, FloatArray]:
         """The forces (F,) that the model lacks, by port: those of effects, and missing ones."""
-        return {
-            port: np.asarray(force - self.model_forces.get(port, 0.0))
-            for port, force in self.trajectory.forces.items()
-        }
-
-    @cached_property
-    def effect_forces(self) -> dict[int, FloatArray]:
-        """The forces (F,) of the hypothesis' effects, by port."""
-        return {
-            port: np.asarray(force - self.missing_forces.get(port, 0.0))
-            for port, force in self.lacking_forces.items()
-        }
+        forces = dict(self.missing_forces)
+        for port, force in self.effect_forces.items():
+            forces[port] = forces.get(port, 0.0) + force
+        return forces
 
     @cached_property
     def explained_trajectory(self) -> Trajectory:

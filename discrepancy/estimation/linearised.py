@@ -93,6 +93,14 @@ class LinearisedTrial:
 
     # ------------------------------------------------------------ forces of the laws
 
+    @property
+    def effect_forces(self) -> dict[int, FloatArray]:
+        """The forces (F,) of the hypothesis' effects along the trajectory, by port."""
+        return {
+            port: force.law_force.force - self.model_forces.get(port, 0.0)
+            for port, force in self.forces.items()
+        }
+
     @cached_property
     def force_by_state(self) -> FloatArray:
         """The derivatives (F, L, n) of the laws' force at each port by the structure's state."""
