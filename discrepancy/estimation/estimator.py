@@ -2,7 +2,8 @@
 
 The estimator is Gauss-Newton's method on the trajectory (see `gauss_newton`). It begins with a
 large missing force, with which the trajectory follows the readings whatever the law is, and lowers
-that force in steps (continuation). The missing force with the largest evidence is returned.
+that force in steps (continuation). It also begins at the motion that the laws alone give, beside
+which little force is missing. The missing force with the largest evidence is returned.
 """
 
 from collections.abc import Sequence
