@@ -7,6 +7,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
+from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .filtered import SmoothedTrial
 from .linearisation import Linearisation
@@ -70,6 +71,11 @@ class Estimate:
     speed_window: float = 0.0
     converged: bool = True
     follows_laws: bool = False
+
+    @property
+    def ported_trials(self) -> tuple[PortedTrial, ...]:
+        """The trials as linear systems with ports, in which the estimate was made."""
+        return tuple(smoothed_trial.trial for smoothed_trial in self.trials)
 
     @property
     def local(self) -> tuple[FloatArray, ...]:

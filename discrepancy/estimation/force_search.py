@@ -247,7 +247,7 @@ class ForceSearch:
 
     def _linearise_along(self, estimate: Estimate) -> Linearisation:
         """Return the trials of an estimate without effects, linear along its motion."""
-        trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
+        trials = estimate.ported_trials
         trajectories = tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials)
         return self._linearise(trials, trajectories, estimate.shared)
 
@@ -381,7 +381,7 @@ class ForceSearch:
         Estimate or None
             The estimate; None if the laws are not possible along the motion.
         """
-        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        trials = base.ported_trials
         start = replace(start_from_estimate(base), effect=effect)
         processes = {
             port: replace(
@@ -444,7 +444,7 @@ class ForceSearch:
         Estimate or None
             The estimate; None if the laws are not possible along the motion.
         """
-        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        trials = base.ported_trials
         start = replace(start_from_estimate(base), effect=effect)
         laws = self.laws(candidate, trials)
         return self.estimator(trials).estimate_roughly(laws, start, processes)
@@ -468,7 +468,7 @@ class ForceSearch:
         Estimate or None
             The estimate; None if the laws are not possible along the motion.
         """
-        trials = tuple(smoothed_trial.trial for smoothed_trial in base.trials)
+        trials = base.ported_trials
         start = replace(start_from_estimate(base), effect=effect)
         # the estimate without effects has no window
         speed_window = base.speed_window or USUAL_WINDOW
@@ -488,7 +488,7 @@ class ForceSearch:
             made in the other trials.
         """
         for number in range(MOST_LINEARISATIONS):
-            trials = tuple(smoothed_trial.trial for smoothed_trial in estimate.trials)
+            trials = estimate.ported_trials
             point = self._point_of(estimate)
             point_of_trials = trials[0].linearisation_point[: len(point.shared)]
             is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))

@@ -195,7 +195,7 @@ def _try_effects(
 
     Effects that change nothing, or are not possible along the motion, are left out.
     """
-    trials = [smoothed_trial.trial for smoothed_trial in base.trials]
+    trials = base.ported_trials
     tried_effects = []
     for term in _terms_to_add(search, base, effects):
         laws = search.laws(Candidate((term,)), trials)
