@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.system.response import PortedSystem
+from discrepancy.trials_in_motion import simulated as module
 from discrepancy.trials_in_motion.simulated import motion_under_laws
 from discrepancy.trials_in_motion.trajectory import Trajectory
 from discrepancy.trials_in_motion.trial import PortedTrial
-from fe.runtime.patch import PowerDamping
+from fe.runtime.patch import PowerDamping, PowerStiffness
 
 FRICTION = 0.11
 TURNING_POINTS = 1.0, -0.78, 0.56, -0.34, 0.12, 0.10
@@ -17,10 +19,11 @@ TURNING_POINTS = 1.0, -0.78, 0.56, -0.34, 0.12, 0.10
 HELD = slice(-200, None)
 
 
-def released_mass(interval: float) -> PortedTrial:
-    """Return a mass and a spring of 1 kg and 1 N/m, released at 1 m, over ten half cycles."""
+def released(system: PortedSystem, interval: float) -> PortedTrial:
+    """Return a trial over ten half cycles of 1 rad/s, whose ports all swing with 1 m without laws."""
     time = np.arange(0.0, 10.0 * np.pi, interval)
     fine_time = np.linspace(0.0, time[-1], 4 * (len(time) - 1) + 1)
+    ports = np.ones(len(system.ports))
     return PortedTrial(
         name="release",
         time=time,
@@ -31,21 +34,27 @@ def released_mass(interval: float) -> PortedTrial:
         shared_derivatives=np.zeros((0, len(time), 1)),
         local_derivatives=np.zeros((0, len(time), 1)),
         local_precision=np.zeros(0),
-        system=PortedSystem(
-            generator=np.array([[0.0, 1.0], [-1.0, 0.0]]),
-            ports=("slide",),
-            actions=np.array([[0.0, 1.0]]),
-            positions=np.array([[1.0, 0.0]]),
-            speeds=np.array([[0.0, 1.0]]),
-            outputs=np.array([[1.0, 0.0]]),
-            through=np.zeros((1, 1)),
-        ),
+        system=system,
         system_derivatives=(),
         substeps=4,
-        port_positions=np.cos(fine_time)[:, None],
-        port_speeds=-np.sin(fine_time)[:, None],
+        port_positions=np.outer(np.cos(fine_time), ports),
+        port_speeds=np.outer(-np.sin(fine_time), ports),
         begins_at_rest=False,
     )
+
+
+def released_mass(interval: float) -> PortedTrial:
+    """Return a mass and a spring of 1 kg and 1 N/m, released at 1 m."""
+    system = PortedSystem(
+        generator=np.array([[0.0, 1.0], [-1.0, 0.0]]),
+        ports=("slide",),
+        actions=np.array([[0.0, 1.0]]),
+        positions=np.array([[1.0, 0.0]]),
+        speeds=np.array([[0.0, 1.0]]),
+        outputs=np.array([[1.0, 0.0]]),
+        through=np.zeros((1, 1)),
+    )
+    return released(system, interval)
 
 
 def simulated(interval: float, friction: float = FRICTION) -> Trajectory:
@@ -103,3 +112,61 @@ def test_the_added_state_moves_the_port_as_the_motion_says():
 
 def test_friction_that_is_larger_than_the_spring_holds_the_mass_from_the_start():
     assert simulated(0.1, friction=1.5).positions == pytest.approx(1.0, abs=1e-4)
+
+
+def test_plain_python_gives_the_motion_of_the_compiled_loop(monkeypatch):
+    compiled_motion = simulated(0.1)
+    monkeypatch.setattr(module, "_compiled_simulation", lambda: module.simulate_laws)
+    plain_motion = simulated(0.1)
+    np.testing.assert_allclose(plain_motion.added_state, compiled_motion.added_state, atol=1e-9)
+    np.testing.assert_allclose(plain_motion.forces[0], compiled_motion.forces[0], atol=1e-9)
+
+
+STIFFNESS = np.array([[3.0, -2.0], [-2.0, 3.0]])
+"""Two masses of 1 kg on springs to the ground of 1 N/m, with a spring of 2 N/m between them: both
+swing in phase with 1 rad/s."""
+
+
+def test_laws_at_two_ports_move_both_as_an_integrator_says():
+    """A hardening spring at the first mass and drag at the second one, beside scipy's solve_ivp."""
+    no_block, unit_block = np.zeros((2, 2)), np.eye(2)
+    system = PortedSystem(
+        generator=np.block([[no_block, unit_block], [-STIFFNESS, no_block]]),
+        ports=("first", "second"),
+        actions=np.hstack([no_block, unit_block]),
+        positions=np.hstack([unit_block, no_block]),
+        speeds=np.hstack([no_block, unit_block]),
+        outputs=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        through=np.zeros((2, 1)),
+    )
+    spring = PowerStiffness(port="first", coefficient=0.3, exponent=3.0, side=0, reference_displacement=1.0)
+    drag = PowerDamping(
+        port="second",
+        coefficient=0.2,
+        velocity_exponent=2.0,
+        displacement_exponent=0.0,
+        reference_velocity=1.0,
+        reference_displacement=1.0,
+    )
+    trial = released(system, 0.05)
+    no_unknowns = np.zeros(0)
+    trajectory = motion_under_laws(
+        trial, [spring, drag], no_unknowns, no_unknowns, np.zeros(4), np.full(2, 1e-7)
+    )
+
+    def rate(_: float, state: FloatArray) -> FloatArray:
+        positions, speeds = state[:2], state[2:]
+        laws = np.array([0.3 * positions[0] ** 3, 0.2 * abs(speeds[1]) * speeds[1]])
+        return np.concatenate((speeds, -STIFFNESS @ positions - laws))
+
+    reference = solve_ivp(
+        rate,
+        (0.0, trial.fine_time[-1]),
+        [1.0, 1.0, 0.0, 0.0],
+        t_eval=trial.fine_time,
+        rtol=1e-10,
+        atol=1e-12,
+        method="DOP853",
+    )
+    np.testing.assert_allclose(trajectory.positions, reference.y[:2].T, atol=2e-4)
+    np.testing.assert_allclose(trajectory.speeds, reference.y[2:].T, atol=5e-4)
