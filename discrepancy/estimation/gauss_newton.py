@@ -2,8 +2,9 @@
 
 The trials are linearised along the last trajectory, and one filter and one smoother give the next
 one, until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4,
-626-636; damped: Särkkä and Svensson 2020, ICASSP). The innovations at the end give the evidence by
-Laplace's approximation.
+626-636; damped: Särkkä and Svensson 2020, ICASSP). Where little force is missing, the trials are
+linearised along the motion that the laws alone give (shooting). The innovations at the end give the
+evidence by Laplace's approximation.
 """
 
 from collections.abc import Mapping, Sequence

@@ -84,6 +84,19 @@ def mean_force(law: FloatArray, x: float, speed: float, half_width: float) -> fl
     return float(size * difference / (2.0 * half_width * next_exponent))
 
 
+@callable_when_compiled
+def mean_tangent(law: FloatArray, x: float, speed: float, half_width: float) -> float:
+    """Return the derivative of `mean_force` by the speed.
+
+    It is exact: d/dv of the integral of f from v - h to v + h is f(v + h) - f(v - h), divided by
+    the width 2 h.
+    """
+    difference_over_window = steady_force(law, x, speed + half_width) - steady_force(
+        law, x, speed - half_width
+    )
+    return difference_over_window / (2.0 * half_width)
+
+
 def fill_force_and_tangents(
     law_index: int,
     of_speed: bool,
@@ -130,12 +143,7 @@ def fill_force_and_tangents(
             force[j], by_position[j] = force_and_slope(law_index, law, memory, x, 1.0)
             continue
         force[j] = mean_force(law, x, v, half_width)
-        # the exact derivative of the mean over the window: d/dv of the integral of f from v - h to
-        # v + h is f(v + h) - f(v - h), divided by the width 2 h
-        difference_over_window = steady_force(law, x, v + half_width) - steady_force(
-            law, x, v - half_width
-        )
-        by_speed[j] = difference_over_window / (2.0 * half_width)
+        by_speed[j] = mean_tangent(law, x, v, half_width)
         if law[POSITION_EXPONENT] != 0.0:
             difference_by_position = mean_force(
                 law, x + half_difference, v, half_width

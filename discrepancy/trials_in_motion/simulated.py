@@ -18,9 +18,8 @@ from fe.compilation import callable_when_compiled, compiled, law_functions
 from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady_force
 
-from .laws import mean_force
+from .laws import mean_force, mean_tangent
 from .steps import multiply, respond_to_inputs, weight_moved_to_end
 from .trajectory import Trajectory
 from .trial import PortedTrial
@@ -99,10 +98,7 @@ def force_at_port(
         law = laws.parameters[k]
         if laws.of_speed[k]:
             force += mean_force(law, position, speed, half_width)
-            difference_over_window = steady_force(law, position, speed + half_width) - steady_force(
-                law, position, speed - half_width
-            )
-            by_speed += difference_over_window / (2.0 * half_width)
+            by_speed += mean_tangent(law, position, speed, half_width)
         else:
             force_of_law, slope = force_and_slope(
                 laws.numbers[k], law, laws.memories[k], position, 1.0
