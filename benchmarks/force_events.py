@@ -20,7 +20,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.open_rigs.campaigns import table
-from benchmarks.open_rigs.rigs import HEATED, STORES, Course, FloatArray, entry, port, solved
+from benchmarks.open_rigs.rigs import HEATED, STORES, FloatArray, entry, port, solved
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.estimation.force_search import ForceSearch
@@ -237,8 +237,7 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
     rig = RIGS[name]
     equations = Equations(kind, drive, event, sizes[0], factors)
     slope = {"heated": equations.heated, "tanks": equations.tanks, "mass": equations.mass}[name]
-    course = Course(lambda t, order: drive(t), lambda t: 0.0, tuple(breaks))
-    states = solved(slope, [0.0] * rig.states, course, time)
+    states = solved(slope, [0.0] * rig.states, tuple(breaks), time)
     deviations = noise * np.array([deviation for _, _, deviation in rig.channels.values()])
     channels = len(rig.channels)
     readings = states[:, :channels] + deviations * generator.standard_normal((count, channels))

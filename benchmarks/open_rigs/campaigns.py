@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from benchmarks.open_rigs.rigs import RIGS, SCALES, Course, FloatArray, Rig, Truth, entry
+from benchmarks.sizing import size_leaving, unexplained_rms
 
 KINDS = ("cart", "damper", "servo", "support", "stores")
 LAWS = (
@@ -158,15 +159,7 @@ class Bench:
         reference : (N,) array
             Readings over the noise without it.
         """
-        change = self.readings_over_noise(truth) - reference
-        count = self.nuisances.shape[1]
-        # Rows of the prior: each nuisance is zero with a unit deviation
-        explained = np.linalg.lstsq(
-            np.vstack((self.nuisances, np.eye(count))),
-            np.concatenate((change, np.zeros(count))),
-            rcond=None,
-        )[0]
-        return float(np.sqrt(np.mean((change - self.nuisances @ explained) ** 2)))
+        return unexplained_rms(self.readings_over_noise(truth) - reference, self.nuisances)
 
     def size_effect(
         self, truth: Truth, key: Literal["size", "amount"], wanted: float, largest: float
@@ -189,16 +182,12 @@ class Bench:
             return replace(truth, size=value) if key == "size" else replace(truth, amount=value)
 
         reference = self.readings_over_noise(with_size(0.0))
-        size = 0.01
-        for _ in range(8):
-            size = min(size, largest)
-            sized = with_size(size)
-            unexplained = self.unexplained(sized, reference)
-            is_too_small = size == largest and unexplained < wanted
-            if abs(unexplained / wanted - 1.0) < 0.1 or is_too_small:
-                break
-            size *= float(np.clip(wanted / unexplained, 0.1, 10.0))
-        return sized, unexplained
+
+        def unexplained_of_size(value: float) -> float:
+            return self.unexplained(with_size(value), reference)
+
+        size, unexplained = size_leaving(wanted, largest, unexplained_of_size)
+        return with_size(size), unexplained
 
 
 def rig_name(kind: str, turn: int, seed: int, hidden: str) -> str:

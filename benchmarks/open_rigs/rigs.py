@@ -206,12 +206,12 @@ def disturbance_force(truth: Truth, course: Course, force: float, length: float)
 def solved(
     slope: Callable[[float, FloatArray], list[float]],
     begin: list[float],
-    course: Course,
+    breaks: tuple[float, ...],
     stamps: FloatArray,
 ) -> FloatArray:
     """Integrate y' = slope(t, y) and return the states (n, S) at times (n,).
 
-    The integration restarts at each break of the excitation, where the slope jumps.
+    The integration restarts at each break, where the slope jumps.
 
     Parameters
     ----------
@@ -219,13 +219,13 @@ def solved(
         (time, state) -> rates (S,).
     begin : list of float
         State (S,) at the first time.
-    course : Course
-        The excitation.
+    breaks : tuple of float
+        Times at which the slope jumps [s].
     stamps : (n,) array
         Times [s].
     """
     states = np.zeros((len(stamps), len(begin)))
-    ends = [*(t for t in course.breaks if 0.0 < t < stamps[-1]), float(stamps[-1])]
+    ends = [*(t for t in breaks if 0.0 < t < stamps[-1]), float(stamps[-1])]
     now = float(stamps[0])
     state = np.array(begin)
     for end in ends:
@@ -316,7 +316,7 @@ def body(
             loose_pull - support,
         ]
 
-    states = solved(slope, [0.0] * 5, course, stamps)
+    states = solved(slope, [0.0] * 5, course.breaks, stamps)
     law_forces = []
     disturbance_forces = []
     for t, state in zip(stamps, states, strict=True):
@@ -367,7 +367,7 @@ def damper(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
         return [z_rate, loose_v, loose_pull(t, state)]
 
     begin = course.value(float(stamps[0]), 0)
-    states = solved(slope, [0.0, begin, 0.0], course, stamps)
+    states = solved(slope, [0.0, begin, 0.0], course.breaks, stamps)
     forces = []
     for t, state in zip(stamps, states, strict=True):
         x, v, a = (course.value(t, order) for order in range(3))
@@ -458,7 +458,7 @@ def stores(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
         )
         return [course.value(t, 0) - upper_flow, lower_rate, loose_flow]
 
-    return solved(slope, [0.0] * 3, course, stamps)[:, :2]
+    return solved(slope, [0.0] * 3, course.breaks, stamps)[:, :2]
 
 
 def heated(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
@@ -475,7 +475,7 @@ def heated(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
         rate = (course.value(t, 0) - out) / capacity - truth.loose_ratio * loose_flow
         return [rate, loose_flow]
 
-    return solved(slope, [0.0] * 2, course, stamps)[:, :1]
+    return solved(slope, [0.0] * 2, course.breaks, stamps)[:, :1]
 
 
 def entry(heading: str, **keys: object) -> str:

@@ -1,0 +1,1 @@
+"""A blind test with laws that the catalogue of effects lacks; see `__main__`."""
