@@ -9,6 +9,7 @@ which little force is missing. The missing force with the largest evidence is re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from math import inf
 
 from .estimate import Estimate
 from .force_states import Process
@@ -133,13 +134,15 @@ class MotionEstimator:
         )
         window = FIRST_WINDOWS[-1] if laws.hold_at_rest else USUAL_WINDOW
         current_start = start
+        largest_evidence = -inf
         for fraction in ROUGH_FRACTIONS:
             processes = scale_processes(start.processes, fraction, 1.0)
             estimate = self.gauss_newton.iterate(
                 laws, replace(current_start, processes=processes), window, MOST_ROUGH_ITERATIONS
             )
-            if estimate is None:
+            if estimate is None or estimate.log_evidence < largest_evidence - LARGEST_DECLINE:
                 break
+            largest_evidence = max(estimate.log_evidence, largest_evidence)
             if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
                 best_estimate = estimate
             current_start = start_from_estimate(estimate)
