@@ -132,38 +132,6 @@ class SearchSettings:
 
     That fit takes the motion as known. Trials that were not fitted may distinguish the two."""
 
-    # ---------------------------------------------------------------- begun from another size
-    restart_sizes: tuple[float, ...] = (
-        0.5,
-        0.56,
-        0.63,
-        0.71,
-        0.8,
-        0.87,
-        0.93,
-        1.0,
-        1.07,
-        1.15,
-        1.25,
-        1.4,
-        1.6,
-        1.8,
-        2.0,
-    )
-    """Start sizes of repeated fits of the leading effect, over its size by the missing force.
-
-    They are used if no fit leaves only noise. Friction that ends a motion has local optima that
-    are an eighth to a quarter of its size apart."""
-    most_restarts: int = 6
-    """Most such fits, from the sizes with the smallest residuals.
-
-    They end with the first that leaves only noise.
-    """
-
-    same_optimum_deviation: float = 0.1
-    """Distance of a simulation from the estimate with the motion, in prior deviations of each
-    parameter, up to which both are in one optimum and the fit is not repeated."""
-
     # ---------------------------------------------------------------- weighed with a remainder
     most_weighed_sets: tuple[int, ...] = (8, 4, 2)
     """Most sets of one, two and three effects that are fitted together with a remainder."""

@@ -441,28 +441,6 @@ class Problem:
         misfits = channel_misfits(self.record_freedom, self.sample_counts, squares)
         return float(misfits[self.sample_counts > 0].sum())
 
-    def recorded_misfit(self, squares: FloatArray) -> float:
-        """Return -ln L if the noise is exactly as recorded, up to a constant [nat].
-
-        The misfit is the sum of squares / 2, plus ln(deviation of a whitened reading / standard
-        deviation of the noise) for each reading. The second term makes the constant equal to that
-        of the evidence with a missing force, which counts readings in standard deviations of the
-        noise. Coloured noise has the smaller deviation after whitening, that of its innovations.
-
-        Parameters
-        ----------
-        squares : (channels,) array
-            The sum of squared standardised residuals of each channel.
-        """
-        log_determinant = 0.0
-        for data in self.trials:
-            static_deviation = data.trial.noise_factor * np.array(
-                [noise.static_deviation for noise in data.noise_models]
-            )
-            log_ratio = np.log(data.deviation / static_deviation)
-            log_determinant += float((data.weight * log_ratio).sum())
-        return 0.5 * float(squares.sum()) + log_determinant
-
     def noise_precisions(self, squares: FloatArray) -> FloatArray:
         """Return the expected noise precision of each channel over the recorded 1 / s0^2.
 

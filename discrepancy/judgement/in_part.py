@@ -60,7 +60,7 @@ def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutco
         sentence mentions.
     """
     force_search = search.force_search if search.force_estimates else None
-    if force_search is not None and not _missing_force_vanishes(search):
+    if force_search is not None and not search.force_estimates[0].leaves_no_force:
         return _verdict_by_comparison(ForceComparison(search, force_search), simulation_verdict)
     compare_under_wide_noise(search)
     comparison = SimulationComparison(search)
@@ -69,26 +69,6 @@ def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutco
         return outcome
     comparison.add_free_shape_families()
     return _verdict_by_comparison(comparison, simulation_verdict)
-
-
-def _missing_force_vanishes(search: Search) -> bool:
-    """Return whether a simulation is more probable than every hypothesis with a missing force.
-
-    A simulation is the limit of an estimate whose missing force is zero. It is compared with the
-    other estimates on the same readings and under the same noise. This is possible only if all
-    trials are in motion, as trials at rest show no missing force, and if every channel has a noise
-    record.
-    """
-    every_channel_has_a_record = bool(np.all(search.problem.record_freedom > 0.0))
-    if not search.is_all_in_motion or not every_channel_has_a_record:
-        return False
-    best_without_force = -np.inf
-    for simulation in search.exact_fits.values():
-        if simulation.candidate.terms:
-            score = search.score_under_recorded_noise(simulation)
-            best_without_force = max(best_without_force, score)
-    best_with_force = max(map(search.score, search.force_estimates))
-    return best_without_force > best_with_force
 
 
 def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:

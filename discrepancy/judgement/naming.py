@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.search.starts import OnProgress, changes_structure, ignore_progress
 from discrepancy.search.strategy import Search
@@ -64,7 +63,7 @@ def reach_verdict(
         experiments and faults of the data are added to the verdict elsewhere.
     """
     outcome = check_against_trials(
-        _verdict_of_two_searches(problem, effects, on_progress, on_search)
+        _verdict_on_search(search(problem, effects, on_progress, on_search))
     )
     verdict = outcome.verdict
     no_effect = outcome.search.no_effect
@@ -82,46 +81,6 @@ def reach_verdict(
         moved_within_prior=moved_within_prior,
     )
     return outcome._replace(verdict=verdict)
-
-
-def _verdict_of_two_searches(
-    problem: Problem, effects: Sequence[Effect], on_progress: OnProgress, on_search: OnSearch
-) -> VerdictOutcome:
-    """Return the verdict on a search, or on a second one that compares simulations only.
-
-    The second search is made if hypotheses were compared by the missing force and the gap remains
-    unexplained. Its verdict is returned if it names effects in part, at least one of which acts on
-    the structure, and if these close enough of the gap in fitted trials.
-    """
-    first_search = search(problem, effects, on_progress, on_search)
-    first_outcome = _verdict_on_search(first_search)
-    is_unexplained = first_outcome.verdict.kind is VerdictKind.UNEXPLAINED
-    if not first_search.force_estimates or not is_unexplained:
-        return first_outcome
-    on_progress("no effect follows the missing force: comparing whole simulations")
-    # the first search may have refined the time steps, so fit again
-    no_effect = try_fit(problem, Candidate(), first_search.no_effect.point)
-    second_search = Search(
-        problem, first_search.effects, no_effect or first_search.no_effect, on_progress=on_progress
-    )
-    second_search.force_search = first_search.force_search
-    on_search(second_search)
-    second_search.search_single_effects()
-    second_search.search_sets()
-    second_outcome = _verdict_on_search(second_search)
-    second_search.force_estimates = first_search.force_estimates
-    is_named = second_outcome.verdict.kind is VerdictKind.NAMED_IN_PART
-    has_law = any(_effects_acting_on_structure(problem, second_outcome.fit))
-    # Held-out trials alone are not enough: most of the gap in fitted trials must be closed too. The
-    # gap is the excess of χ² over its expected value for noise alone, the number of readings.
-    reading_count = float(problem.sample_counts.sum())
-    excess_without_effect = second_search.no_effect.chi_square - reading_count
-    remaining_excess = second_outcome.fit.chi_square - reading_count
-    closes_gap = (
-        excess_without_effect > 0.0
-        and remaining_excess < (1.0 - SEARCH.least_gap_share) * excess_without_effect
-    )
-    return second_outcome if is_named and has_law and closes_gap else first_outcome
 
 
 def _effects_acting_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:

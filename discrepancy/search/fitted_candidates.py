@@ -66,17 +66,6 @@ class FittedCandidates:
         """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
         return fit.log_evidence + self.log_prior(fit.candidate)
 
-    def score_under_recorded_noise(self, fit: CandidateFit) -> float:
-        """Return ln (evidence times prior) of a simulation if the noise is as recorded [nat].
-
-        The evidence of a fit averages over the variance of the noise, which its record leaves
-        uncertain. Hypotheses with a missing force take the recorded variance as exact; with this
-        score a simulation can be compared with them.
-        """
-        averaged_misfit = self.problem.misfit(fit.squares_by_channel)
-        recorded_misfit = self.problem.recorded_misfit(fit.squares_by_channel)
-        return self.score(fit) + averaged_misfit - recorded_misfit
-
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
         """Return the fits that the comparison of candidates uses, one for each candidate.
 

@@ -1,82 +1,23 @@
 """Starting points of fits near other optima than the one that was found.
 
-They have another magnitude of a single effect, another stretch of the structure that an effect
-covers, or another place of one effect of a set.
+They have another stretch of the structure that an effect covers, or another place of one effect of
+a set.
 """
 
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
 from discrepancy.catalogue.entry import Setting
-from discrepancy.errors import DiscrepancyError
-from discrepancy.estimation.estimate import Estimate
-from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, objective, try_fit
-from discrepancy.fits.problem import Problem
-from discrepancy.search_settings import SEARCH
+from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.fitting import CandidateFit, try_fit
 
 from .fitted_candidates import FittedCandidates
 
 LEAST_TAIL = 0.02
 """Prior probability that is left beyond a moved end of a stretch."""
-
-
-def canonical_relatives(leading_term: EffectTerm, hypotheses: Iterable[Estimate]) -> list[Estimate]:
-    """Return the hypotheses that a fit from other starting magnitudes may improve.
-
-    Such a hypothesis consists of one effect. The effect has the same family (such as friction) and
-    the same place as the leading effect, which fits best so far; it may be the leading effect
-    itself. It has a magnitude, from which the fit can start. The shape of its law is the canonical
-    one of the catalogue, as its shape parameters are not fitted.
-
-    Parameters
-    ----------
-    leading_term : EffectTerm
-        The leading effect at its place.
-    hypotheses : iterable of Estimate
-        All hypotheses: sets of effects that were fitted to the missing force.
-    """
-    relatives = []
-    for hypothesis in hypotheses:
-        if len(hypothesis.candidate.terms) != 1:
-            continue
-        (term,) = hypothesis.candidate.terms
-        has_same_family = term.effect.family == leading_term.effect.family
-        is_related = has_same_family and term.place == leading_term.place
-        has_magnitude = any(parameter.magnitude for parameter in term.parameters)
-        if is_related and has_magnitude and not term.free_shape:
-            relatives.append(hypothesis)
-    return relatives
-
-
-def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Point) -> list[Point]:
-    """Return points at which a single effect has another magnitude, to begin fits at.
-
-    They are sorted by their objective, the least first; `SEARCH.most_restarts` of them are
-    returned.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    candidate : Candidate
-        The candidate of one effect.
-    start : Point
-        The point at which the effect agrees with the missing force. Only the magnitude is changed.
-    """
-    (term,) = candidate.terms
-    valued_points: list[tuple[float, Point]] = []
-    for factor in SEARCH.restart_sizes:
-        effect = term.multiply_magnitudes_within_range(start.effect, factor)
-        point = replace(start, effect=effect)
-        with suppress(DiscrepancyError):  # the effect is larger than the model allows
-            valued_points.append((objective(problem, candidate, point), point))
-    valued_points.sort(key=lambda valued_point: valued_point[0])
-    return [point for _, point in valued_points[: SEARCH.most_restarts]]
 
 
 def refit_from_other_stretches(

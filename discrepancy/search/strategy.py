@@ -191,20 +191,9 @@ class Search(FittedCandidates):
         """Return a base whose nuisances are not distorted by the errors of the model.
 
         The nuisances of a wrong model compensate a part of its error, and are a bad start. They
-        are taken from a fit that includes a free missing force. If a trial is at rest, or no force
-        can be estimated, they are set to their prior means.
+        are set to their prior means.
         """
         point = self.problem.prior_mean_point(base.candidate)
-        force_search = self.force_search if self.is_all_in_motion else None
-        if force_search is not None:
-            hypothesis = force_search.estimate_without_effects
-            if base.candidate.terms:
-                with_effects = force_search.estimate_effects(
-                    hypothesis, base.candidate, base.effect
-                )
-                # without the effects if they cannot act along the motion
-                hypothesis = with_effects or hypothesis
-            point = force_search.point(hypothesis)
         return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
 
     def _fit_from_starts(
@@ -340,16 +329,13 @@ class Search(FittedCandidates):
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
         """Fit the sets of effects whose force agrees best with the missing force.
 
-        The missing force is estimated from the readings without a law. The new fits replace all
-        earlier ones.
+        The missing force is estimated from the readings without a law.
 
         Parameters
         ----------
         force_search : ForceSearch
             The search for the missing force.
         """
-        self.exact_fits = {(): self.no_effect}
-        self.rough_fits = {}
         self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
         # fit the most probable sets to the readings, each from its estimate by the missing force
         eligible_hypotheses = []
@@ -372,63 +358,7 @@ class Search(FittedCandidates):
             fit = try_fit(self.problem, hypothesis.candidate, start)
             if fit is not None:
                 self.record_fit(fit, exact=True)
-        self.refit_from_other_magnitudes(force_search)
-        self.move_effects()
-        self.drop_effects()
         self.refine_time_steps()
-
-    def refit_from_other_magnitudes(self, force_search: ForceSearch) -> None:
-        """Fit the best single effect again from other magnitudes, unless it explains the data.
-
-        If dry friction ends a motion, there is an optimum of its magnitude for every number of half
-        swings. The magnitude that agrees with the missing force is near the right optimum, but the
-        fit may end in the next one. A law of free shape can adapt itself to a wrong optimum, so the
-        laws of its family with canonical shape are fitted.
-
-        Parameters
-        ----------
-        force_search : ForceSearch
-            The search for the missing force.
-        """
-        if not self.is_unexplained() and not self.best().candidate.has_free_shape:
-            return
-        single_fits = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
-        if not single_fits:
-            return
-        leading_fit = max(single_fits, key=self.score)
-        if self._is_in_optimum_of_estimate(leading_fit):
-            return
-        (leading_term,) = leading_fit.candidate.terms
-        for hypothesis in other_optima.canonical_relatives(leading_term, self.force_estimates):
-            candidate = hypothesis.candidate
-            self.on_progress(f"fitting {candidate.description} from other sizes")
-            start = force_search.point(hypothesis)
-            for point in other_optima.points_at_other_magnitudes(self.problem, candidate, start):
-                fit = try_fit(self.problem, candidate, point)
-                if fit is None:
-                    continue
-                self.record_fit(fit, exact=True)
-                if check_absolute_fit(self.problem, fit).passed:
-                    return
-
-    def _is_in_optimum_of_estimate(self, fit: CandidateFit) -> bool:
-        """Return whether a simulation is near the data, at the values estimated with the motion.
-
-        The estimate follows the law from a large missing force to a small one, and so reaches the
-        right optimum. Other optima are much farther away, and leave far more than the noise.
-
-        Parameters
-        ----------
-        fit : CandidateFit
-            The fit of the hypothesis by simulations.
-        """
-        if self._has_large_residuals(fit):
-            return False
-        return any(
-            hypothesis.candidate.key == fit.candidate.key
-            and np.abs(hypothesis.effect - fit.effect).max() < SEARCH.same_optimum_deviation
-            for hypothesis in self.force_estimates
-        )
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises."""

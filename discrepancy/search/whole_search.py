@@ -71,14 +71,9 @@ def search(
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
     force_search = result.force_search if result.is_all_in_motion else None
-    # With one port, the missing force alone decides between effects. With several ports, free
-    # forces at the others could imitate nearly any law at one of them: compare simulations first.
-    if force_search is not None and len(force_search.ports) <= 1:
-        result.search_by_missing_force(force_search)
-        return result
-    result.search_single_effects()
-    if force_search is not None and result.is_unexplained():
+    if force_search is not None:
         result.search_by_missing_force(force_search)
     else:
+        result.search_single_effects()
         result.search_sets()
     return result

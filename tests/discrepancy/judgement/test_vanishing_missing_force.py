@@ -1,4 +1,4 @@
-"""Hypotheses with and without a missing force are compared on one scale."""
+"""Where the missing force vanishes beside a law, the law is judged by its simulation."""
 
 import numpy as np
 import pytest
@@ -13,9 +13,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import fit
-from discrepancy.search.fitted_candidates import FittedCandidates
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, problem_without_wrong_ends
 from tests.discrepancy.rigs import chosen, integrated, model_of
@@ -101,13 +99,11 @@ def test_the_value_of_the_law_is_that_of_the_simulation(sticking: Investigation)
     assert law.coefficient == pytest.approx(FRICTION, rel=1e-3)
 
 
-def test_evidence_under_recorded_noise_has_the_scale_of_that_with_a_missing_force() -> None:
-    campaign = pushed_axis(0.0, 300)
-    problem = problem_without_wrong_ends(campaign, model_of(AXIS))
-    no_effect = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
-    candidates = FittedCandidates(problem, (), no_effect)
-    evidence = candidates.score_under_recorded_noise(no_effect) - candidates.log_prior(no_effect.candidate)
+def test_a_right_model_leaves_no_force_and_its_evidence_is_that_of_noise() -> None:
+    problem = problem_without_wrong_ends(pushed_axis(0.0, 300), model_of(AXIS))
+    without_effects = ForceSearch(problem).estimate_without_effects
     count = float(problem.sample_counts.sum())
-    # of a right model: half the readings, and half the logarithms of how much the readings tell of
-    # mass, damping, and the two unknowns of each beginning
-    assert -0.5 * count - 80.0 < evidence < -0.5 * count
+    assert without_effects.leaves_no_force
+    # half the readings, and half the logarithms of how much the readings tell of mass, damping, and
+    # the two unknowns of each beginning
+    assert -0.5 * count - 80.0 < without_effects.log_evidence_without_force < -0.5 * count
