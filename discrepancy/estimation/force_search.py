@@ -27,6 +27,7 @@ from .gauss_newton import EstimatorStart, GaussNewton, linearise_trials, start_f
 from .linearisation import Linearisation, plain_linearisation
 from .log_prior import log_prior
 from .process_search import Processes, scale_processes
+from .regression import Priors
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
@@ -128,6 +129,8 @@ class ForceSearch:
         The model's own laws at its ports, which its linear system does not contain.
     trial_set : TrialSet
         The trials in motion, of which linear systems are made.
+    shared_priors : Priors
+        The priors of the unknowns that all trials share.
     """
 
     def __init__(self, problem: Problem, sample_limit: int | None = None) -> None:
@@ -146,11 +149,11 @@ class ForceSearch:
             unknowns_of_model_laws=self._unknowns_of_model_laws(start.shared),
             sample_limit=sample_limit,
         )
+        low, high = self.problem.shared.bounds
+        self.shared_priors = Priors(self.problem.shared.precision, low, high)
         self.estimate_by_port: dict[str, Estimate] = {}
         # first estimate, along the motion of the model at the prior means
-        linearisation = plain_linearisation(
-            self.trial_set.trials_about(start), self.problem.shared.precision
-        )
+        linearisation = plain_linearisation(self.trial_set.trials_about(start), self.shared_priors)
         for port, name in enumerate(self.ports):
             processes = self.prior_processes((port,))
             self.estimate_by_port[name] = estimate_of_processes(linearisation, processes, processes)
@@ -239,7 +242,7 @@ class ForceSearch:
         prior_medians : dict of int to Process
             Their prior medians.
         """
-        linearisation = plain_linearisation(trials, self.problem.shared.precision)
+        linearisation = plain_linearisation(trials, self.shared_priors)
         solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
         trajectories = tuple(trial.trajectory for trial in smoothed_trials)
         along_motion = self._linearise(trials, trajectories, solution.mean)
@@ -270,12 +273,11 @@ class ForceSearch:
         shared_values : (K,) array
             The values of the shared unknowns.
         """
-        precision = self.problem.shared.precision
         no_local_values = tuple(np.zeros(0) for _ in trials)
         start = EstimatorStart(NO_EFFECT_VALUES, shared_values, no_local_values, trajectories, {})
         laws = self.trial_set.laws(NO_EFFECTS, trials)
-        linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, precision)
-        return linearisation or plain_linearisation(trials, precision)
+        linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, self.shared_priors)
+        return linearisation or plain_linearisation(trials, self.shared_priors)
 
     def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
         """Return the prior medians of missing forces, by the number of the port.
@@ -352,7 +354,7 @@ class ForceSearch:
         processes = self.estimate_without_effects.processes
         prior_medians = self.prior_processes(processes)
         return MotionEstimator(
-            GaussNewton(tuple(trials), self.problem.shared.precision, prior_medians),
+            GaussNewton(tuple(trials), self.shared_priors, prior_medians),
             small_processes=scale_processes(processes, SMALL_FRACTION, 1.0),
         )
 

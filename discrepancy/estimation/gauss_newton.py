@@ -29,6 +29,7 @@ from .estimate import Estimate
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
 from .process_search import Processes, prior_log_density
+from .regression import Priors
 
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
@@ -157,7 +158,7 @@ def linearise_trials(
     trials: Sequence[PortedTrial],
     start: EstimatorStart,
     speed_window: float,
-    shared_precision: FloatArray,
+    shared_priors: Priors,
 ) -> Linearisation | None:
     """Return all trials with a hypothesis' laws, linearised along trajectories.
 
@@ -172,8 +173,8 @@ def linearise_trials(
     speed_window : float
         The half width of the window of speeds over which laws of the speed are averaged, divided by
         the rms speed.
-    shared_precision : (K,) array
-        The prior precisions of the shared unknowns.
+    shared_priors : Priors
+        The priors of the K shared unknowns.
 
     Returns
     -------
@@ -198,8 +199,8 @@ def linearise_trials(
         )
         linear_trials.append(linear_trial)
     # the unknowns of effects have standard normal priors, of precision one
-    precision = np.concatenate((shared_precision, np.ones(laws.candidate.parameter_count)))
-    return Linearisation(tuple(linear_trials), precision)
+    effect_priors = Priors.without_ranges(np.ones(laws.candidate.parameter_count))
+    return Linearisation(tuple(linear_trials), shared_priors.followed_by(effect_priors))
 
 
 def linearise_along_laws(
@@ -207,7 +208,7 @@ def linearise_along_laws(
     trials: Sequence[PortedTrial],
     start: EstimatorStart,
     speed_window: float,
-    shared_precision: FloatArray,
+    shared_priors: Priors,
 ) -> Linearisation | None:
     """Return all trials linearised along the motion that a hypothesis' laws alone give them.
 
@@ -221,8 +222,8 @@ def linearise_along_laws(
         The values of unknowns, and trajectories that begin in the same states.
     speed_window : float
         The half width of the window of speeds, see `LawArguments`.
-    shared_precision : (K,) array
-        The prior precisions of the shared unknowns.
+    shared_priors : Priors
+        The priors of the K shared unknowns.
 
     Returns
     -------
@@ -237,7 +238,7 @@ def linearise_along_laws(
             return None
         trajectories.append(trajectory)
     start_along_laws = replace(start, trajectories=tuple(trajectories))
-    return linearise_trials(laws, trials, start_along_laws, speed_window, shared_precision)
+    return linearise_trials(laws, trials, start_along_laws, speed_window, shared_priors)
 
 
 def _start_after_step(
@@ -285,21 +286,21 @@ class GaussNewton:
     ----------
     trials : tuple of PortedTrial
         The dynamic trials as linear systems with ports.
-    shared_precision : (K,) ndarray
-        The prior precisions of the shared unknowns.
+    shared_priors : Priors
+        The priors of the K shared unknowns.
     prior_medians : mapping of int to Process
         The prior medians of the missing forces, by the number of the port.
     """
 
     trials: tuple[PortedTrial, ...]
-    shared_precision: FloatArray
+    shared_priors: Priors
     prior_medians: Processes
 
     def linearise(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> Linearisation | None:
         """Return the trials with laws along trajectories, see `linearise_trials`."""
-        return linearise_trials(laws, self.trials, start, speed_window, self.shared_precision)
+        return linearise_trials(laws, self.trials, start, speed_window, self.shared_priors)
 
     def log_evidence(self, linearisation: Linearisation, processes: Processes) -> float:
         """Return log evidence plus log prior of missing forces in linear trials [nat]."""
@@ -397,7 +398,7 @@ class GaussNewton:
         fraction = 1.0
         for _ in range(most_iterations):
             linearisation = linearise_along_laws(
-                laws, self.trials, start, speed_window, self.shared_precision
+                laws, self.trials, start, speed_window, self.shared_priors
             )
             if linearisation is None:
                 return best_estimate
@@ -464,7 +465,7 @@ class GaussNewton:
         deviations = np.sqrt(np.diag(solution.covariance))
         largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
         evidence_change = abs(evidence - last_evidence)
-        shared_count = len(self.shared_precision)
+        shared_count = len(self.shared_priors)
         return Estimate(
             candidate=candidate,
             effect=unknowns[shared_count:],

@@ -14,7 +14,7 @@ from .filtered import FilteredTrial, SmoothedTrial
 from .force_states import Process
 from .linearised import LinearisedTrial
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
-from .regression import LEAST_PRECISION, Regression, Solution, integrate_out_last
+from .regression import LEAST_PRECISION, Priors, Regression, Solution, integrate_out_last
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +25,17 @@ class Linearisation:
     ----------
     trials : tuple of LinearisedTrial
         The trials, each linear about the same values.
-    prior_precision : (K + E,) ndarray
-        The prior precisions of the K unknowns that all trials share, then of the E of the effects.
+    priors : Priors
+        The priors of the K unknowns that all trials share, then of the E of the effects.
     """
 
     trials: tuple[LinearisedTrial, ...]
-    prior_precision: FloatArray
+    priors: Priors
 
     @property
     def shared_precision(self) -> FloatArray:
         """The prior precisions (K,) of the unknowns that all trials share."""
-        return self.prior_precision[: len(self.trials[0].shared)]
+        return self.priors.precision[: len(self.trials[0].shared)]
 
     @cached_property
     def correlation_time_range(self) -> tuple[float, float]:
@@ -54,7 +54,7 @@ class Linearisation:
 
         The local unknowns, which occur in one trial only, are integrated out.
         """
-        sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
+        sum_of_products = np.zeros((1 + len(self.priors),) * 2)
         half_log_determinant = 0.0
         for filtered_trial in filtered_trials:
             products, half_determinant = filtered_trial.whitened_products
@@ -73,9 +73,7 @@ class Linearisation:
 
     def _solve_filtered(self, filtered_trials: Iterable[FilteredTrial]) -> Solution:
         """Return log evidence and values of the K + E unknowns by the filters of all trials."""
-        return self.regression(filtered_trials).solve(
-            range(len(self.prior_precision)), self.prior_precision
-        )
+        return self.regression(filtered_trials).solve(range(len(self.priors)), self.priors)
 
     def solve_and_smooth(self, processes: Processes) -> tuple[Solution, tuple[SmoothedTrial, ...]]:
         """Return the most probable unknowns, and the smoothed motion and forces of all trials."""
@@ -177,22 +175,20 @@ def trajectory_of_model(trial: PortedTrial) -> Trajectory:
     return Trajectory(no_state, trial.port_positions, trial.port_speeds, {})
 
 
-def plain_linearisation(
-    trials: Sequence[PortedTrial], shared_precision: FloatArray
-) -> Linearisation:
+def plain_linearisation(trials: Sequence[PortedTrial], shared_priors: Priors) -> Linearisation:
     """Return trials along the motion of the linear model, without any law or error of a sensor.
 
     Parameters
     ----------
     trials : sequence of PortedTrial
         The trials as linear systems with ports.
-    shared_precision : (K,) array
-        The prior precisions of the shared unknowns.
+    shared_priors : Priors
+        The priors of the K shared unknowns.
     """
     no_effect = np.zeros(0)
     linear_trials = []
     for trial in trials:
-        shared = trial.linearisation_point[: len(shared_precision)]
+        shared = trial.linearisation_point[: len(shared_priors)]
         linear_trials.append(
             LinearisedTrial(
                 trial=trial,
@@ -203,4 +199,4 @@ def plain_linearisation(
                 shared=shared,
             )
         )
-    return Linearisation(tuple(linear_trials), shared_precision)
+    return Linearisation(tuple(linear_trials), shared_priors)

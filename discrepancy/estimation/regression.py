@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import lsq_linear
 
 from discrepancy.campaign.records import FloatArray
 
@@ -16,6 +17,45 @@ ROUNDING_OF_SUM, LARGEST_ROUNDING = 1e-15, 1.0
 which there is an evidence [nat]."""
 LEAST_PRECISION = 1e-10
 """Prior precision of an unknown with a flat prior, whose exact precision of zero is singular."""
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """The priors of K unknowns: normal about zero, within ranges.
+
+    Attributes
+    ----------
+    precision : (K,) ndarray
+        The prior precisions.
+    low, high : (K,) ndarray
+        The least and largest values; infinite without a range.
+    """
+
+    precision: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def without_ranges(cls, precision: FloatArray) -> "Priors":
+        """Return normal priors of given precisions (K,)."""
+        unbounded = np.full(len(precision), np.inf)
+        return cls(precision, -unbounded, unbounded)
+
+    def __len__(self) -> int:
+        return len(self.precision)
+
+    def of(self, unknowns: Sequence[int]) -> "Priors":
+        """Return the priors of some of the unknowns, given by their numbers."""
+        numbers = np.asarray(unknowns, dtype=np.intp)
+        return Priors(self.precision[numbers], self.low[numbers], self.high[numbers])
+
+    def followed_by(self, others: "Priors") -> "Priors":
+        """Return the priors of these unknowns and others after them."""
+        return Priors(
+            np.concatenate((self.precision, others.precision)),
+            np.concatenate((self.low, others.low)),
+            np.concatenate((self.high, others.high)),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +76,24 @@ class Solution:
     mean: FloatArray
     covariance: FloatArray
 
+    def within(self, priors: Priors) -> "Solution":
+        """Return the solution at the most probable values within the ranges of the unknowns.
+
+        The log evidence is that of the whole posterior, less its decrease from the mean to these
+        values: beyond an end of a range the readings ask for what cannot be.
+        """
+        if np.all((priors.low <= self.mean) & (self.mean <= priors.high)):
+            return self
+        # the mode minimises (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2 within the ranges
+        whitening = solve_triangular(
+            np.linalg.cholesky(self.covariance), np.eye(len(self.mean)), lower=True
+        )
+        mode = lsq_linear(
+            whitening, whitening @ self.mean, (priors.low, priors.high), method="bvls"
+        ).x
+        decrease = 0.5 * float(np.sum((whitening @ (mode - self.mean)) ** 2))
+        return Solution(self.log_evidence - decrease, mode, self.covariance)
+
 
 @dataclass(frozen=True, eq=False)
 class Regression:
@@ -54,22 +112,22 @@ class Regression:
     products: FloatArray
     half_log_determinant: float
 
-    def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
+    def solve(self, unknowns: Sequence[int], priors: Priors) -> Solution:
         """Solve the linear model for some of its unknowns, with all other unknowns at zero.
 
         Parameters
         ----------
         unknowns : sequence of int
             The numbers of these unknowns.
-        precision : (len(unknowns),) array
-            The prior precision of each of these unknowns.
+        priors : Priors
+            The priors of these unknowns.
         """
         # the row and column of the residual come first, then those of the chosen unknowns
         rows = np.array([0, *(1 + unknown for unknown in unknowns)])
         products = self.products[np.ix_(rows, rows)]
         products_of_unknowns = products[1:, 1:]
         right_side = products[1:, 0]
-        prior_precision = np.maximum(precision, LEAST_PRECISION)
+        prior_precision = np.maximum(priors.precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
         column_scale = 1.0 / np.sqrt(np.diag(products_of_unknowns) + prior_precision)
         scale_of_pair = np.outer(column_scale, column_scale)
@@ -94,7 +152,7 @@ class Regression:
             - self.half_log_determinant
             - float(half_log_det_of_normal_matrix - half_log_det_of_prior)
         )
-        return Solution(log_evidence, mean, covariance)
+        return Solution(log_evidence, mean, covariance).within(priors)
 
 
 def integrate_out_last(

@@ -34,6 +34,7 @@ from .force_search import WIDE_WINDOW, ForceSearch
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
 from .process_search import Processes, processes_within_range, scale_processes
+from .regression import Priors
 
 SHAPE_VALUES = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which a parameter that is not a magnitude is tried."""
@@ -287,7 +288,7 @@ def _weigh_effects(
     if not tried_effects:
         return evidence_of_base, []
     with_columns = _with_columns(base, tried_effects)
-    base_count = len(base.linearisation.prior_precision)
+    base_count = len(base.linearisation.priors)
     best_starts: dict[int, ScreenedStart] = {}
     for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
         processes = processes_within_range(
@@ -296,12 +297,12 @@ def _weigh_effects(
         )
         normal_equations = with_columns.regression(with_columns.filter(processes))
         of_base = range(base_count)
-        without_effect = normal_equations.solve(of_base, with_columns.prior_precision[of_base])
+        without_effect = normal_equations.solve(of_base, with_columns.priors.of(of_base))
         evidence_of_base = max(evidence_of_base, without_effect.log_evidence)
         for index, tried_effect in enumerate(tried_effects):
             # the unknowns of the base are fitted again, with this column alone
             unknowns = [*range(base_count), base_count + index]
-            solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
+            solution = normal_equations.solve(unknowns, with_columns.priors.of(unknowns))
             factor = float(solution.mean[-1])
             has_possible_sign = factor > 0.0 or tried_effect.term.may_be_negative
             if not (has_possible_sign and np.isfinite(solution.log_evidence)):
@@ -316,15 +317,15 @@ def _weigh_effects(
 
 def _with_columns(base: Estimate, tried_effects: Sequence[TriedEffect]) -> Linearisation:
     """Return the trials of an estimate with one more unknown for each effect: its factor."""
-    first_factor = len(base.linearisation.prior_precision)
+    first_factor = len(base.linearisation.priors)
     effect = np.concatenate((base.effect, np.zeros(len(tried_effects))))
     linear_trials = []
     for trial_index, linear_trial in enumerate(base.linearisation.trials):
         columns = [tried_effect.columns[trial_index] for tried_effect in tried_effects]
         linear_trials.append(_trial_with_columns(linear_trial, columns, first_factor, effect))
-    precisions = _precisions_of_factors(base, tried_effects)
+    priors_of_factors = Priors.without_ranges(_precisions_of_factors(base, tried_effects))
     return Linearisation(
-        tuple(linear_trials), np.concatenate((base.linearisation.prior_precision, precisions))
+        tuple(linear_trials), base.linearisation.priors.followed_by(priors_of_factors)
     )
 
 
@@ -372,8 +373,8 @@ def _trial_with_columns(
     )
 
 
-def _precisions_of_factors(base: Estimate, tried_effects: Sequence[TriedEffect]) -> list[float]:
-    """Return the prior precisions of the factors on effects.
+def _precisions_of_factors(base: Estimate, tried_effects: Sequence[TriedEffect]) -> FloatArray:
+    """Return the prior precisions (number of effects,) of the factors on effects.
 
     The prior standard deviation of a factor is `FACTOR_DEVIATION` times the factor with which the
     effect would be as large as the gap: of forces for an effect with a force, of readings for
@@ -392,7 +393,7 @@ def _precisions_of_factors(base: Estimate, tried_effects: Sequence[TriedEffect])
             ratio = _rms([column.readings for column in tried_effect.columns]) / gap_of_readings
         # precision = 1 / (FACTOR_DEVIATION * gap / effect)^2
         precisions.append(min(ratio / FACTOR_DEVIATION, LARGEST_RATIO) ** 2)
-    return precisions
+    return np.array(precisions)
 
 
 def _rms(series: Iterable[FloatArray]) -> float:

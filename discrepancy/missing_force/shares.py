@@ -231,9 +231,9 @@ class ForceShares:
                 processes, estimate.solution
             )
         assert self._held_out is not None
-        precision = self.search.problem.shared.precision
+        priors = self.search.shared_priors
         trials = self._held_out_linearised_as(estimate)
-        without_laws = plain_linearisation(trials, precision)
+        without_laws = plain_linearisation(trials, priors)
         linearisation = without_laws
         smoothed_trials = without_laws.smooth(
             processes, replace(estimate.solution, mean=estimate.shared)
@@ -254,7 +254,7 @@ class ForceShares:
                 trajectories=tuple(trial.trajectory for trial in smoothed_trials),
                 processes=remaining_processes,
             )
-            with_laws = linearise(laws, trials, start, speed_window, precision)
+            with_laws = linearise(laws, trials, start, speed_window, priors)
             if with_laws is None:
                 break
             linearisation = with_laws

@@ -20,6 +20,7 @@ from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
+from discrepancy.estimation.regression import Priors
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -292,7 +293,7 @@ def _port_or_channel_error(
                 _with_channel_as_port(trial, names, channel)
                 for trial, names in zip(trials, channels, strict=True)
             ],
-            linearisation.shared_precision,
+            linearisation.priors,
         )
         evidence, processes = _most_probable_channel_error(with_channel_error, longest_duration)
         if evidence > best_estimate.log_evidence:
@@ -443,7 +444,7 @@ def strongest_pattern(
     )
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
     processes = {0: Process(size, 0.1 * float(np.ptp(time)), may_jump=True)}
-    linearisation = plain_linearisation([trial], np.zeros(0))
+    linearisation = plain_linearisation([trial], Priors.without_ranges(np.zeros(0)))
     return estimate_of_processes(linearisation, processes, processes), pattern[0]
 
 

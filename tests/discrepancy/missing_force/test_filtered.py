@@ -13,7 +13,7 @@ from discrepancy.estimation.filtered import FilteredTrial
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import plain_linearisation
 from discrepancy.estimation.linearised import LinearisedTrial
-from discrepancy.estimation.regression import Regression
+from discrepancy.estimation.regression import Priors, Regression
 from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.shares import _simulated_noise
@@ -31,6 +31,9 @@ from discrepancy.workflow import investigate
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import FEW
 
+NO_PRIORS = Priors.without_ranges(np.zeros(0))
+"""Of trials without shared unknowns."""
+
 
 def gaussian(covariance, readings):
     """Return the log evidence of readings but for a constant."""
@@ -40,7 +43,7 @@ def gaussian(covariance, readings):
 
 def alone(trial):
     """Return a trial without shared unknowns as one linear model."""
-    return plain_linearisation([trial], np.zeros(0))
+    return plain_linearisation([trial], NO_PRIORS)
 
 
 def filtered(trial, process):
@@ -166,7 +169,7 @@ def test_trials_tell_together_what_each_tells():
         )
         for _ in range(2)
     ]
-    together = plain_linearisation(trials, np.zeros(0)).solve({0: PROCESS}).log_evidence
+    together = plain_linearisation(trials, NO_PRIORS).solve({0: PROCESS}).log_evidence
     assert together == pytest.approx(sum(evidence(trial, PROCESS) for trial in trials), rel=1e-9)
 
 
@@ -307,7 +310,7 @@ def test_evidence_beside_unknowns_is_that_of_their_prior():
     random, precision = np.random.default_rng(2), np.array([4.0, 0.01])
     readings, columns = random.standard_normal(9), random.standard_normal((2, 9))
     rows = np.vstack((readings, columns))
-    found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
+    found = Regression(rows @ rows.T, 0.0).solve([0, 1], Priors.without_ranges(precision))
     covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
     assert found.log_evidence == pytest.approx(gaussian(covariance, readings))
 
@@ -542,7 +545,7 @@ def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channel
         trials[1], deviation=trials[1].deviation[::-1],
         system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
     )  # fmt: skip
-    forced = estimate_of_processes(plain_linearisation(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
+    forced = estimate_of_processes(plain_linearisation(trials, NO_PRIORS), {0: PROCESS}, {0: PROCESS})
     number, found = _port_or_channel_error(0, forced, names)
     shown = [trial.system.through[0] != 0.0 for trial in (item.trial for item in found.trials)]
     assert number == 0

@@ -20,6 +20,7 @@ from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.linearisation import plain_linearisation
 from discrepancy.estimation.log_prior import log_prior
 from discrepancy.estimation.ranking import rank_hypotheses
+from discrepancy.estimation.regression import Priors
 from discrepancy.estimation.screen import screen_effects
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
@@ -377,7 +378,7 @@ def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, numb
 
     # the readings of the linear trial by a unit of each shared unknown, along the forced motion
     added = here.state_under_force(0, forces[0])
-    bare = plain_linearisation([here], problem.shared.precision).trials[0]
+    bare = plain_linearisation([here], Priors.without_ranges(problem.shared.precision)).trials[0]
     trajectory = Trajectory(added, here.port_positions, here.port_speeds, forces)
     forced = replace(bare, trajectory=trajectory)
     changed = [k for k, item in enumerate(here.system_derivatives) if item is not None]
