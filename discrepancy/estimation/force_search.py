@@ -166,6 +166,15 @@ class ForceSearch:
                 self.prior_processes((port,)),
             )
 
+    @property
+    def has_channel_for_each_port(self) -> bool:
+        """Whether each trial has at least as many channels as there are ports.
+
+        Free forces at more ports than that fit any reading, whatever law acts at one of them.
+        """
+        trials = [self.problem.trials[number] for number in self.trial_indices]
+        return all(len(data.trial.channels) >= len(self.ports) for data in trials)
+
     # ---------------------------------------------------------------- where a force is missing
 
     def _most_probable_port(self) -> Estimate:

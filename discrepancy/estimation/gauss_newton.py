@@ -455,7 +455,10 @@ class GaussNewton:
         Estimate or None
             The estimate; None if its evidence is not finite.
         """
-        solution, smoothed_trials = linearisation.solve_and_smooth(start.processes)
+        try:
+            solution, smoothed_trials = linearisation.solve_and_smooth(start.processes)
+        except np.linalg.LinAlgError:  # along a motion that grows without bound
+            return None
         if not np.isfinite(solution.log_evidence):
             return None
         unknowns = solution.mean

@@ -269,7 +269,9 @@ class EffectLaws:
         trial = self.trials[arguments.trial_index]
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
-            return self.readings_change(arguments.trial_index, arguments.trajectory, term, values)
+            return self.readings_change(arguments.trial_index, explained, term, values)
+
+        explained = self._explained_trajectory(arguments)
 
         change = np.zeros_like(trial.residual)
         derivatives: dict[int, FloatArray] = {}
@@ -288,6 +290,24 @@ class EffectLaws:
                     )
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
+
+    def _explained_trajectory(self, arguments: LawArguments) -> Trajectory:
+        """Return the motion of a trial by the model and the laws, which errors of sensors act on.
+
+        The motion by missing forces is left out. It is estimated from the readings, so that its
+        product with an error would explain them by themselves.
+        """
+        trial = self.trials[arguments.trial_index]
+        forces = {port: force.force for port, force in self._checked_forces(arguments).items()}
+        added_state = np.zeros_like(arguments.trajectory.added_state)
+        for port, force in forces.items():
+            added_state += trial.state_under_force(port, force)
+        return Trajectory(
+            added_state,
+            positions=trial.port_positions + added_state @ trial.system.positions.T,
+            speeds=trial.port_speeds + added_state @ trial.system.speeds.T,
+            forces=forces,
+        )
 
     def readings_change(
         self, trial_index: int, trajectory: Trajectory, term: EffectTerm, values: FloatArray
