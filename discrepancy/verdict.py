@@ -9,6 +9,8 @@ from discrepancy.document import Number, Patch
 from reporting.notebook import html_table
 from reporting.words import between, brief, listing, rounded
 
+RATE_OF = "the rate of "
+"""How the name of an input's rate begins, among the variables that may order a missing force."""
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
 
@@ -288,7 +290,8 @@ class ForceAtPort:
         Correlation time of the force [s].
     orders : mapping of str to float
         Fraction of the force's variance that is explained by its mean at equal displacement,
-        velocity, amplitude or time, by the name of that variable [1].
+        velocity, amplitude, time, recorded input or rate of an input, by the name of that variable
+        [1].
     ordered_by : tuple of str
         Variables that explain the force about as well as the best one; empty if none explains it.
     law : str
@@ -323,7 +326,10 @@ class ForceAtPort:
         """What the force depends on, as a clause of a sentence."""
         if not self.ordered_by:
             return f"it follows none of {listing(self.orders)}"
-        return f"{self.followed_percent} % of its variance follows {listing(self.ordered_by)}"
+        clause = f"{self.followed_percent} % of its variance follows {listing(self.ordered_by)}"
+        if len(self.ordered_by) == 1 and self.ordered_by[0].startswith(RATE_OF):
+            return f"{clause}, as if it acted later or earlier than was recorded"
+        return clause
 
 
 @dataclass(frozen=True)

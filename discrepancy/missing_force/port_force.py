@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import DiscrepancyError
 from discrepancy.estimation.estimate import LEAST_EVIDENCE, Estimate
 from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
+from discrepancy.verdict import RATE_OF, ForceAtPort, ForceLeft, ForceMoment
 from reporting.arrays import LEAST_DIVISOR
 
 from .gap_share import GapShare
@@ -60,7 +60,11 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 
 
 def ordering_variables(
-    force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
+    force: FloatArray,
+    position: FloatArray,
+    speed: FloatArray,
+    time: FloatArray,
+    inputs: Mapping[str, FloatArray],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return the variables that order a force: the force is nearly a function of such a variable.
 
@@ -68,6 +72,9 @@ def ordering_variables(
     ----------
     force, position, speed, time : (N,) array
         The force, the motion of its port, and the time.
+    inputs : mapping of str to (N,) array
+        Recorded inputs and their rates, by name. A force follows an input if less of it acts than
+        was recorded, and the rate of an input if it acts later than recorded.
 
     Returns
     -------
@@ -88,6 +95,8 @@ def ordering_variables(
         "amplitude": explained_variance(amplitude, np.abs(force)),
         "time": explained_variance(time, force),
     }
+    for name, values in inputs.items():
+        shares[name] = explained_variance(values, force)
     least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
     return shares, tuple(name for name, share in shares.items() if share >= least_share)
 
@@ -107,6 +116,8 @@ class TrialForce:
         The times of the samples [s].
     position, speed : (N,) array
         The motion of the port [m or rad, and per s]; at a port of a state the speed is the state.
+    inputs : mapping of str to (N,) array
+        The recorded inputs and their rates, see `ordering_variables` [SI].
     force, deviation : (N,) array
         The smoothed force, and its posterior standard deviation [N, N m or the port's flow].
     law : (N,) array or None
@@ -117,6 +128,7 @@ class TrialForce:
     time: FloatArray
     position: FloatArray
     speed: FloatArray
+    inputs: Mapping[str, FloatArray]
     force: FloatArray
     deviation: FloatArray
     law: FloatArray | None
@@ -185,14 +197,17 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     law_name = " and ".join(
         term.name_in_words for term in estimate.candidate.terms if term.place == port
     )
-    trial_forces = _forces_by_trial(estimate, number, has_law=bool(law_name))
+    recorded = {trial.name: trial for trial in search.problem.campaign.trials}
+    trial_forces = _forces_by_trial(estimate, number, recorded, has_law=bool(law_name))
     unit, *_ = search.problem.model.port_units(port)
     correlation_time = estimate.processes[number].correlation_time
     force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
     return MissingForce(force, trial_forces, law_name)
 
 
-def _forces_by_trial(estimate: Estimate, port: int, *, has_law: bool) -> list[TrialForce]:
+def _forces_by_trial(
+    estimate: Estimate, port: int, recorded: Mapping[str, Trial], *, has_law: bool
+) -> list[TrialForce]:
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
     Parameters
@@ -201,6 +216,8 @@ def _forces_by_trial(estimate: Estimate, port: int, *, has_law: bool) -> list[Tr
         The estimate of a hypothesis, with the motion and the forces of each trial.
     port : int
         The index of the port among the ports of the model.
+    recorded : mapping of str to Trial
+        The trials as they were recorded, by name.
     has_law : bool
         Whether a law of the hypothesis acts at the port. The result then also tells how much of the
         force the law explains.
@@ -216,12 +233,28 @@ def _forces_by_trial(estimate: Estimate, port: int, *, has_law: bool) -> list[Tr
                 time=trial.time,
                 position=smoothed_trial.trajectory.positions[samples, port],
                 speed=smoothed_trial.trajectory.speeds[samples, port],
+                inputs=_inputs_and_rates(recorded[trial.name], trial.stride),
                 force=smoothed_trial.lacking_forces[port][samples],
                 deviation=smoothed_trial.missing_force_deviations[port][samples],
                 law=law_force,
             )
         )
     return trial_forces
+
+
+def _inputs_and_rates(trial: Trial, stride: int) -> dict[str, FloatArray]:
+    """Return what acted on a trial as it was recorded, and its rates, at every `stride`-th sample.
+
+    It is empty if nothing was recorded.
+    """
+    inputs = {f"the input {item.name!r}": item.values for item in trial.inputs}
+    if not inputs and np.any(trial.force):
+        inputs = {"the applied force": trial.force}
+    variables = {}
+    for name, values in inputs.items():
+        variables[name] = values[::stride]
+        variables[RATE_OF + name] = np.gradient(values, trial.time)[::stride]
+    return variables
 
 
 def _force_at_port(
@@ -251,7 +284,15 @@ def _force_at_port(
     position = np.concatenate([trial_force.position for trial_force in trial_forces])
     speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
     time = np.concatenate([trial_force.time for trial_force in trial_forces])
-    shares, ordered_by = ordering_variables(force, position, speed, time)
+    # an input that was not recorded in a trial did not act there
+    input_names = dict.fromkeys(name for trial in trial_forces for name in trial.inputs)
+    inputs = {
+        name: np.concatenate(
+            [trial.inputs.get(name, np.zeros_like(trial.force)) for trial in trial_forces]
+        )
+        for name in input_names
+    }
+    shares, ordered_by = ordering_variables(force, position, speed, time, inputs)
     # the trial and the sample with the largest force
     trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
     sample_of_largest = int(np.abs(trial_force.force).argmax())

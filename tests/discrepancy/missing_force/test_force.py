@@ -45,7 +45,7 @@ from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.costs import once
 from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
+from tests.discrepancy.rigs import FEW, asked, chosen, fmu_rig, hiding, integrated, one_mass, simulated
 from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
@@ -464,3 +464,39 @@ def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():
     assert explained_variance(x, x**3) > 0.9
     assert explained_variance(v, x**3) < 0.2
     assert explained_variance(np.zeros(400), x) == 0.0
+
+
+def clipped(force):
+    """Return what a saturating actuator makes of a recorded force."""
+    return np.clip(force, -4.0, 4.0)
+
+
+def late(force):
+    """Return a force that acts two samples later than it was recorded."""
+    return np.concatenate((np.zeros(2), force[:-2]))
+
+
+@pytest.mark.parametrize(
+    ("acting", "variable"),
+    [(clipped, "the applied force"), (late, "the rate of the applied force")],
+    ids=["saturates", "is late"],
+)
+def test_a_force_that_acts_otherwise_than_recorded_follows_the_input(acting, variable):
+    time = 0.005 * np.arange(500)
+    recorded = 5.0 * np.sin(12.0 * time) + 3.0 * np.sin(27.0 * time)
+    acts = acting(recorded)
+
+    def rate(now, state):
+        return [state[1], (np.interp(now, time, acts) - 1.6 * state[1] - 800.0 * state[0]) / 2.0]
+
+    noise = 1e-5
+    x = integrated(rate, time, [0.0, 0.0], max_step=0.005)[:, :1]
+    x = x + noise * np.random.default_rng(5).standard_normal(x.shape)
+    trial = asked(TrialKind.FORCED, time, channels=("x",), values=x, force=recorded, load_place="push")
+    channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(noise, 400.0))
+    model = one_mass(stiffness=800.0, damping={"matrix": 1.6})
+    problem = problem_of(Campaign("driven", {"x": channel}, (trial,), None, {}, ""), model)
+    search = ForceSearch(problem)
+    told = missing_force(search, search.best_port_estimate).at_port
+    assert told.ordered_by == (variable,)
+    assert told.orders[variable] > 0.6
