@@ -29,8 +29,9 @@ from benchmarks.unlisted_laws.kinds import KINDS, Kind
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
+from discrepancy.missing_force.port_force import missing_force
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind, effect_label
-from discrepancy.workflow import investigate
+from discrepancy.workflow import Investigation, investigate
 
 NAMING = (
     VerdictKind.NAMED,
@@ -59,7 +60,15 @@ def judge(out: Path, seed: int, name: str) -> dict[str, Any]:
         seconds = time.process_time() - began
         return facts | error_row(error) | {"seconds": seconds}
     seconds = time.process_time() - began
-    return facts | verdict_row(experiment.kind, investigation.verdict) | {"seconds": seconds}
+    told = variables_told(investigation)
+    return facts | verdict_row(experiment.kind, investigation.verdict, told) | {"seconds": seconds}
+
+
+def variables_told(investigation: Investigation) -> tuple[str, ...]:
+    """Return the variables that the missing force follows, as a sentence without a name tells."""
+    search = investigation.search.force_search if investigation.search else None
+    missing = missing_force(search, search.best_port_estimate) if search else None
+    return missing.at_port.ordered_by if missing else ()
 
 
 def error_row(error: DiscrepancyError) -> dict[str, Any]:
@@ -70,14 +79,15 @@ def error_row(error: DiscrepancyError) -> dict[str, Any]:
         "right": [],
         "family": "",
         "probability": None,
+        "told": [],
         "outcome": "no name",
         "hypotheses": [],
         "sentence": str(error),
     }
 
 
-def verdict_row(kind: Kind, verdict: Verdict) -> dict[str, Any]:
-    """Return a verdict on a campaign of a kind, and its outcome."""
+def verdict_row(kind: Kind, verdict: Verdict, told: tuple[str, ...]) -> dict[str, Any]:
+    """Return a verdict on a campaign of a kind, with the variables told, and its outcome."""
     effects = [
         effect_label(effect.identifier, effect.place, free_shape=bool(effect.shape))
         for effect in verdict.effects
@@ -96,7 +106,12 @@ def verdict_row(kind: Kind, verdict: Verdict) -> dict[str, Any]:
         "family": verdict.family,
         "probability": None if math.isnan(verdict.probability) else verdict.probability,
         "right": right,
-        "outcome": outcome_of(verdict.kind, is_right=bool(right)),
+        "told": list(told),
+        "outcome": outcome_of(
+            verdict.kind,
+            is_right=bool(right),
+            is_told_right=bool(told) and all(name.startswith(kind.variables) for name in told),
+        ),
         "hypotheses": hypotheses,
         "sentence": verdict.sentence,
     }
@@ -112,19 +127,24 @@ def has_right_dependence(kind: Kind, effect: NamedEffect) -> bool:
     return effect_label(effect.identifier, effect.place) in kind.effects
 
 
-def outcome_of(verdict: VerdictKind, *, is_right: bool) -> str:
-    """Return "no name", "dependence" if one of the names has the right one, or "false name"."""
+def outcome_of(verdict: VerdictKind, *, is_right: bool, is_told_right: bool) -> str:
+    """Return "dependence" if that is right, "false name", or "no name".
+
+    The dependence is right if that of one of the names is, or without a name, if the missing force
+    is said to follow the right variable.
+    """
     if verdict not in NAMING:
-        return "no name"
+        return "dependence" if is_told_right else "no name"
     return "dependence" if is_right else "false name"
 
 
 def line_of(row: Mapping[str, Any]) -> str:
     """Return the line that is printed for a campaign."""
     probability = "-" if row["probability"] is None else f"{row['probability']:.5f}"
+    names = ", ".join(row["effects"]) or f"follows {' and '.join(row['told'])}"
     return (
         f"{row['kind']:19s} gap {row['gap']:4.1f}  {row['verdict']:14s} "
-        f"{', '.join(row['effects']) or '-':40s} P {probability:7s} "
+        f"{names:40s} P {probability:7s} "
         f"family {row['family'] or '-'}  {row['outcome'].upper():10s} "
         f"{row['seconds']:4.0f} s  {row['sentence']}"
     )
@@ -135,8 +155,12 @@ def print_counts(rows: Sequence[Mapping[str, Any]]) -> None:
     false_names = [row for row in rows if row["outcome"] == "false name"]
     right = [row for row in rows if row["outcome"] == "dependence"]
     with_others = sum(len(row["right"]) < len(row["effects"]) for row in right)
+    without_name = sum(not row["effects"] for row in right)
     print(f"false names: {len(false_names)} of {len(rows)}")
-    print(f"dependence right: {len(right)} of {len(rows)}, {with_others} with other names beside")
+    print(
+        f"dependence right: {len(right)} of {len(rows)}, {with_others} with other names beside, "
+        f"{without_name} without a name"
+    )
     for row in false_names:
         if row["probability"] is not None and row["probability"] > NEARLY_CERTAIN:
             print(

@@ -25,6 +25,9 @@ class Kind:
         Effects of the right dependence, as "effect@place".
     families : frozenset of str
         Families of the right dependence.
+    variables : tuple of str
+        How the names of the variables begin that the missing force follows if it is told right
+        without a name.
     reason : str
         Why these depend on the same, and what no effect of the catalogue has.
     has_releases : bool
@@ -38,6 +41,7 @@ class Kind:
     largest: float
     effects: frozenset[str]
     families: frozenset[str]
+    variables: tuple[str, ...]
     reason: str
     has_releases: bool = True
     has_accelerometer: bool = False
@@ -53,6 +57,7 @@ KINDS = {
             {"cubic_stiffness@mass", "free_play@mass", "breathing_crack@mass, open at negative x"}
         ),
         OF_DISPLACEMENT,
+        ("displacement",),
         "A force of the displacement that is stiffer far out, or at positive x. No effect has a "
         "spring beyond a gap on one side.",
     ),
@@ -62,6 +67,7 @@ KINDS = {
         0.06,
         frozenset({"cubic_stiffness@mass", "breathing_crack@mass, open at positive x"}),
         frozenset({"stiffness |x|^n, one- or two-sided"}),
+        ("displacement",),
         "A force of the displacement that is softer at positive x. A gap (free play) is softer "
         "around rest and stiffer far out, on both sides alike. No effect grows towards a pole.",
     ),
@@ -71,6 +77,7 @@ KINDS = {
         0.7,
         frozenset({"stiffness_drift@"}),
         frozenset({"time variation"}),
+        ("time",),
         "The stiffness depends on the time in the record. The catalogue has a steady drift; it has "
         "no loss from an unknown moment on, because an effect in a window needs an event.",
     ),
@@ -80,6 +87,7 @@ KINDS = {
         0.1,
         frozenset({"coulomb_friction@mass"}),
         frozenset({"damping |v|^p |x|^a"}),
+        ("velocity",),
         "Friction that depends on the direction of the velocity. In the catalogue it does not fall "
         "with the speed, since exponents below 0 count as 0; quadratic damping is the opposite.",
     ),
@@ -96,6 +104,7 @@ KINDS = {
             }
         ),
         OF_DISPLACEMENT | {"damping |v|^p |x|^a"},
+        ("displacement",),
         "A spring of the displacement, as for the stop, and a loss that needs displacement and "
         "velocity, as structural damping and its family. No effect has both beyond a gap.",
     ),
@@ -105,6 +114,7 @@ KINDS = {
         2.0,
         frozenset({"joint_micro_slip@mass", "bouc_wen_hysteresis@mass"}),
         frozenset({"rate-independent hysteresis"}),
+        ("the displacement relaxed",),
         "The force depends on the past displacement. Hysteresis of the catalogue has sliders in "
         "the place of the damper, so that it depends on amplitude and not on rate; damping has no "
         "memory.",
@@ -115,6 +125,7 @@ KINDS = {
         0.5,
         frozenset({"gauge_gain@acceleration"}),
         frozenset({"sensor gain"}),
+        (),
         "An error of the second reading alone that is proportional to the motion. No effect has "
         "one channel in the reading of another; near resonance both are nearly proportional.",
         has_releases=False,
@@ -126,6 +137,7 @@ KINDS = {
         0.8,
         frozenset({"load_cell@"}),
         frozenset({"load"}),
+        ("the applied force", "the input"),
         "The error of the force depends on the command. The catalogue has a gain and a constant of "
         "the force; its saturation is that of a sensor.",
         has_releases=False,
@@ -136,6 +148,7 @@ KINDS = {
         10.0,
         frozenset({"sensor_lag@displacement", "clock_error@"}),
         frozenset({"sensor lag"}),
+        ("the rate of",),
         "The motion lags behind the command. With one force from rest a lag of all channels is the "
         "very same, and is in the catalogue; so a second recorded force acts without delay. A "
         "clock error has a time zero of all readings.",
@@ -148,6 +161,7 @@ KINDS = {
         0.3,
         frozenset({"stiffness_drift@"}),
         frozenset({"time variation"}),
+        ("time",),
         "The stiffness depends on the time in the record. The catalogue has a steady drift alone.",
     ),
 }

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import DiscrepancyError
@@ -29,6 +30,8 @@ LEAST_ORDER = 0.3
 """Least share of a force's variance that a variable explains if it orders the force."""
 TIED_SHARE = 0.05
 """Difference of these shares up to which two variables order a force equally well."""
+RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
+"""Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
 
 # ---------------------------------------------------------------- variables that order a force
@@ -99,6 +102,26 @@ def ordering_variables(
         shares[name] = explained_variance(values, force)
     least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
     return shares, tuple(name for name, share in shares.items() if share >= least_share)
+
+
+def relaxed_displacement(time: FloatArray, speed: FloatArray, relaxation_time: float) -> FloatArray:
+    """Return the elongation (N,) of a spring in series with a damper, z' = v - z / relaxation_time.
+
+    It is the displacement for a long relaxation time, and proportional to the speed for a short
+    one. In between it depends on the history of the motion.
+
+    Parameters
+    ----------
+    time, speed : (N,) array
+        The times of the samples [s], and the speed at them.
+    relaxation_time : float
+        The ratio of damping and stiffness [s].
+    """
+    steps = np.linspace(time[0], time[-1], len(time))
+    decay = float(np.exp(-(steps[1] - steps[0]) / relaxation_time))
+    speed_at_steps = np.interp(steps, time, speed)
+    relaxed = lfilter([relaxation_time * (1.0 - decay)], [1.0, -decay], speed_at_steps)
+    return np.asarray(np.interp(time, steps, relaxed))
 
 
 # ---------------------------------------------------------------- the missing force at a port
@@ -292,7 +315,9 @@ def _force_at_port(
         )
         for name in input_names
     }
-    shares, ordered_by = ordering_variables(force, position, speed, time, inputs)
+    others, _ = ordering_variables(force, position, speed, time, inputs)
+    history = _history_of_motion(trial_forces, least_share=max(others.values()) + TIED_SHARE)
+    shares, ordered_by = ordering_variables(force, position, speed, time, inputs | history)
     # the trial and the sample with the largest force
     trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
     sample_of_largest = int(np.abs(trial_force.force).argmax())
@@ -316,6 +341,35 @@ def _force_at_port(
         ordered_by=ordered_by,
         law=law_name,
     )
+
+
+def _history_of_motion(
+    trial_forces: Sequence[TrialForce], least_share: float
+) -> dict[str, FloatArray]:
+    """Return the relaxed displacement that orders a force best, by its name.
+
+    It is left out unless it orders the force better than all variables without memory, to which
+    short and long relaxation times come near.
+
+    Parameters
+    ----------
+    trial_forces : sequence of TrialForce
+        The force in each trial.
+    least_share : float
+        The share of the force's variance that it must explain.
+    """
+    force = np.concatenate([trial.force for trial in trial_forces])
+    interval = min(float(np.median(np.diff(trial.time))) for trial in trial_forces)
+    best: dict[str, FloatArray] = {}
+    for relaxation_time in interval * RELAXATION_TIMES:
+        relaxed = np.concatenate(
+            [relaxed_displacement(item.time, item.speed, relaxation_time) for item in trial_forces]
+        )
+        share = explained_variance(relaxed, force)
+        if share > least_share:
+            least_share = share
+            best = {f"the displacement relaxed within {relaxation_time:.2g} s": relaxed}
+    return best
 
 
 def _rms(values: FloatArray) -> float:

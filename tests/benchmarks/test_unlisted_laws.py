@@ -113,4 +113,18 @@ def _effect(identifier: str, place: str = "mass", *, free_shape: bool = False) -
 )
 def test_what_a_name_is_worth_for_a_stop(kind, effects, outcome):
     verdict = Verdict(VerdictKind(kind), "", 1.0, 10.0, effects=tuple(effects))
-    assert verdict_row(KINDS["one-sided stop"], verdict)["outcome"] == outcome
+    assert verdict_row(KINDS["one-sided stop"], verdict, ())["outcome"] == outcome
+
+
+@pytest.mark.parametrize(
+    ("told", "outcome"),
+    [
+        (("displacement",), "dependence"),
+        (("displacement", "time"), "no name"),
+        (("velocity",), "no name"),
+        ((), "no name"),
+    ],
+)
+def test_what_a_variable_that_is_told_without_a_name_is_worth_for_a_stop(told, outcome):
+    verdict = Verdict(VerdictKind.UNEXPLAINED, "", 1.0, 10.0)
+    assert verdict_row(KINDS["one-sided stop"], verdict, told)["outcome"] == outcome

@@ -28,7 +28,7 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.missing_force.port_force import explained_variance, missing_force
+from discrepancy.missing_force.port_force import explained_variance, missing_force, relaxed_displacement
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
@@ -466,6 +466,27 @@ def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():
     assert explained_variance(np.zeros(400), x) == 0.0
 
 
+def missing_beside_spring(rate, first, force):
+    """Return the force that is missing on a mass of 2 kg on 800 N/m, whose true motion has a rate.
+
+    The rate is a function of time and state; the state begins with the displacement.
+    """
+    time = 0.005 * np.arange(len(force))
+    noise = 1e-5
+    x = integrated(rate, time, first, max_step=0.005)[:, :1]
+    x = x + noise * np.random.default_rng(5).standard_normal(x.shape)
+    trial = asked(TrialKind.FORCED, time, channels=("x",), values=x, force=force, load_place="push")
+    channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(noise, 400.0))
+    model = one_mass(stiffness=800.0, damping={"matrix": 1.6})
+    problem = problem_of(Campaign("driven", {"x": channel}, (trial,), None, {}, ""), model)
+    search = ForceSearch(problem)
+    return missing_force(search, search.best_port_estimate).at_port
+
+
+TIME_OF_DRIVE = 0.005 * np.arange(600)
+RECORDED = 5.0 * np.sin(12.0 * TIME_OF_DRIVE) + 3.0 * np.sin(27.0 * TIME_OF_DRIVE)
+
+
 def clipped(force):
     """Return what a saturating actuator makes of a recorded force."""
     return np.clip(force, -4.0, 4.0)
@@ -482,21 +503,32 @@ def late(force):
     ids=["saturates", "is late"],
 )
 def test_a_force_that_acts_otherwise_than_recorded_follows_the_input(acting, variable):
-    time = 0.005 * np.arange(500)
-    recorded = 5.0 * np.sin(12.0 * time) + 3.0 * np.sin(27.0 * time)
-    acts = acting(recorded)
+    acts = acting(RECORDED)
 
     def rate(now, state):
-        return [state[1], (np.interp(now, time, acts) - 1.6 * state[1] - 800.0 * state[0]) / 2.0]
+        x, v = state
+        return [v, (np.interp(now, TIME_OF_DRIVE, acts) - 1.6 * v - 800.0 * x) / 2.0]
 
-    noise = 1e-5
-    x = integrated(rate, time, [0.0, 0.0], max_step=0.005)[:, :1]
-    x = x + noise * np.random.default_rng(5).standard_normal(x.shape)
-    trial = asked(TrialKind.FORCED, time, channels=("x",), values=x, force=recorded, load_place="push")
-    channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(noise, 400.0))
-    model = one_mass(stiffness=800.0, damping={"matrix": 1.6})
-    problem = problem_of(Campaign("driven", {"x": channel}, (trial,), None, {}, ""), model)
-    search = ForceSearch(problem)
-    told = missing_force(search, search.best_port_estimate).at_port
+    told = missing_beside_spring(rate, [0.0, 0.0], RECORDED)
     assert told.ordered_by == (variable,)
     assert told.orders[variable] > 0.6
+
+
+def test_a_spring_behind_a_damper_follows_the_relaxed_displacement():
+    """A Maxwell branch of 60 N/m that relaxes within 0.05 s."""
+
+    def rate(now, state):
+        x, v, z = state
+        force = np.interp(now, TIME_OF_DRIVE, RECORDED)
+        return [v, (force - 1.6 * v - 800.0 * x - 60.0 * z) / 2.0, v - z / 0.05]
+
+    told = missing_beside_spring(rate, [0.0, 0.0, 0.0], RECORDED)
+    (variable,) = told.ordered_by
+    assert variable.startswith("the displacement relaxed within 0.0")
+    assert told.orders[variable] > 0.9
+
+
+def test_a_relaxed_displacement_is_that_of_the_closed_form():
+    time = np.linspace(0.0, 2.0, 20001)
+    relaxed = relaxed_displacement(time, np.ones_like(time), 0.3)
+    assert relaxed[1:] == pytest.approx(0.3 * (1.0 - np.exp(-time[1:] / 0.3)), rel=2e-3, abs=2e-4)
