@@ -60,11 +60,13 @@ def judge(out: Path, seed: int, name: str) -> dict[str, Any]:
         seconds = time.process_time() - began
         return facts | error_row(error) | {"seconds": seconds}
     seconds = time.process_time() - began
-    told = variables_told(investigation)
-    return facts | verdict_row(experiment.kind, investigation.verdict, told) | {"seconds": seconds}
+    followed = followed_variables(investigation)
+    return (
+        facts | verdict_row(experiment.kind, investigation.verdict, followed) | {"seconds": seconds}
+    )
 
 
-def variables_told(investigation: Investigation) -> tuple[str, ...]:
+def followed_variables(investigation: Investigation) -> tuple[str, ...]:
     """Return the variables that the missing force follows, as a sentence without a name tells."""
     search = investigation.search.force_search if investigation.search else None
     missing = missing_force(search, search.best_port_estimate) if search else None
@@ -79,15 +81,15 @@ def error_row(error: DiscrepancyError) -> dict[str, Any]:
         "right": [],
         "family": "",
         "probability": None,
-        "told": [],
+        "follows": [],
         "outcome": "no name",
         "hypotheses": [],
         "sentence": str(error),
     }
 
 
-def verdict_row(kind: Kind, verdict: Verdict, told: tuple[str, ...]) -> dict[str, Any]:
-    """Return a verdict on a campaign of a kind, with the variables told, and its outcome."""
+def verdict_row(kind: Kind, verdict: Verdict, followed: tuple[str, ...]) -> dict[str, Any]:
+    """Return a verdict on a campaign, the variables that the force follows, and its outcome."""
     effects = [
         effect_label(effect.identifier, effect.place, free_shape=bool(effect.shape))
         for effect in verdict.effects
@@ -106,11 +108,12 @@ def verdict_row(kind: Kind, verdict: Verdict, told: tuple[str, ...]) -> dict[str
         "family": verdict.family,
         "probability": None if math.isnan(verdict.probability) else verdict.probability,
         "right": right,
-        "told": list(told),
+        "follows": list(followed),
         "outcome": outcome_of(
             verdict.kind,
             is_right=bool(right),
-            is_told_right=bool(told) and all(name.startswith(kind.variables) for name in told),
+            follows_right=bool(followed)
+            and all(name.startswith(kind.variables) for name in followed),
         ),
         "hypotheses": hypotheses,
         "sentence": verdict.sentence,
@@ -127,24 +130,24 @@ def has_right_dependence(kind: Kind, effect: NamedEffect) -> bool:
     return effect_label(effect.identifier, effect.place) in kind.effects
 
 
-def outcome_of(verdict: VerdictKind, *, is_right: bool, is_told_right: bool) -> str:
+def outcome_of(verdict: VerdictKind, *, is_right: bool, follows_right: bool) -> str:
     """Return "dependence" if that is right, "false name", or "no name".
 
     The dependence is right if that of one of the names is, or without a name, if the missing force
     is said to follow the right variable.
     """
     if verdict not in NAMING:
-        return "dependence" if is_told_right else "no name"
+        return "dependence" if follows_right else "no name"
     return "dependence" if is_right else "false name"
 
 
 def line_of(row: Mapping[str, Any]) -> str:
     """Return the line that is printed for a campaign."""
     probability = "-" if row["probability"] is None else f"{row['probability']:.5f}"
-    names = ", ".join(row["effects"]) or f"follows {' and '.join(row['told'])}"
+    explanation = ", ".join(row["effects"]) or f"follows {' and '.join(row['follows'])}"
     return (
         f"{row['kind']:19s} gap {row['gap']:4.1f}  {row['verdict']:14s} "
-        f"{names:40s} P {probability:7s} "
+        f"{explanation:40s} P {probability:7s} "
         f"family {row['family'] or '-'}  {row['outcome'].upper():10s} "
         f"{row['seconds']:4.0f} s  {row['sentence']}"
     )

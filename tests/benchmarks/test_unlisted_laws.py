@@ -117,7 +117,7 @@ def test_what_a_name_is_worth_for_a_stop(kind, effects, outcome):
 
 
 @pytest.mark.parametrize(
-    ("told", "outcome"),
+    ("followed", "outcome"),
     [
         (("displacement",), "dependence"),
         (("displacement", "time"), "no name"),
@@ -125,6 +125,6 @@ def test_what_a_name_is_worth_for_a_stop(kind, effects, outcome):
         ((), "no name"),
     ],
 )
-def test_what_a_variable_that_is_told_without_a_name_is_worth_for_a_stop(told, outcome):
+def test_what_a_variable_that_the_force_follows_is_worth_for_a_stop(followed, outcome):
     verdict = Verdict(VerdictKind.UNEXPLAINED, "", 1.0, 10.0)
-    assert verdict_row(KINDS["one-sided stop"], verdict, told)["outcome"] == outcome
+    assert verdict_row(KINDS["one-sided stop"], verdict, followed)["outcome"] == outcome
