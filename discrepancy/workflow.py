@@ -213,7 +213,14 @@ def investigate(
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            windows = gap_windows(problem, fit, before, seed=seed)
+            estimate = search.estimate_of(fit.candidate)
+            windows = gap_windows(
+                problem,
+                fit,
+                before,
+                leaves_no_force=estimate is not None and estimate.leaves_no_force,
+                seed=seed,
+            )
             if after is not before:
                 windows += windows_of_residuals(after, seed=seed, with_effect=True)
             windows = add_window_sizes(windows, before, after)
@@ -222,7 +229,7 @@ def investigate(
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
         with stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
-                problem, search.force_search, search.force_estimates, fit
+                problem, search.force_search, search.estimate_of(fit.candidate), fit
             )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.estimation.estimate import LEAST_EVIDENCE
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import Linearisation
 from discrepancy.estimation.process_search import (
@@ -43,8 +44,6 @@ INITIAL_EVENT_DEVIATION, INITIAL_STEADY_DEVIATION = 3.0, 0.003
 given process."""
 NEGLIGIBLE_DEVIATION = 1e-3
 """Standard deviation that stands for no force, over that of the given process."""
-LEAST_EVIDENCE = 3.0
-"""Log evidence over no missing force [nat] from which on there is one in a record."""
 FIRST_EVALUATIONS, LATER_EVALUATIONS = 30, 60
 """Numbers of evaluations of the evidence in the first fit of the forces, and in later fits."""
 MOST_ROUNDS = 5
@@ -274,11 +273,10 @@ def find_events(
         The events with changes if these are more probable than `least_score` and than a force that
         acts throughout the records that have one; otherwise such a force.
     """
-    sample_count = sum(len(trial.trial.time) for trial in linearisation.trials)
-    stride = ceil(sample_count / MOST_SAMPLES)
+    stride = _stride_of_search(linearisation)
     search = EventSearch(linearisation, port, process, stride=stride)
     always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
-    steady = _steady_force_where_needed(search, always_off)
+    steady = force_in_records(linearisation, port, process)
     # stretches with a large force that may jump, besides a small force throughout
     event_deviation = INITIAL_EVENT_DEVIATION * process.standard_deviation
     steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
@@ -294,11 +292,35 @@ def find_events(
         best_events = next_events
     if stride > 1:
         best_events = _refine_to_all_samples(best_events, stride)
-        steady = _refine_to_all_samples(steady, stride)
     has_changes = any(len(change_samples(is_on)) for is_on in best_events.paths)
     if has_changes and best_events.score > max(least_score, steady.score):
         return best_events
     return steady
+
+
+def force_in_records(linearisation: Linearisation, port: int, process: Process) -> Events:
+    """Return a force that acts throughout the records that have one.
+
+    Parameters
+    ----------
+    linearisation : Linearisation
+        The trials with the columns of all unknowns, without laws.
+    port : int
+        The number of the port.
+    process : Process
+        A force that acts throughout.
+    """
+    stride = _stride_of_search(linearisation)
+    search = EventSearch(linearisation, port, process, stride=stride)
+    always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
+    steady = _steady_force_where_needed(search, always_off)
+    return _refine_to_all_samples(steady, stride) if stride > 1 else steady
+
+
+def _stride_of_search(linearisation: Linearisation) -> int:
+    """Return of how many samples one is taken, so that all together are `MOST_SAMPLES` at most."""
+    sample_count = sum(len(trial.trial.time) for trial in linearisation.trials)
+    return ceil(sample_count / MOST_SAMPLES)
 
 
 def events_throughout(linearisation: Linearisation, port: int, process: Process) -> Events:

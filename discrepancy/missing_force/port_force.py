@@ -380,7 +380,7 @@ def _rms(values: FloatArray) -> float:
 def missing_force_of_verdict(
     problem: Problem,
     search: ForceSearch | None,
-    estimates: Sequence[Estimate],
+    estimate: Estimate | None,
     fit: CandidateFit,
 ) -> MissingForce | None:
     """Return the missing force for a verdict, with the share of it that its law explains.
@@ -391,8 +391,8 @@ def missing_force_of_verdict(
         The campaign and the model, with the layout of their unknowns.
     search : ForceSearch or None
         The search for the missing force, if there was one.
-    estimates : sequence of Estimate
-        The hypotheses that were fitted to the missing force.
+    estimate : Estimate or None
+        The estimate of the effects of the verdict. If there is none, they are estimated now.
     fit : CandidateFit
         The fit of the verdict.
 
@@ -409,7 +409,10 @@ def missing_force_of_verdict(
         if not can_estimate_forces(problem) or (terms and not laws):
             return None
         search = search or ForceSearch(problem)
-        estimate = _estimate_of_fit(search, estimates, fit)
+        if terms and estimate is None:
+            estimate = search.estimate_effects(
+                search.estimate_without_effects, fit.candidate, fit.point.effect
+            )
         force = missing_force(search, estimate or search.estimate_without_effects)
     except ESTIMATION_ERRORS:
         return None
@@ -428,34 +431,6 @@ def missing_force_of_verdict(
         fitted_remainder = _remaining_force(shares.gap_share(estimate, held_out=False))
         at_port = replace(at_port, fitted=fitted_remainder, held_out=held_out)
     return replace(force, at_port=at_port)
-
-
-def _estimate_of_fit(
-    search: ForceSearch, estimates: Sequence[Estimate], fit: CandidateFit
-) -> Estimate | None:
-    """Return the estimate of the effects of a fit, from the missing force.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search for the missing force.
-    estimates : sequence of Estimate
-        The hypotheses that were estimated already; if none has these effects, one is estimated now.
-    fit : CandidateFit
-        A fit by simulation.
-
-    Returns
-    -------
-    Estimate or None
-        The estimate; None if the fit has no effects, or if their forces cannot be computed from
-        the motion that the readings show.
-    """
-    for estimate in estimates:
-        if estimate.candidate.key == fit.candidate.key:
-            return estimate
-    if not fit.candidate.terms:
-        return None
-    return search.estimate_effects(search.estimate_without_effects, fit.candidate, fit.point.effect)
 
 
 def _remaining_force(share: GapShare) -> ForceLeft:

@@ -28,7 +28,7 @@ from discrepancy.system.response import PortedSystem
 from discrepancy.trials_in_motion.trial import PortedTrial
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import LEAST_EVIDENCE, MOST_EVENTS, Events, events_throughout, find_events
+from .events import MOST_EVENTS, Events, events_throughout, find_events, force_in_records
 from .switched_record import change_samples
 
 TIMED_KINDS = frozenset(TrialKind) - {TrialKind.STATIC}
@@ -44,7 +44,12 @@ CHANNEL_ERROR_TIMES = (0.02, 0.3)
 
 
 def gap_windows(
-    problem: Problem, fit: CandidateFit, residuals: ResidualSet, *, seed: int = 0
+    problem: Problem,
+    fit: CandidateFit,
+    residuals: ResidualSet,
+    *,
+    leaves_no_force: bool = False,
+    seed: int = 0,
 ) -> tuple[GapWindow, ...]:
     """Return the windows in which the unchanged model has a gap, in held-out records too.
 
@@ -58,6 +63,9 @@ def gap_windows(
     residuals : ResidualSet
         The residuals of the unchanged model. They alone are examined if missing forces cannot be
         estimated, or if the model has laws of its own, which are exact only in a simulation.
+    leaves_no_force : bool
+        Whether no force is missing beside the effects of this fit, which act throughout: events
+        need not be looked for then.
     seed : int
         The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
         the noise that the fit has absorbed.
@@ -69,7 +77,9 @@ def gap_windows(
     if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
         return windows_of_residuals(residuals, seed=seed)
     try:
-        windows = _windows_of_missing_force(problem.with_trials(dynamic_trials), fit)
+        windows = _windows_of_missing_force(
+            problem.with_trials(dynamic_trials), fit, leaves_no_force=leaves_no_force
+        )
     # windows are an addition to the verdict: if the force cannot be estimated, use the residuals
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):
         return windows_of_residuals(residuals, seed=seed)
@@ -77,7 +87,9 @@ def gap_windows(
     return windows + windows_of_residuals(residuals, seed=seed, kinds=flight)
 
 
-def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
+def _windows_of_missing_force(
+    problem: Problem, fit: CandidateFit, *, leaves_no_force: bool
+) -> tuple[GapWindow, ...]:
     """Return the windows in which a force is missing at the port with the most evidence.
 
     If an error of a channel is more probable, they are the windows of that error.
@@ -88,19 +100,24 @@ def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapW
         The campaign and model, with the dynamic trials.
     fit : CandidateFit
         The fit of the verdict.
+    leaves_no_force : bool
+        Whether no force is missing beside its effects.
     """
     search = ForceSearch(problem)
     port = max(search.estimate_by_port, key=lambda name: search.estimate_by_port[name].log_evidence)
-    evidence_of_law = _evidence_of_law(search, port, fit)
     channels_by_trial = [data.trial.channels for data in problem.trials]
     port_number, estimate = _port_or_channel_error(
         search.ports.index(port), search.estimate_with_jumps(port), channels_by_trial
     )
     # no windows without a missing force
-    if estimate.log_evidence < estimate.log_evidence_without_force + LEAST_EVIDENCE:
+    if estimate.leaves_no_force:
         return ()
     process = estimate.processes[port_number]
-    best_events = find_events(estimate.linearisation, port_number, process, evidence_of_law)
+    if leaves_no_force:
+        best_events = force_in_records(estimate.linearisation, port_number, process)
+    else:
+        evidence_of_law = _evidence_of_law(search, port, fit)
+        best_events = find_events(estimate.linearisation, port_number, process, evidence_of_law)
     # the part of the readings that the force causes gives the size of each window
     readings_by_force = []
     for smoothed_trial in estimate.trials:
@@ -172,7 +189,7 @@ def windows_of_residuals(
         estimate, pattern = strongest_pattern(
             trial.name, trial.time, white_residuals, fitted_trial.used
         )
-        if estimate.log_evidence < estimate.log_evidence_without_force + LEAST_EVIDENCE:
+        if estimate.leaves_no_force:
             continue
         process = estimate.processes[0]
         try:

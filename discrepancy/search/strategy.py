@@ -77,6 +77,11 @@ class Search(FittedCandidates):
             self.on_progress(f"the missing force cannot be estimated: {cause}")
             return None
 
+    def estimate_of(self, candidate: Candidate) -> Estimate | None:
+        """Return the estimate of a set of effects with the missing force; None without one."""
+        estimates = (item for item in self.force_estimates if item.candidate.key == candidate.key)
+        return next(estimates, None)
+
     # ---------------------------------------------------------------- rough fits of one more effect
 
     def fit_one_more_effect(
