@@ -167,12 +167,9 @@ class MotionEstimator:
         Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        followed_estimate = self.follow_laws(laws, replace(start, processes=self.small_processes))
-        if followed_estimate is not None and followed_estimate.leaves_no_force:
-            return followed_estimate
         estimate = self._estimate_with_smaller_forces(laws, start, speed_window)
         if estimate is None:
-            return followed_estimate
+            return self.follow_laws(laws, replace(start, processes=self.small_processes))
         tuned_estimate = self.tune_processes(laws, estimate)
         next_start = replace(start_from_estimate(tuned_estimate), processes=self.small_processes)
         return _more_probable(tuned_estimate, self.follow_laws(laws, next_start))
@@ -210,7 +207,12 @@ class MotionEstimator:
         return best_estimate
 
     def polish(
-        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
+        self,
+        laws: HypothesisLaws,
+        start: EstimatorStart,
+        speed_window: float,
+        *,
+        may_follow_laws: bool = True,
     ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are nearly these.
 
@@ -224,13 +226,15 @@ class MotionEstimator:
             The values, trajectories and missing forces to begin with.
         speed_window : float
             The half width of the window of speeds, see `LawArguments`.
+        may_follow_laws : bool
+            Whether an estimate along the motion of the laws alone is made, too.
 
         Returns
         -------
         Estimate or None
             The estimate; None if the laws are not possible along the trajectories.
         """
-        followed_estimate = self.follow_laws(laws, start)
+        followed_estimate = self.follow_laws(laws, start) if may_follow_laws else None
         if followed_estimate is not None and followed_estimate.leaves_no_force:
             return followed_estimate
         smallest_window = NARROWEST_WINDOW if laws.hold_at_rest else USUAL_WINDOW

@@ -39,6 +39,9 @@ MOST_LINEARISATIONS = 3
 SAME_POINT = 0.1
 """Change of all shared unknowns, in prior standard deviations, below which the trials are not
 linearised again."""
+LARGEST_LINEAR_ERROR = 0.1
+"""Share of the missing force that may be there because trials are linear about other parameters.
+What is larger is not removed by another linearisation."""
 WIDE_WINDOW = 0.1
 """Half width of the window of speeds where the model's own laws are linear along a first motion."""
 
@@ -428,11 +431,20 @@ class ForceSearch:
             The values to begin with.
         """
         estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
-        if estimate is not None:
-            estimate = self.estimate_about_own_values(estimate)
-            if estimate.leaves_no_force:
-                return estimate
-        return None
+        if estimate is None or self._share_of_missing_force(estimate) > LARGEST_LINEAR_ERROR:
+            return None
+        estimate = self.estimate_about_own_values(estimate)
+        return estimate if estimate.leaves_no_force else None
+
+    def _share_of_missing_force(self, estimate: Estimate) -> float:
+        """Return the missing force beside a hypothesis over that without effects.
+
+        It is the ratio of the standard deviations, the largest one of all ports.
+        """
+        return max(
+            process.standard_deviation / self.force_deviation(port)
+            for port, process in estimate.processes.items()
+        )
 
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
@@ -512,7 +524,9 @@ class ForceSearch:
             if number == 0 and not estimate.follows_laws:
                 next_estimate = estimator.estimate_nearby(laws, start, estimate.speed_window)
             else:
-                next_estimate = estimator.polish(laws, start, estimate.speed_window)
+                next_estimate = estimator.polish(
+                    laws, start, estimate.speed_window, may_follow_laws=estimate.follows_laws
+                )
             if next_estimate is None:
                 break
             estimate = next_estimate
