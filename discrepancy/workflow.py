@@ -229,7 +229,11 @@ def investigate(
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
         with stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
-                problem, search.force_search, search.estimate_of(fit.candidate), fit
+                problem,
+                search.force_search,
+                search.estimate_of(fit.candidate),
+                fit,
+                is_named=verdict.kind is not VerdictKind.UNEXPLAINED,
             )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):

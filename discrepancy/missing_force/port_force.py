@@ -67,7 +67,7 @@ def ordering_variables(
     position: FloatArray,
     speed: FloatArray,
     time: FloatArray,
-    inputs: Mapping[str, FloatArray],
+    further: Mapping[str, FloatArray],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return the variables that order a force: the force is nearly a function of such a variable.
 
@@ -75,9 +75,10 @@ def ordering_variables(
     ----------
     force, position, speed, time : (N,) array
         The force, the motion of its port, and the time.
-    inputs : mapping of str to (N,) array
-        Recorded inputs and their rates, by name. A force follows an input if less of it acts than
-        was recorded, and the rate of an input if it acts later than recorded.
+    further : mapping of str to (N,) array
+        Recorded inputs, their rates and a relaxed displacement, by name. A force follows an input
+        if less of it acts than was recorded, the rate of an input if it acts later than recorded,
+        and a relaxed displacement if it has a memory.
 
     Returns
     -------
@@ -98,7 +99,7 @@ def ordering_variables(
         "amplitude": explained_variance(amplitude, np.abs(force)),
         "time": explained_variance(time, force),
     }
-    for name, values in inputs.items():
+    for name, values in further.items():
         shares[name] = explained_variance(values, force)
     least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
     return shares, tuple(name for name, share in shares.items() if share >= least_share)
@@ -139,8 +140,8 @@ class TrialForce:
         The times of the samples [s].
     position, speed : (N,) array
         The motion of the port [m or rad, and per s]; at a port of a state the speed is the state.
-    inputs : mapping of str to (N,) array
-        The recorded inputs and their rates, see `ordering_variables` [SI].
+    variables : mapping of str to (N,) array
+        Further variables that the force may follow, see `ordering_variables` [SI].
     force, deviation : (N,) array
         The smoothed force, and its posterior standard deviation [N, N m or the port's flow].
     law : (N,) array or None
@@ -151,7 +152,7 @@ class TrialForce:
     time: FloatArray
     position: FloatArray
     speed: FloatArray
-    inputs: Mapping[str, FloatArray]
+    variables: Mapping[str, FloatArray]
     force: FloatArray
     deviation: FloatArray
     law: FloatArray | None
@@ -221,7 +222,9 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
         term.name_in_words for term in estimate.candidate.terms if term.place == port
     )
     recorded = {trial.name: trial for trial in search.problem.campaign.trials}
-    trial_forces = _forces_by_trial(estimate, number, recorded, has_law=bool(law_name))
+    trial_forces = _with_history_of_motion(
+        _forces_by_trial(estimate, number, recorded, has_law=bool(law_name))
+    )
     unit, *_ = search.problem.model.port_units(port)
     correlation_time = estimate.processes[number].correlation_time
     force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
@@ -256,7 +259,7 @@ def _forces_by_trial(
                 time=trial.time,
                 position=smoothed_trial.trajectory.positions[samples, port],
                 speed=smoothed_trial.trajectory.speeds[samples, port],
-                inputs=_inputs_and_rates(recorded[trial.name], trial.stride),
+                variables=_inputs_and_rates(recorded[trial.name], trial.stride),
                 force=smoothed_trial.lacking_forces[port][samples],
                 deviation=smoothed_trial.missing_force_deviations[port][samples],
                 law=law_force,
@@ -306,18 +309,7 @@ def _force_at_port(
     force = np.concatenate([trial_force.force for trial_force in trial_forces])
     position = np.concatenate([trial_force.position for trial_force in trial_forces])
     speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
-    time = np.concatenate([trial_force.time for trial_force in trial_forces])
-    # an input that was not recorded in a trial did not act there
-    input_names = dict.fromkeys(name for trial in trial_forces for name in trial.inputs)
-    inputs = {
-        name: np.concatenate(
-            [trial.inputs.get(name, np.zeros_like(trial.force)) for trial in trial_forces]
-        )
-        for name in input_names
-    }
-    others, _ = ordering_variables(force, position, speed, time, inputs)
-    history = _history_of_motion(trial_forces, least_share=max(others.values()) + TIED_SHARE)
-    shares, ordered_by = ordering_variables(force, position, speed, time, inputs | history)
+    shares, ordered_by = _variables_that_order(trial_forces)
     # the trial and the sample with the largest force
     trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
     sample_of_largest = int(np.abs(trial_force.force).argmax())
@@ -343,33 +335,54 @@ def _force_at_port(
     )
 
 
-def _history_of_motion(
-    trial_forces: Sequence[TrialForce], least_share: float
-) -> dict[str, FloatArray]:
-    """Return the relaxed displacement that orders a force best, by its name.
+def _variables_that_order(
+    trial_forces: Sequence[TrialForce],
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return what `ordering_variables` returns for the force in all trials together."""
+    # an input that was not recorded in a trial did not act there
+    names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)
+    further = {
+        name: np.concatenate(
+            [trial.variables.get(name, np.zeros_like(trial.force)) for trial in trial_forces]
+        )
+        for name in names
+    }
+    return ordering_variables(
+        force=np.concatenate([trial.force for trial in trial_forces]),
+        position=np.concatenate([trial.position for trial in trial_forces]),
+        speed=np.concatenate([trial.speed for trial in trial_forces]),
+        time=np.concatenate([trial.time for trial in trial_forces]),
+        further=further,
+    )
 
-    It is left out unless it orders the force better than all variables without memory, to which
-    short and long relaxation times come near.
 
-    Parameters
-    ----------
-    trial_forces : sequence of TrialForce
-        The force in each trial.
-    least_share : float
-        The share of the force's variance that it must explain.
+def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialForce]:
+    """Return the force in each trial with the relaxed displacement that orders it best.
+
+    It is added only if it orders the force better than all variables without memory, to which short
+    and long relaxation times come near.
     """
+    shares, _ = _variables_that_order(trial_forces)
     force = np.concatenate([trial.force for trial in trial_forces])
     interval = min(float(np.median(np.diff(trial.time))) for trial in trial_forces)
-    best: dict[str, FloatArray] = {}
-    for relaxation_time in interval * RELAXATION_TIMES:
-        relaxed = np.concatenate(
-            [relaxed_displacement(item.time, item.speed, relaxation_time) for item in trial_forces]
-        )
-        share = explained_variance(relaxed, force)
-        if share > least_share:
-            least_share = share
-            best = {f"the displacement relaxed within {relaxation_time:.2g} s": relaxed}
-    return best
+    share_of_relaxation = {}
+    for relaxation_time in (interval * RELAXATION_TIMES).tolist():
+        relaxed = [
+            relaxed_displacement(item.time, item.speed, relaxation_time) for item in trial_forces
+        ]
+        share_of_relaxation[relaxation_time] = explained_variance(np.concatenate(relaxed), force)
+    best_time = max(
+        share_of_relaxation, key=lambda relaxation_time: share_of_relaxation[relaxation_time]
+    )
+    if share_of_relaxation[best_time] < max(shares.values()) + TIED_SHARE:
+        return list(trial_forces)
+    name = f"the displacement relaxed within {best_time:.2g} s"
+    trials_with_history = []
+    for trial in trial_forces:
+        relaxed_in_trial = relaxed_displacement(trial.time, trial.speed, best_time)
+        variables = {**trial.variables, name: relaxed_in_trial}
+        trials_with_history.append(replace(trial, variables=variables))
+    return trials_with_history
 
 
 def _rms(values: FloatArray) -> float:
@@ -382,6 +395,8 @@ def missing_force_of_verdict(
     search: ForceSearch | None,
     estimate: Estimate | None,
     fit: CandidateFit,
+    *,
+    is_named: bool,
 ) -> MissingForce | None:
     """Return the missing force for a verdict, with the share of it that its law explains.
 
@@ -395,21 +410,26 @@ def missing_force_of_verdict(
         The estimate of the effects of the verdict. If there is none, they are estimated now.
     fit : CandidateFit
         The fit of the verdict.
+    is_named : bool
+        Whether the effects of the fit are named. Errors of sensors that are named leave no force
+        missing; as a best hypothesis without a name they do.
 
     Returns
     -------
     MissingForce or None
-        The missing force; None if no force can be estimated, or if none of the fit's effects acts
-        at a port.
+        The missing force; None if no force can be estimated, or if effects are named of which none
+        acts at a port.
     """
     terms = fit.candidate.terms
     try:
         ports = problem.model.ports
         laws = [term for term in terms if term.place in ports]
-        if not can_estimate_forces(problem) or (terms and not laws):
+        if not can_estimate_forces(problem) or (terms and not laws and is_named):
             return None
         search = search or ForceSearch(problem)
-        if terms and estimate is None:
+        if not laws:
+            return missing_force(search, search.estimate_without_effects)
+        if estimate is None:
             estimate = search.estimate_effects(
                 search.estimate_without_effects, fit.candidate, fit.point.effect
             )

@@ -174,7 +174,8 @@ MOST_FORCE_SAMPLES = 400
 def missing_force_figure(missing: MissingForce) -> Figure:
     """Draw a missing force over displacement, speed and time.
 
-    A second row of panels shows the force that remains with the fitted law, if there is one.
+    A force that follows another variable, such as an input, is drawn over that instead of speed. A
+    second row of panels shows the force that remains with the fitted law, if there is one.
     """
     row_titles = {"force": "missing force"}
     if missing.law:
@@ -187,6 +188,10 @@ def missing_force_figure(missing: MissingForce) -> Figure:
         }
     else:
         motions = {"position": "integral of the state", "speed": f"state, {speed_unit}"}
+    followed = missing.at_port.ordered_by[:1]
+    if followed and any(followed[0] in course.variables for course in missing.courses):
+        del motions["speed"]
+        motions[followed[0]] = followed[0].removeprefix("the ")
     sample_count = sum(len(course.time) for course in missing.courses)
     drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
     figure, rows = residual_figures.new_panels(
@@ -251,15 +256,19 @@ def _draw_over_motion(
     missing : MissingForce
         The missing force.
     motion, series, law : str
-        Names of the arrays of a trial: of the motion, of the force, and of the force by its law
-        (empty if there is no law).
+        Names of the arrays of a trial: of the motion or of another variable, of the force, and of
+        the force by its law (empty if there is no law).
     samples : slice
         Samples that are drawn.
     """
+    is_variable = any(motion in course.variables for course in missing.courses)
+    courses = [
+        course for course in missing.courses if not is_variable or motion in course.variables
+    ]
 
     def joined(name: str) -> FloatArray:
         """Return an array of the trials that have it, joined in their order."""
-        arrays = [getattr(course, name) for course in missing.courses]
+        arrays = [course.variables.get(name, getattr(course, name, None)) for course in courses]
         return np.concatenate([array[samples] for array in arrays if array is not None])
 
     positions = joined(motion)

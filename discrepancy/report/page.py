@@ -187,7 +187,8 @@ def verdict_card(verdict: Verdict) -> str:
     """Return the verdict in one line: what is missing, where, how large, and how sure that is.
 
     The size is the missing force at its port or, if there is no such force, the first parameter of
-    a named effect with its 90 % interval. If nothing is missing, the parameter, gain or zero that
+    a named effect with its 90 % interval. Without a name, the card says what the force depends on.
+    If nothing is missing, the parameter, gain or zero that
     the fit moves farthest is mentioned.
     """
     clauses = [f"{capital(missing_effects_text(verdict))} {OPENING[verdict.kind]}"]
@@ -204,6 +205,8 @@ def verdict_card(verdict: Verdict) -> str:
     if verdict.force is not None:
         force = verdict.force
         clauses.append(f"{number(force.rms)} {force.unit} (rms) at {force.port}")
+        if verdict.kind is VerdictKind.UNEXPLAINED:
+            clauses.append(force.dependence)
     elif parameters:
         value, interval = estimate_text(parameters[0])
         size = f"{parameter_text(parameters[0])} {value} {unit_text(parameters[0].unit)}".rstrip()

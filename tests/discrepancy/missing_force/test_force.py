@@ -480,7 +480,7 @@ def missing_beside_spring(rate, first, force):
     model = one_mass(stiffness=800.0, damping={"matrix": 1.6})
     problem = problem_of(Campaign("driven", {"x": channel}, (trial,), None, {}, ""), model)
     search = ForceSearch(problem)
-    return missing_force(search, search.best_port_estimate).at_port
+    return missing_force(search, search.best_port_estimate)
 
 
 TIME_OF_DRIVE = 0.005 * np.arange(600)
@@ -509,9 +509,11 @@ def test_a_force_that_acts_otherwise_than_recorded_follows_the_input(acting, var
         x, v = state
         return [v, (np.interp(now, TIME_OF_DRIVE, acts) - 1.6 * v - 800.0 * x) / 2.0]
 
-    told = missing_beside_spring(rate, [0.0, 0.0], RECORDED)
-    assert told.ordered_by == (variable,)
-    assert told.orders[variable] > 0.6
+    missing = missing_beside_spring(rate, [0.0, 0.0], RECORDED)
+    assert missing.at_port.ordered_by == (variable,)
+    assert missing.at_port.orders[variable] > 0.6
+    labels = [axes.get_xlabel() for axes in missing_force_figure(missing).axes]
+    assert labels[1] == variable.removeprefix("the ")
 
 
 def test_a_spring_behind_a_damper_follows_the_relaxed_displacement():
@@ -522,7 +524,7 @@ def test_a_spring_behind_a_damper_follows_the_relaxed_displacement():
         force = np.interp(now, TIME_OF_DRIVE, RECORDED)
         return [v, (force - 1.6 * v - 800.0 * x - 60.0 * z) / 2.0, v - z / 0.05]
 
-    told = missing_beside_spring(rate, [0.0, 0.0, 0.0], RECORDED)
+    told = missing_beside_spring(rate, [0.0, 0.0, 0.0], RECORDED).at_port
     (variable,) = told.ordered_by
     assert variable.startswith("the displacement relaxed within 0.0")
     assert told.orders[variable] > 0.9
