@@ -37,7 +37,7 @@ from discrepancy.report.decidability_text import (
     group_lines,
 )
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import missing_effects_text, render_report
+from discrepancy.report.page import missing_effects_text, render_report, verdict_card
 from discrepancy.report.printed import check_lines
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.sizes import si_sizes
@@ -176,6 +176,15 @@ def test_an_unexplained_gap_without_a_proof_has_the_consistency_and_no_share(dra
     page = page_of(replace(drag, proof=None), **unexplained)
     assert "of the mean square error" not in page
     assert "p of the consistency; a fit has at least 0.001" in page
+
+
+def test_the_first_screen_says_what_a_force_without_a_name_follows(drag):
+    force = drag.verdict.force
+    assert force.ordered_by == ("velocity",)
+    follows = f"{force.followed_percent} % of its variance follows velocity"
+    unexplained = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=())
+    assert follows in verdict_card(unexplained)
+    assert follows not in verdict_card(drag.verdict)
 
 
 def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(drag):
