@@ -213,12 +213,11 @@ def investigate(
     if thorough:
         with stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            estimate = search.estimate_of(fit.candidate)
             windows = gap_windows(
                 problem,
                 fit,
                 before,
-                leaves_no_force=estimate is not None and estimate.leaves_no_force,
+                leaves_no_force=_laws_leave_no_force(verdict, search, fit),
                 seed=seed,
             )
             if after is not before:
@@ -285,6 +284,20 @@ def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
         for term in terms
     ]
     return tuple(sorted(labels))
+
+
+def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) -> bool:
+    """Return whether the effects of a verdict are laws that act throughout and leave no force.
+
+    The simulation of an effect that is named leaves only noise. Otherwise, the estimate with the
+    missing force tells.
+    """
+    for term in fit.candidate.terms:
+        if term.place not in search.problem.model.ports or term.effect.variant_of:
+            return False
+    estimate = search.estimate_of(fit.candidate)
+    is_estimate_complete = estimate is not None and estimate.leaves_no_force
+    return verdict.kind is VerdictKind.NAMED or is_estimate_complete
 
 
 def _remarks(

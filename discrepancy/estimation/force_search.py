@@ -446,6 +446,29 @@ class ForceSearch:
             for port, process in estimate.processes.items()
         )
 
+    def estimate_of_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
+        """Return the estimate of a hypothesis whose simulation was fitted to the readings.
+
+        If the laws leave no force along the motion that they have with the values of the fit, these
+        are its values. Otherwise it is estimated with the missing force, from the same effects.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            The effects of the hypothesis, each at its place.
+        point : Point
+            The values of all unknowns of the fit.
+        """
+        base = self.estimate_without_effects
+        trials = self.trial_set.trials_about(point)
+        start = replace(
+            start_in_other_trials(base, trials), effect=point.effect, shared=point.shared
+        )
+        explained = self._estimate_that_leaves_no_force(
+            self.estimator(trials), self.laws(candidate, trials), start
+        )
+        return explained or self.estimate_effects(base, candidate, point.effect)
+
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
     ) -> Estimate | None:

@@ -430,9 +430,7 @@ def missing_force_of_verdict(
         if not laws:
             return missing_force(search, search.estimate_without_effects)
         if estimate is None:
-            estimate = search.estimate_effects(
-                search.estimate_without_effects, fit.candidate, fit.point.effect
-            )
+            estimate = search.estimate_of_simulation(fit.candidate, fit.point)
         force = missing_force(search, estimate or search.estimate_without_effects)
     except ESTIMATION_ERRORS:
         return None
