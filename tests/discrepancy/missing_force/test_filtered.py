@@ -13,7 +13,7 @@ from discrepancy.estimation.filtered import FilteredTrial
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import plain_linearisation
 from discrepancy.estimation.linearised import LinearisedTrial
-from discrepancy.estimation.regression import Priors, Regression
+from discrepancy.estimation.regression import Priors, Regression, Solution
 from discrepancy.judgement.remarks import gap_times_sentence, has_gap_beginning_inside
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.shares import _simulated_noise
@@ -313,6 +313,24 @@ def test_evidence_beside_unknowns_is_that_of_their_prior():
     found = Regression(rows @ rows.T, 0.0).solve([0, 1], Priors.without_ranges(precision))
     covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
     assert found.log_evidence == pytest.approx(gaussian(covariance, readings))
+
+
+def test_an_unknown_beyond_its_range_is_at_the_end_and_the_others_are_conditioned_on_it():
+    random = np.random.default_rng(3)
+    root = random.standard_normal((3, 3))
+    covariance, mean = root @ root.T, np.array([4.0, 0.3, -0.2])
+    priors = Priors(np.ones(3), np.array([-1.0, -9.0, -9.0]), np.array([1.0, 9.0, 9.0]))
+    found = Solution(-7.0, mean, covariance).within(priors)
+    beyond = 1.0 - mean[0]
+    conditional = mean + covariance[:, 0] / covariance[0, 0] * beyond
+    assert found.mean == pytest.approx(conditional, rel=1e-9)
+    assert found.log_evidence == pytest.approx(-7.0 - 0.5 * beyond**2 / covariance[0, 0], rel=1e-9)
+
+
+def test_unknowns_within_their_ranges_stay_as_they_are():
+    priors = Priors(np.ones(2), np.full(2, -1.0), np.full(2, 1.0))
+    solution = Solution(-7.0, np.array([0.5, -1.0]), np.eye(2))
+    assert solution.within(priors) is solution
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
