@@ -18,8 +18,9 @@ from reporting.words import listing
 # ---------------------------------------------------------------- when there is a gap
 
 KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-KINDS_WITH_NAME = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY)
 """Kinds of verdicts after which the model remains unchanged: no gap was detected."""
+KINDS_WITH_NAME = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY)
+"""Kinds of verdicts that name one set of effects, or its family."""
 MOST_MENTIONED = 3
 """Windows, or effects that were not tested, that a sentence mentions one by one."""
 

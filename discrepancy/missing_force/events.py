@@ -83,6 +83,11 @@ class EventSearch(EventTrials):
         super().__init__(linearisation, port, stride=stride)
         self.process = process
 
+    @property
+    def paths_without_force(self) -> list[BoolArray]:
+        """The path (N,) of each trial, without the force of events at any sample."""
+        return [np.zeros(len(trial.time), dtype=bool) for trial in self.trials]
+
     def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
         """Return the information of each trial on the shared unknowns, given forces and paths."""
         return [
@@ -273,16 +278,16 @@ def find_events(
         The events with changes if these are more probable than `least_score` and than a force that
         acts throughout the records that have one; otherwise such a force.
     """
-    stride = _stride_of_search(linearisation)
-    search = EventSearch(linearisation, port, process, stride=stride)
-    always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
-    steady = force_in_records(linearisation, port, process)
+    search = _search_in_thinned_records(linearisation, port, process)
+    steady = _steady_force_where_needed(search)
     # stretches with a large force that may jump, besides a small force throughout
     event_deviation = INITIAL_EVENT_DEVIATION * process.standard_deviation
     steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
     event_force = Process(event_deviation, process.correlation_time, may_jump=True)
     steady_force = replace(process, standard_deviation=steady_deviation)
-    best_events = _search_round(search, (event_force, steady_force), always_off, FIRST_EVALUATIONS)
+    best_events = _search_round(
+        search, (event_force, steady_force), search.paths_without_force, FIRST_EVALUATIONS
+    )
     for _ in range(MOST_ROUNDS):
         next_events = _search_round(
             search, best_events.forces, best_events.paths, LATER_EVALUATIONS
@@ -290,8 +295,8 @@ def find_events(
         if next_events.score < best_events.score + LEAST_GAIN:
             break
         best_events = next_events
-    if stride > 1:
-        best_events = _refine_to_all_samples(best_events, stride)
+    best_events = _refine_to_all_samples(best_events)
+    steady = _refine_to_all_samples(steady)
     has_changes = any(len(change_samples(is_on)) for is_on in best_events.paths)
     if has_changes and best_events.score > max(least_score, steady.score):
         return best_events
@@ -310,17 +315,16 @@ def force_in_records(linearisation: Linearisation, port: int, process: Process) 
     process : Process
         A force that acts throughout.
     """
-    stride = _stride_of_search(linearisation)
-    search = EventSearch(linearisation, port, process, stride=stride)
-    always_off = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
-    steady = _steady_force_where_needed(search, always_off)
-    return _refine_to_all_samples(steady, stride) if stride > 1 else steady
+    search = _search_in_thinned_records(linearisation, port, process)
+    return _refine_to_all_samples(_steady_force_where_needed(search))
 
 
-def _stride_of_search(linearisation: Linearisation) -> int:
-    """Return of how many samples one is taken, so that all together are `MOST_SAMPLES` at most."""
+def _search_in_thinned_records(
+    linearisation: Linearisation, port: int, process: Process
+) -> EventSearch:
+    """Return the search in every k-th sample, so that there are `MOST_SAMPLES` at most."""
     sample_count = sum(len(trial.trial.time) for trial in linearisation.trials)
-    return ceil(sample_count / MOST_SAMPLES)
+    return EventSearch(linearisation, port, process, stride=ceil(sample_count / MOST_SAMPLES))
 
 
 def events_throughout(linearisation: Linearisation, port: int, process: Process) -> Events:
@@ -329,16 +333,11 @@ def events_throughout(linearisation: Linearisation, port: int, process: Process)
     return Events(EventSearch(linearisation, port, process), (process, process), always, -np.inf)
 
 
-def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
-    """Return events that were found in every `stride`-th sample, with changes among all samples.
-
-    Parameters
-    ----------
-    coarse_events : Events
-        The events, with paths over the samples that were used.
-    stride : int
-        The step between these samples.
-    """
+def _refine_to_all_samples(coarse_events: Events) -> Events:
+    """Return events that were found in every k-th sample, with changes among all samples."""
+    stride = coarse_events.search.stride
+    if stride == 1:
+        return coarse_events
     search = EventSearch(
         coarse_events.search.linearisation, coarse_events.search.port, coarse_events.search.process
     )
@@ -356,26 +355,18 @@ def _refine_to_all_samples(coarse_events: Events, stride: int) -> Events:
     return replace(events_in_all_samples, score=log_evidence - price_of_changes(paths))
 
 
-def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) -> Events:
-    """Return a force that acts throughout those records whose evidence is larger with it.
-
-    Parameters
-    ----------
-    search : EventSearch
-        The search, with the samples that are used.
-    never : sequence of (N,) array of bool
-        The path of each trial without any force.
-    """
+def _steady_force_where_needed(search: EventSearch) -> Events:
+    """Return a force that acts throughout those records whose evidence is larger with it."""
     negligible_force = replace(
         search.process, standard_deviation=NEGLIGIBLE_DEVIATION * search.process.standard_deviation
     )
     # the force of events, which is on in whole records, stands for the steady force
-    paths = [~off for off in never]
+    paths = [~off for off in search.paths_without_force]
     (steady_force, _), score = search.fit_forces(
         (search.process, negligible_force), paths, FIRST_EVALUATIONS
     )
     forces = (steady_force, negligible_force)
-    for trial_index, off in enumerate(never):
+    for trial_index, off in enumerate(search.paths_without_force):
         paths_without = [*paths[:trial_index], off, *paths[trial_index + 1 :]]
         evidence_without = search.log_evidence(search.products(forces, paths_without))
         evidence_with = search.log_evidence(search.products(forces, paths))

@@ -65,6 +65,8 @@ class EventTrials:
 
     Attributes
     ----------
+    stride : int
+        The step between the samples that are used.
     trials : list of PortedTrial
         The trials with the samples that are used.
     columns : list of (N, C, 1 + K + L) ndarray
@@ -74,6 +76,7 @@ class EventTrials:
     def __init__(self, linearisation: Linearisation, port: int, *, stride: int = 1) -> None:
         self.linearisation = linearisation
         self.port = port
+        self.stride = stride
         self.trials = [
             replace(
                 linear_trial.trial,

@@ -29,8 +29,9 @@ def search(
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
 
-    The model without effect is fitted first, then single effects, then sets. If a missing force can
-    be seen in the trials, sets of effects are compared with it instead.
+    The model without effect is fitted first. If all trials are in motion, and have a channel for
+    each port of the model, sets of effects are then compared with the missing force. Otherwise
+    single effects are fitted, then sets.
 
     Parameters
     ----------

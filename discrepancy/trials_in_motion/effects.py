@@ -267,20 +267,25 @@ class EffectLaws:
     def _linearised_sensor_errors(self, arguments: LawArguments) -> LinearisedSensorErrors:
         """Return the changes of a trial's readings by errors of sensors, with their derivatives."""
         trial = self.trials[arguments.trial_index]
+        change = np.zeros_like(trial.residual)
+        derivatives: dict[int, FloatArray] = {}
+        terms = self.candidate.split_by_term(arguments.effect)
+        # an effect without a law at a port changes readings only
+        is_error = [
+            not len(self._patch_of_term(index, values).of(PortForce))
+            for index, (_, values) in enumerate(terms)
+        ]
+        if not any(is_error):
+            return LinearisedSensorErrors(change, derivatives)
+        explained = self._explained_trajectory(arguments)
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
             return self.readings_change(arguments.trial_index, explained, term, values)
 
-        explained = self._explained_trajectory(arguments)
-
-        change = np.zeros_like(trial.residual)
-        derivatives: dict[int, FloatArray] = {}
         # the unknowns of effects follow the shared ones
         first_unknown = len(trial.shared_derivatives)
-        for index, (term, values) in enumerate(self.candidate.split_by_term(arguments.effect)):
-            has_law = bool(len(self._patch_of_term(index, values).of(PortForce)))
-            # an effect without a law at a port changes readings only
-            if not has_law:
+        for (term, values), changes_readings in zip(terms, is_error, strict=True):
+            if changes_readings:
                 change = change + change_by_effect(term, values)
                 for k in range(len(values)):
                     change_above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))

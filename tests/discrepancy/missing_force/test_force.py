@@ -39,13 +39,23 @@ from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.trials_in_motion.ported_trial import ported_trial
-from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trajectory import LawArguments, Trajectory
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.costs import once
 from tests.discrepancy.core.kit import fitted, problem_of
-from tests.discrepancy.rigs import FEW, asked, chosen, fmu_rig, hiding, integrated, one_mass, simulated
+from tests.discrepancy.rigs import (
+    FEW,
+    asked,
+    chosen,
+    fmu_rig,
+    hiding,
+    integrated,
+    measured,
+    one_mass,
+    simulated,
+)
 from tests.refusals import Inputs
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
@@ -534,3 +544,23 @@ def test_a_relaxed_displacement_is_that_of_the_closed_form():
     time = np.linspace(0.0, 2.0, 20001)
     relaxed = relaxed_displacement(time, np.ones_like(time), 0.3)
     assert relaxed[1:] == pytest.approx(0.3 * (1.0 - np.exp(-time[1:] / 0.3)), rel=2e-3, abs=2e-4)
+
+
+def test_a_gain_error_acts_on_the_motion_of_the_model_and_not_on_that_by_a_missing_force():
+    """The motion that the readings show would otherwise be explained by the readings themselves."""
+    problem = problem_of(*measured(0.01, "ringdown"))
+    search = ForceSearch(problem)
+    estimate = search.estimate_without_effects
+    (gain,) = chosen("gauge_gain")
+    candidate = Candidate((EffectTerm(gain, "leaf_strain"),))
+    laws = search.laws(candidate, estimate.ported_trials)
+    moved = estimate.trials[0].trajectory
+    still = replace(moved, added_state=np.zeros_like(moved.added_state))
+    changes = []
+    for trajectory in (moved, still):
+        arguments = LawArguments(0, trajectory, np.array([0.7]), estimate.shared, 0.005)
+        _, errors = laws.linearise_along_trajectory(arguments)
+        changes.append(errors.change)
+    assert np.abs(moved.added_state).max() > 0.0
+    assert np.abs(changes[0]).max() > 0.0
+    np.testing.assert_array_equal(changes[0], changes[1])
