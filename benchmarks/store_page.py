@@ -16,6 +16,7 @@ _GROUPS = (
     "filtered",
     "smoothed",
     "predicted",
+    "earned",
     "policy",
     "calibration",
     "learnt",

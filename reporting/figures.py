@@ -432,6 +432,12 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
     return buffer.getvalue()
 
 
+def write_picture(path: Path, figure: Figure) -> None:
+    """Write a figure as PNG if the file ends in ".png", else as SVG."""
+    picture = to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure)
+    atomic_write_bytes(path, picture)
+
+
 def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
     """Write a figure as SVG and as PNG, and return the SVG.
 

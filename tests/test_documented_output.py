@@ -9,7 +9,7 @@ import pytest
 from benchmarks.pictures.picture import PRINTED_NUMBER, agrees
 from tests import command_line
 from tests.conftest import REFERENCE
-from twin_master.fleet.reading import COUNTS_OF_FLEETS, PRINTED_FIGURES_OF_FLEETS
+from twin_master.fleet.comparison import COUNTS_OF_FLEETS, PRINTED_FIGURES_OF_FLEETS
 from twin_master.scenario.schema import FIGURES
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -101,8 +101,8 @@ PolicyOption = Annotated[
     typer.Option(
         "--policy",
         metavar="FILE or NAME",
-        help="Fly this policy without planning: a file of `uav-twin plan --out`, or MODULE:NAME "
-        "or FILE.py:NAME of an array or a function.",
+        help="Fly this policy: mode, qmdp, belief or 'risk 0.05', each also with ', hold 3'; a "
+        "file of `uav-twin plan --out`; or MODULE:NAME or FILE.py:NAME of an array or a function.",
     ),
 ]
 SensorModelOption = Annotated[

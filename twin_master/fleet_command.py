@@ -35,6 +35,7 @@ from twin_master.command_options import (
     WorkersOption,
     choose_engine,
 )
+from twin_master.compare_command import print_figures
 from twin_master.errors import TwinMasterError
 
 if TYPE_CHECKING:
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from twin_master.fleet.engine import Engine
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
-    from twin_master.fleet.reading import Figures
     from twin_master.fleet.watched.watched_asset import WatchedAsset
     from twin_master.watch.metrics import MetricsServer
 
@@ -373,8 +373,8 @@ def fly_and_print_fleet(
     json : bool
         Whether to print JSON.
     """
+    from twin_master.fleet.comparison import figures_of_fleets
     from twin_master.fleet.flight import fly_fleet
-    from twin_master.fleet.reading import figures_of_fleets
 
     folder = out if out is not None else Path("runs") / fleet.head.name
     hint = f"what was flown is kept in {folder}: repeat the command to go on"
@@ -397,7 +397,7 @@ def fly_and_print_fleet(
             }
         )
     else:
-        _print_figures(figures)
+        print_figures(figures)
         _print_outcome(outcome)
     return outcome
 
@@ -429,39 +429,6 @@ def _write_report(folder: Path) -> None:
 
     with terminal.progress().stage("Writing the report"):
         write_fleet_report(folder)
-
-
-def compare(
-    folders: Annotated[
-        list[Path],
-        typer.Argument(
-            show_default=False,
-            help="Folders of fleets or ensembles.",
-        ),
-    ],
-    *,
-    json: JsonOption = False,
-) -> None:
-    """Show the figures of several fleets or ensembles side by side.
-
-    Example: `uav-twin compare runs/fleet runs/other_fleet`
-    """
-    from twin_master.fleet.reading import figures_of_fleets
-
-    figures = figures_of_fleets(folders)
-    if json:
-        terminal.print_json(figures)
-    else:
-        _print_figures(figures)
-
-
-def _print_figures(figures: "Figures") -> None:
-    """Print the figures as a table with a column for each group."""
-    from twin_master.fleet.reading import figure_rows
-
-    rows = figure_rows(figures)
-    if rows:
-        terminal.print_table(["result", *figures], rows)
 
 
 _POLLING_INTERVAL = 0.05

@@ -16,8 +16,6 @@ from twin_master.command_options import CalibrationOption, ScenarioArgument, See
 from twin_master.errors import MissionInputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from reporting.arrays import Float
     from reporting.json_file import JsonObject
     from twin_master.mission.planning import ComparedPolicy
@@ -87,6 +85,7 @@ def plan(
 
     Example: `uav-twin plan inspected_wing --out policy.npz`
     """
+    from reporting.figures import write_picture
     from twin_master.mission.planning import compare_simple_rules, encode_policy, share_beyond_limit
     from twin_master.report.planning import plan_figure
 
@@ -98,7 +97,7 @@ def plan(
     if out is not None:
         atomic_write_bytes(out, encode_policy(planned.plan.policy, knowledge.model))
     if picture is not None:
-        _write_picture(picture, plan_figure(planned.plan.policy, knowledge.model))
+        write_picture(picture, plan_figure(planned.plan.policy, knowledge.model))
     record: Record = {
         "lower": planned.plan.lower,
         "upper": planned.plan.upper,
@@ -267,14 +266,6 @@ def _sensor_titles(scenario: "Scenario") -> tuple[str, ...]:
     """Return the titles of the sensors; if they have none, their numbers from 1."""
     section = scenario.observation
     return section.titles or tuple(str(number + 1) for number in range(section.count))
-
-
-def _write_picture(path: Path, figure: "Figure") -> None:
-    """Write a figure as PNG or SVG, by the suffix of the file."""
-    from reporting.figures import to_png, to_svg
-
-    picture = to_png(figure) if path.suffix.lower() == ".png" else to_svg(figure)
-    atomic_write_bytes(path, picture)
 
 
 def design(
@@ -448,6 +439,7 @@ def _write_design_picture(
     """Draw the information of the chosen sensors, and where they are."""
     import numpy as np
 
+    from reporting.figures import write_picture
     from twin_master.report.planning import design_figure
 
     positions = places.positions
@@ -463,7 +455,7 @@ def _write_design_picture(
         choice.sensors,
         places.outlines,
     )
-    _write_picture(path, figure)
+    write_picture(path, figure)
 
 
 def _find_gauges(scenario: "Scenario") -> _GaugePlaces:

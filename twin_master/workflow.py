@@ -34,9 +34,10 @@ from twin_master.assets.resolution import (
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
+from twin_master.mission.knowledge_file import save_knowledge
 from twin_master.mission.parts import GivenEstimator, GivenPolicy, GivenSensorModel, TwinParts
 from twin_master.mission.planning import encode_policy, read_policy
-from twin_master.mission.preparation import Knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History
 from twin_master.network.twin import build_graphical_model
@@ -122,7 +123,9 @@ def fly(
     resolved_scenario = resolve_scenario(loaded_scenario, overrides)
     folder = Path("runs") / resolved_scenario.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
-    parts = TwinParts(policy, sensor_model, estimator)
+    resolved_scenario, parts = TwinParts(policy, sensor_model, estimator).in_scenario(
+        resolved_scenario
+    )
     parts.with_objects()  # so that a wrong name is refused before the folder is made
     policy_files = {}
     model = build_graphical_model(resolved_scenario)

@@ -8,7 +8,13 @@ import typer
 
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
-from twin_master import command, fleet_command, plan_command, scenario_command
+from twin_master import (
+    command,
+    compare_command,
+    fleet_command,
+    plan_command,
+    scenario_command,
+)
 from uav_twin import (
     calibrate_commands,
     discrepancy_campaigns,
@@ -136,7 +142,7 @@ app.command("plan", rich_help_panel=MISSIONS)(plan_command.plan)
 app.command("design", rich_help_panel=MISSIONS)(plan_command.design)
 app.command("view", rich_help_panel=MISSIONS)(command.view)
 app.command("watch", rich_help_panel=MISSIONS)(watch_command.watch)
-app.command("compare", rich_help_panel=MISSIONS)(fleet_command.compare)
+app.command("compare", rich_help_panel=MISSIONS)(compare_command.compare)
 app.command("scenarios", rich_help_panel=MISSIONS)(scenario_command.list_scenarios)
 
 scenario_group = _add_group("scenario", MISSIONS, "Check a scenario before it is flown.")

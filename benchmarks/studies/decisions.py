@@ -1,40 +1,189 @@
-"""What notices are worth to belief and decisions under a fault.
+"""What policies and notices are worth to belief and decisions under faults of the gauges.
 
-Shown in docs/explanation/notices.md.
+Shown in docs/how_to/compare_policies.md and docs/explanation/notices.md.
 
-`python -m benchmarks.studies.decisions --flights 300` flies the mission of level_turns with a wing
-whose gauges or skin are not as the model says. Each seed is flown twice: by the twin of the
-scenario, and by the plain filter (`notice = false`). The table shows for each fault the rms error
-of z1 and z2 from the step of the fault on, the steps flown at 3g with z1 truly at or above the
-limit, and the steps at 2g below the limit, which were needless.
+`python -m benchmarks.studies.decisions --flights 80` flies the mission of level_turns with a wing
+whose gauges or skin are not as the model says, under several policies. All of them meet the same
+damage, noise and faults. The table shows for each fault the rms error of z1 and z2 from the step of
+the fault on, the steps flown at 3g with z1 truly at or above the limit, the steps at 2g below the
+limit, which were needless, the changes of control, and the flights with an alarm.
 """
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.studies.hidden_effects import LIMIT, beyond_the_limit
-from benchmarks.studies.learning import SOFTENING, spoiled, third_region
+from benchmarks.studies.learning import SOFTENING, third_region
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
+from reporting.arrays import Index
+from twin_master.assets.asset_source import Asset
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.mission.loop import fly
+from twin_master.mission.loop import operate
+from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.side_by_side import AssetsSideBySide, Flights, TwinsSideBySide
+from twin_master.mission.steps import Reading, Source
 from twin_master.scenario.reading import load_scenario
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import SensorFault
 
 Float = NDArray[np.float64]
-FaultFactor = Callable[[int, int], Float]
-"""(seed, step) -> factors (G,) of the gauges in a step of the flight with a seed."""
 
 SCENARIO = "level_turns"
 BEGINS = 10
-"""First step with a fault."""
+"""First step with a fault, of those that do not exist from the start."""
 MOST_STRAINED = 16
 """Index of gauge 17, whose strain is the largest."""
+TOGETHER = 40
+"""Flights that are flown side by side."""
+POLICIES = ("paper", "hold 5", "risk 0.07", "risk 0.07, hold 3", "risk 0.02")
+"""Policies of the study: that of the scenario, or names for `--policy` of `uav-twin run`."""
+WITHOUT_NOTICES = "paper, without notices"
+
+
+@dataclass(frozen=True)
+class FlownStep:
+    """A step of B flights, for a fault.
+
+    Attributes
+    ----------
+    seeds : (B,) array
+        The seeds of the flights.
+    step : int
+        The number of the step, from 0.
+    is_sharp : (B,) array
+        Whether it is flown at 3g.
+    strain : (B, G) array
+        The true strains.
+    """
+
+    seeds: Index
+    step: int
+    is_sharp: NDArray[np.bool_]
+    strain: Float
+
+
+GaugeFault = Callable[[FlownStep], Float]
+"""Returns the strains (B, G) that gauges indicate in a step, without noise."""
+
+
+def with_gains(count: int, gain: float, begins: int = BEGINS, at: str = "") -> GaugeFault:
+    """Return a fault of gauges that are drawn for each flight.
+
+    Parameters
+    ----------
+    count : int
+        The number of faulty gauges.
+    gain : float
+        Their relative error.
+    begins : int
+        The first step with the fault.
+    at : str
+        The only control under which it shows, "2g" or "3g"; both if empty.
+    """
+
+    def strain_with_gains(step: FlownStep) -> Float:
+        gauges = step.strain.shape[1]
+        factor = np.ones_like(step.strain)
+        for flight, seed in enumerate(step.seeds.tolist()):
+            drawn = np.random.default_rng([seed, 2]).permutation(gauges)[:count]
+            factor[flight, drawn] = 1.0 + gain
+        shows = np.full(len(step.seeds), step.step >= begins)
+        if at:
+            shows &= step.is_sharp == (at == "3g")
+        return np.where(shows[:, None], factor, 1.0) * step.strain
+
+    return strain_with_gains
+
+
+def with_gain_of_most_strained(step: FlownStep) -> Float:
+    """Return the strains if gauge 17 shows a third too little."""
+    is_faulty = (np.arange(step.strain.shape[1]) == MOST_STRAINED) & (step.step >= BEGINS)
+    return np.where(is_faulty, 2.0 / 3.0, 1.0) * step.strain
+
+
+def saturating(limit: float) -> GaugeFault:
+    """Return the fault of gauges that saturate softly at a limit, from the start."""
+    return lambda step: limit * np.tanh(step.strain / limit)
+
+
+def softening_skin() -> GaugeFault:
+    """Return the strains of a wing whose skin between the regions softens, a point a step."""
+    factor_of_loss = third_region()
+    begin, rate, limit = SOFTENING
+    return lambda step: (
+        factor_of_loss(min(rate * max(step.step - begin + 1, 0), limit)) * step.strain
+    )
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of the study: of gauges or skin, or one that a scenario can state.
+
+    Attributes
+    ----------
+    gauge_fault : callable
+        The strains that the gauges show, see `GaugeFault`.
+    sensor_faults : tuple of SensorFault
+        The faults that the scenario states.
+    """
+
+    gauge_fault: GaugeFault = field(default=lambda step: step.strain)
+    sensor_faults: tuple[SensorFault, ...] = ()
+
+
+def faults(gauges: int) -> dict[str, Fault]:
+    """Return the faults of the study by name, for a number of gauges."""
+    half = gauges // 2
+    most_strained = MOST_STRAINED + 1
+
+    def of_gauge_17(kind: str) -> Fault:
+        fault = SensorFault(kind=kind, sensors=(most_strained,), first_step=BEGINS)  # type: ignore[arg-type]
+        return Fault(sensor_faults=(fault,))
+
+    return {
+        "nothing": Fault(),
+        "a gauge shows 20 % too little": Fault(with_gains(1, -0.2)),
+        "a gauge shows 33 % too little": Fault(with_gains(1, -1.0 / 3.0)),
+        "gauge 17, strained most, 33 % too little": Fault(with_gain_of_most_strained),
+        "gauge 17 lost": of_gauge_17("dropout"),
+        "gauge 17 stuck": of_gauge_17("stuck"),
+        "half of the gauges show 33 % too little": Fault(with_gains(half, -0.33)),
+        "the same at 3g alone, from the start": Fault(with_gains(half, -0.33, 0, "3g")),
+        "the same at 3g alone": Fault(with_gains(half, -0.33, at="3g")),
+        "the same at 2g alone": Fault(with_gains(half, -0.33, at="2g")),
+        "all gauges show 10 % too little": Fault(with_gains(gauges, -0.1)),
+        "all gauges saturate softly, 4000 tanh(x / 4000) microstrain": Fault(saturating(4e-3)),
+        "all gauges saturate softly, 6000 tanh(x / 6000) microstrain": Fault(saturating(6e-3)),
+        "all gauges saturate softly, 8000 tanh(x / 8000) microstrain": Fault(saturating(8e-3)),
+        "skin between the regions softens, a point a step": Fault(softening_skin()),
+    }
+
+
+class FaultyGauges(Source[TwinsSideBySide]):
+    """The source of the readings of gauges with a fault."""
+
+    def __init__(self, assets: AssetsSideBySide, gauge_fault: GaugeFault, seeds: Index, sharp: int):
+        self._assets = assets
+        self._gauge_fault = gauge_fault
+        self._seeds = seeds
+        self._sharp = sharp
+
+    def read(self, twins: TwinsSideBySide) -> Reading | None:
+        """Fly the next step of all twins; None once all missions are at their ends."""
+        is_sharp = np.asarray(twins.proposed_control) == self._sharp
+        step = twins.steps
+        reading = self._assets.read(twins)
+        if reading is None or reading.ground_truth is None:
+            return None
+        strain = reading.ground_truth.observation
+        indicated_strain = self._gauge_fault(FlownStep(self._seeds, step, is_sharp, strain))
+        return replace(reading, observed=reading.observed + (indicated_strain - strain))
 
 
 @dataclass(frozen=True)
@@ -44,7 +193,7 @@ class FlightErrors:
     Attributes
     ----------
     rms : (2,) array
-        Rms error of z1 and z2 from the step of the fault on [percentage points].
+        Rms error of z1 and z2 from step `BEGINS` on [percentage points].
     beyond : int
         Steps with z1 at or above the limit.
     sharp_beyond : int
@@ -53,6 +202,10 @@ class FlightErrors:
         Steps with z1 below the limit.
     gentle_below : int
         Those of them after which 2g is flown, which was needless.
+    changes : float
+        Changes of control in a flight, on average.
+    alarmed : int
+        Flights with an alarm or a gauge that was left out.
     """
 
     rms: Float
@@ -60,112 +213,108 @@ class FlightErrors:
     sharp_beyond: int
     below: int
     gentle_below: int
+    changes: float
+    alarmed: int
 
-
-def factor_of_drawn_gauges(count: int, gain: float, sensors: int, seed: int, step: int) -> Float:
-    """Return factors (G,) of the gauges; `count` of them, drawn for a flight, have a gain error."""
-    drawn = np.random.default_rng([seed, 2]).permutation(sensors)[:count]
-    is_faulty = np.isin(np.arange(sensors), drawn) & (step >= BEGINS)
-    return np.where(is_faulty, 1.0 + gain, 1.0)
-
-
-def fault_factors(sensors: int) -> dict[str, FaultFactor]:
-    """Return the faults of the study by name, for a number of gauges."""
-    third_region_factor = third_region()
-    begin, rate, limit = SOFTENING
-
-    def of_most_strained(_seed: int, step: int) -> Float:
-        is_faulty = (np.arange(sensors) == MOST_STRAINED) & (step >= BEGINS)
-        return np.where(is_faulty, 2.0 / 3.0, 1.0)
-
-    def of_softening_skin(_seed: int, step: int) -> Float:
-        return third_region_factor(min(rate * max(step - begin + 1, 0), limit))
-
-    return {
-        "nothing": partial(factor_of_drawn_gauges, 0, 0.0, sensors),
-        "a gauge shows 20 % too little": partial(factor_of_drawn_gauges, 1, -0.2, sensors),
-        "a gauge shows 33 % too little": partial(factor_of_drawn_gauges, 1, -1.0 / 3.0, sensors),
-        "gauge 17, strained most, 33 % too little": of_most_strained,
-        "half of the gauges show 33 % too little": partial(
-            factor_of_drawn_gauges, sensors // 2, -0.33, sensors
-        ),
-        "skin between the regions softens, a point a step": of_softening_skin,
-    }
+    def row(self, fault: str, policy: str, flights: int) -> str:
+        """Return the row of the table."""
+        z1, z2 = self.rms
+        return (
+            f"| {fault} | {policy} | {z1:.1f}, {z2:.1f} "
+            f"| {100 * self.sharp_beyond / self.beyond:.1f} % "
+            f"| {100 * self.gentle_below / self.below:.1f} % "
+            f"| {self.changes:.1f} | {self.alarmed} of {flights} |"
+        )
 
 
 def fly_with_fault(
-    knowledge: Knowledge, source: ReducedModelSource, fault: FaultFactor, seeds: range
-) -> FlightErrors:
-    """Fly a mission for each seed with a fault of the gauges, and return errors and decisions.
-
-    Parameters
-    ----------
-    knowledge : Knowledge
-        What the twin knows.
-    source : ReducedModelSource
-        The asset without the fault.
-    fault : callable
-        Factors of the gauges.
-    seeds : range
-        Seeds of the flights.
-    """
+    knowledge: Knowledge, asset: Asset, gauge_fault: GaugeFault, seeds: Index
+) -> Flights:
+    """Return the flights of all seeds with a fault of the gauges."""
     scenario = knowledge.scenario
     sharp = scenario.control_names.index("3g")
-    squared_errors = []
-    counts = np.zeros(4, dtype=int)
-    for seed in seeds:
-        asset = spoiled(source.open(), partial(fault, seed))
-        plant = knowledge.plant(knowledge.truth(seed), asset)
-        flight = fly(scenario, knowledge.twin(lag=1), plant)
-        error = flight.filtered @ knowledge.model.states.coordinates - flight.state
-        squared_errors.append(np.mean(error[BEGINS:] ** 2, axis=0))
+    formations = []
+    for first in range(0, len(seeds), TOGETHER):
+        seeds_of_formation = seeds[first : first + TOGETHER]
+        truth = Truth.stack([knowledge.truth(seed) for seed in seeds_of_formation.tolist()])
+        plant = knowledge.plant(truth, *([asset] * len(seeds_of_formation)))
+        flights = Flights.empty(knowledge, len(seeds_of_formation))
+        assets = AssetsSideBySide(scenario, plant, flights)
+        source = FaultyGauges(assets, gauge_fault, seeds_of_formation, sharp)
+        for _ in operate(
+            TwinsSideBySide(scenario, knowledge.twin(), flights), source, flights.store_step
+        ):
+            pass
+        formations.append(flights)
+    return Flights.concatenate(formations)
 
-        z1 = flight.state[:, 0]
-        is_sharp = flight.control_index == sharp
-        sharp_beyond, beyond = beyond_the_limit(is_sharp, z1)
-        is_below = (z1 < LIMIT)[:-1]
-        is_gentle_next = (~is_sharp)[1:]
-        counts += [beyond, sharp_beyond, is_below.sum(), (is_below & is_gentle_next).sum()]
-    rms = 100.0 * np.sqrt(np.mean(squared_errors, axis=0))
-    return FlightErrors(rms, *counts.tolist())
+
+def errors_of(knowledge: Knowledge, flights: Flights) -> FlightErrors:
+    """Return errors and decisions of the twins over their flights."""
+    sharp = knowledge.scenario.control_names.index("3g")
+    error = flights.filtered @ knowledge.model.states.coordinates - flights.state
+    rms = 100.0 * np.sqrt(np.mean(error[:, BEGINS:] ** 2, axis=(0, 1)))
+    beyond = sharp_beyond = below = gentle_below = 0
+    for state, control in zip(flights.state, flights.control_index, strict=True):
+        is_sharp = control == sharp
+        sharp_beyond_of_flight, beyond_of_flight = beyond_the_limit(is_sharp, state[:, 0])
+        sharp_beyond += sharp_beyond_of_flight
+        beyond += beyond_of_flight
+        is_below = (state[:, 0] < LIMIT)[:-1]
+        below += int(is_below.sum())
+        gentle_below += int((is_below & ~is_sharp[1:]).sum())
+    changes = float(np.mean(np.sum(np.diff(flights.control_index, axis=1) != 0, axis=1)))
+    is_alarmed = [
+        any(notice.kind in ("alarm", "gauge_left_out") for _, notice in notices)
+        for notices in flights.notices
+    ]
+    return FlightErrors(
+        rms=rms,
+        beyond=beyond,
+        sharp_beyond=sharp_beyond,
+        below=below,
+        gentle_below=gentle_below,
+        changes=changes,
+        alarmed=sum(is_alarmed),
+    )
+
+
+def scenario_of(policy: str) -> Scenario:
+    """Return the scenario of the study with a policy."""
+    scenario = load_scenario(SCENARIO).scenario
+    if policy == WITHOUT_NOTICES:
+        return scenario.model_copy(update={"notice": None})
+    return scenario if policy == "paper" else scenario.with_policy(policy)
 
 
 def main() -> int:
-    """Print a row for each fault and each twin."""
+    """Print a row for each fault and each policy."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--flights", type=int, default=300)
+    parser.add_argument("--flights", type=int, default=80)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", help="numbers of faults from 0, with commas")
+    parser.add_argument("--policies", help='with semicolons, such as "paper; risk 0.02, hold 3"')
     arguments = parser.parse_args()
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.flights)
-    scenario = load_scenario(SCENARIO).scenario
+    seeds = np.arange(arguments.first_seed, arguments.first_seed + arguments.flights)
+    policies = [*POLICIES, WITHOUT_NOTICES]
+    if arguments.policies:
+        policies = [policy.strip() for policy in arguments.policies.split(";")]
     wing = reduced_model(load_design())
-    scenarios = {
-        "with notices": scenario,
-        "without": scenario.model_copy(update={"notice": None}),
-    }
-    sources = {twin: ReducedModelSource(flown, wing) for twin, flown in scenarios.items()}
-    knowledge = {
-        twin: prepare_knowledge(scenarios[twin], source, scenario.mission.seed)
-        for twin, source in sources.items()
-    }
-    faults = list(fault_factors(scenario.observation.count).items())
+    named_faults = list(faults(load_scenario(SCENARIO).scenario.observation.count).items())
     if arguments.only is not None:
-        faults = [faults[int(number)] for number in arguments.only.split(",")]
+        named_faults = [named_faults[int(number)] for number in arguments.only.split(",")]
     print(
-        "| wrong from step 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|"
-        + " --- |" * 5
+        "| what is wrong | policy | rms z1, z2 | 3g beyond the limit | needless 2g | changes "
+        "| flights with a notice |\n|" + " --- |" * 7
     )
-    for name, fault in faults:
-        for twin, source in sources.items():
-            errors = fly_with_fault(knowledge[twin], source, fault, seeds)
-            z1, z2 = errors.rms
-            print(
-                f"| {name} | {twin} | {z1:.1f}, {z2:.1f} "
-                f"| {100 * errors.sharp_beyond / errors.beyond:.1f} % "
-                f"| {100 * errors.gentle_below / errors.below:.2f} % |",
-                flush=True,
-            )
+    for name, fault in named_faults:
+        for policy in policies:
+            scenario = scenario_of(policy)
+            scenario = scenario.with_changes("truth", sensor_faults=fault.sensor_faults)
+            source = ReducedModelSource(scenario, wing)
+            knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
+            flights = fly_with_fault(knowledge, source.open(), fault.gauge_fault, seeds)
+            print(errors_of(knowledge, flights).row(name, policy, len(seeds)), flush=True)
     return 0
 
 

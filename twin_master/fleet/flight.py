@@ -31,17 +31,19 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.checks import check_fleet, flies_model, source_of
+from twin_master.fleet.comparison import figure_rows, group_figures
 from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.learning.evidence import reason_transitions_are_fixed
 from twin_master.fleet.members import Member
 from twin_master.fleet.plan import Fleet, Group, load_fleet
-from twin_master.fleet.reading import figure_rows, group_figures, open_fleet, open_groups
+from twin_master.fleet.reading import open_fleet, open_groups
 from twin_master.fleet.shard import ShardResult, reason_flown_one_by_one, result_of_unflown
 from twin_master.fleet.storage.store import check_installed
 from twin_master.fleet.storage.store_address import STORE_NAME, StoreAddress
 from twin_master.fleet.storage.store_writing import GroupWriter, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.knowledge_file import KNOWLEDGE_NAME, save_knowledge
 from twin_master.mission.parts import (
     NO_PARTS,
     GivenEstimator,
@@ -50,7 +52,7 @@ from twin_master.mission.parts import (
     TwinParts,
 )
 from twin_master.mission.plant import FLIGHT_ERRORS
-from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
+from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.pictures import plot_courses

@@ -171,6 +171,78 @@ class Outcomes:
         )
 
 
+@dataclass(frozen=True)
+class EarnedOutcomes:
+    """What N flights with U controls earned: means over the flights with their standard errors.
+
+    Attributes
+    ----------
+    discounted_return : Estimated
+        The sum of the rewards of a flight, discounted.
+    reward : Estimated
+        The reward of a step.
+    control_share : tuple of Estimated
+        For each control, the fraction of the steps that are flown with it.
+    beyond_limit, needless : Estimated
+        The fraction of the steps whose control is harder, or gentler, than the best control of the
+        state.
+    beyond_health_limit : Estimated
+        The fraction of the steps beyond a health limit.
+    changes : Estimated
+        The number of changes of the control in a flight.
+    """
+
+    discounted_return: Estimated
+    reward: Estimated
+    control_share: tuple[Estimated, ...]
+    beyond_limit: Estimated
+    needless: Estimated
+    beyond_health_limit: Estimated
+    changes: Estimated
+
+    @classmethod
+    def from_blocks(cls, blocks: Iterator[StoredRows], controls: int) -> "EarnedOutcomes":
+        """Return what all flights earned, block by block, for a number of controls.
+
+        Flights that failed are left out. Of a flight that ended early, the flown steps are counted.
+        """
+        returns, reward, beyond_limit, needless, beyond_health_limit, changes = (
+            Moments() for _ in range(6)
+        )
+        control_share = [Moments() for _ in range(controls)]
+        for block in blocks:
+            rows_flown = flown_rows(np.asarray(block("status")))
+            control = np.asarray(block("observed/control_index"))[rows_flown]
+            is_flown = control >= 0
+            steps_flown = np.maximum(is_flown.sum(axis=1), 1)
+
+            def mean_of_steps(values: AnyArray, steps_flown: AnyArray = steps_flown) -> Float:
+                """Return the mean over the flown steps of each flight; others have NaN."""
+                return np.asarray(np.nansum(values, axis=1, dtype=np.float64) / steps_flown)
+
+            def stored(name: str, block: StoredRows = block, rows: AnyArray = rows_flown) -> Float:
+                return np.asarray(block(f"earned/{name}"))[rows]
+
+            returns.add(stored("return"))
+            reward.add(mean_of_steps(stored("reward")))
+            beyond_limit.add(mean_of_steps(stored("beyond_limit")))
+            needless.add(mean_of_steps(stored("needless")))
+            beyond_health_limit.add(mean_of_steps(stored("health") < 0.0))
+            for index, share in enumerate(control_share):
+                share.add(mean_of_steps(control == index))
+            is_change = (np.diff(control, axis=1) != 0) & is_flown[:, 1:]
+            changes.add(is_change.sum(axis=1).astype(np.float64))
+        return cls(
+            discounted_return=returns.mean,
+            reward=reward.mean,
+            control_share=tuple(share.mean for share in control_share),
+            beyond_limit=beyond_limit.mean,
+            needless=needless.mean,
+            beyond_health_limit=beyond_health_limit.mean,
+            changes=changes.mean,
+        )
+
+
 class _OutcomeSums:
     """The sums from which the outcomes of missions follow."""
 

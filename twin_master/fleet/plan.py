@@ -230,8 +230,16 @@ class Fleet:
         MissionInputError
             If the name of a part is not that of an object.
         """
-        parts.with_objects()  # refuses a wrong name before anything is written
-        return replace(self, parts=parts)
+        groups = []
+        other_parts = parts
+        for group in self.groups:
+            scenarios = []
+            for scenario in group.scenarios:
+                changed_scenario, other_parts = parts.in_scenario(scenario)
+                scenarios.append(changed_scenario)
+            groups.append(replace(group, scenarios=tuple(scenarios)))
+        other_parts.with_objects()  # refuses a wrong name before anything is written
+        return replace(self, groups=tuple(groups), parts=other_parts)
 
     def with_store(self, address: str) -> "Fleet":
         """Return the fleet with its store at an address; in its folder if the address is empty."""

@@ -1,7 +1,6 @@
 """Outcomes, damage and decisions of the twins of a fleet, read from the fleet's store."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,25 +10,20 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index, product_of_each
 from reporting.json_file import JsonRecord
-from reporting.words import plus_minus, significant
 from twin_master.fleet.configuration import GROUPS, fleet_config
 from twin_master.fleet.members import RecordedMembers
-from twin_master.fleet.outcomes import Estimated, Outcomes
 from twin_master.fleet.storage.store import (
-    ENDED,
-    FAILED,
-    FLOWN,
-    WITHIN,
     check_installed,
     flown_rows,
     open_group,
 )
-from twin_master.fleet.storage.store_layout import ALL_ROWS, NOTICE_KINDS, row_blocks, stored_values
-from twin_master.mission.preparation import Knowledge, load_knowledge
+from twin_master.fleet.storage.store_layout import ALL_ROWS, NOTICE_KINDS, stored_values
+from twin_master.mission.knowledge_file import load_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.network.estimator import BELIEVED
+from twin_master.network.planner import BeliefPolicy
 from twin_master.network.simulated_missions import leaving_probability
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import printed_state
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
@@ -157,10 +151,11 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
     scenario = knowledge.scenario
     transition = knowledge.model.transition
     steps = scenario.mission.prediction_steps
-    if knowledge.plan.on_belief is not None:
+    policy_on_belief = knowledge.plan.on_belief
+    if isinstance(policy_on_belief, BeliefPolicy):
         return leaving_probability(
             knowledge.problem,
-            knowledge.plan.on_belief,
+            policy_on_belief,
             np.stack([transition.forward(control, row) for row in belief]),
             control,
             steps,
@@ -220,7 +215,7 @@ def flown_twins(
     for number in np.unique(scenario_numbers).tolist():
         knowledge_folder = _knowledge_folder(folder, record, number)
         rows = rows_flown[scenario_numbers == number]
-        yield TwinsOfScenario(rows, knowledge_folder, _knowledge(folder, record, number))
+        yield TwinsOfScenario(rows, knowledge_folder, knowledge_of_scenario(folder, record, number))
 
 
 def _knowledge_folder(folder: Path, record: JsonRecord, scenario_number: int) -> Path:
@@ -228,7 +223,7 @@ def _knowledge_folder(folder: Path, record: JsonRecord, scenario_number: int) ->
     return folder / GROUPS / str(record["name"]) / str(scenario_number)
 
 
-def _knowledge(folder: Path, record: JsonRecord, scenario_number: int) -> Knowledge:
+def knowledge_of_scenario(folder: Path, record: JsonRecord, scenario_number: int) -> Knowledge:
     """Return the knowledge of the twins of a scenario of a group."""
     knowledge_folder = _knowledge_folder(folder, record, scenario_number)
     scenario = Scenario.model_validate(record["scenarios"][scenario_number])
@@ -249,7 +244,7 @@ class ControlForecast:
     def __init__(self, folder: Path, record: JsonRecord) -> None:
         self._members = RecordedMembers(record)
         # The twins of a block have one scenario, or each has its own.
-        self._knowledge = lru_cache(maxsize=1)(partial(_knowledge, folder, record))
+        self._knowledge = lru_cache(maxsize=1)(partial(knowledge_of_scenario, folder, record))
 
     def probabilities(self, group: "xr.DataTree", rows: slice) -> Float:
         """Return the probability that each of B twins changes control within `prediction_steps`.
@@ -291,175 +286,3 @@ class ControlForecast:
         is_unexplained = stored_values(group, "notice/none_of_these", rows)[at_last_step] > BELIEVED
         probability[is_unexplained] = np.nan
         return probability
-
-
-def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
-    """Return the outcomes of the twins of a group of the store."""
-    return Outcomes.from_blocks(
-        partial(stored_values, group, rows=rows) for rows in row_blocks(group)
-    )
-
-
-def group_figures(group: "xr.DataTree") -> dict[str, Estimated | int]:
-    """Return counts of a group's twins, and the figures of their outcomes, by title.
-
-    The figures are means over the twins with their standard errors; a group without a flown twin
-    has counts alone. Figures that need the true state are left out for real assets.
-    """
-    figures, flown_count = _counts_of_twins(group)
-    if not flown_count:
-        return figures
-    outcomes = outcomes_of_group(group)
-    is_truth_known = not np.isnan(outcomes.bias[0].value)  # NaN for real assets
-    if is_truth_known:
-        if not np.isnan(outcomes.prompt_fallbacks.value):
-            steps = f"{group.attrs['step_name']}s"
-            figures[f"fallback within {WITHIN} {steps}, of those called for"] = (
-                outcomes.prompt_fallbacks
-            )
-        if not np.isnan(outcomes.early_fallbacks.value):
-            figures["early fallback"] = outcomes.early_fallbacks
-        state_unit = unit_of_states(group)
-        for name, rms, bias in zip(
-            stored_values(group, "filtered/region"), outcomes.rms, outcomes.bias, strict=True
-        ):
-            figures[f"filtered rms error of {name}"] = replace(rms, unit=state_unit)
-            figures[f"bias of {name}"] = replace(bias, unit=state_unit)
-    figures["log evidence of a step"] = outcomes.log_evidence
-    if is_truth_known:
-        figures["true state in the 90 % set"] = outcomes.credible_coverage
-    return figures
-
-
-Figures = dict[str, dict[str, Estimated | int]]
-"""The figures of each group, by the name of the group and of the figure."""
-
-
-def figures_of_fleets(folders: Sequence[Path]) -> Figures:
-    """Return the figures of each group by name; of several folders, the name has the folder.
-
-    Raises
-    ------
-    RunFolderError, FleetError
-        If a folder does not hold a fleet, or if its store cannot be read.
-    """
-    figures = {}
-    for folder in folders:
-        for name, group in open_groups(folder).items():
-            full_name = name if len(folders) == 1 else f"{folder}: {name}"
-            figures[full_name] = group_figures(group)
-    return figures
-
-
-def unit_of_states(group: "xr.DataTree") -> str:
-    """Return the unit of the stored factors of the state; empty if they differ in it."""
-    unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
-    return "" if ", " in unit else unit
-
-
-def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Estimated | int], int]:
-    """Return the numbers of twins by title, and the number of twins that have outcomes.
-
-    Counted are twins that flew, failed, ended early, or gave notices.
-    """
-    status_counts = np.zeros(max(FLOWN, FAILED, ENDED) + 1, dtype=np.int64)
-    alarmed = 0
-    left_gauge_out = 0
-    for rows in row_blocks(group):
-        status = stored_values(group, "status", rows)
-        status_counts += np.bincount(status, minlength=len(status_counts))
-        alarmed += int(np.sum(notice_counts(group, "alarm", rows) > 0))
-        left_gauge_out += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
-    figures: dict[str, Estimated | int] = {
-        "twins": int(status_counts.sum()),
-        "flown": int(status_counts[FLOWN]),
-        "failed in flight": int(status_counts[FAILED]),
-    }
-    if status_counts[ENDED]:
-        figures["ended early"] = int(status_counts[ENDED])
-    if group.attrs.get("gives_notice"):
-        figures["raised an alarm"] = alarmed
-    if left_gauge_out:
-        figures["left a gauge out"] = left_gauge_out
-    return figures, int(status_counts[FLOWN] + status_counts[ENDED])
-
-
-class _PrintedFigure(NamedTuple):
-    """How a figure of a group is printed.
-
-    Attributes
-    ----------
-    title : str
-        What it is called; the field `{of}` is the rest of its key.
-    scale : float
-        The factor from the stored to the printed values.
-    unit : str
-        The printed unit; empty for a plain number.
-    """
-
-    title: str
-    scale: float = 1.0
-    unit: str = ""
-
-
-PRINTED_FIGURES_OF_FLEETS = {
-    f"fallback within {WITHIN} ": _PrintedFigure(
-        f"assets whose control changed within {WITHIN} steps of the damage that called for it",
-        100.0,
-        "%",
-    ),
-    "early fallback": _PrintedFigure(
-        "assets whose control changed before the damage called for it", 100.0, "%"
-    ),
-    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of}"),
-    "bias of ": _PrintedFigure("mean error of the estimated {of}"),
-    "log evidence of a step": _PrintedFigure("log evidence of a step", unit="nat"),
-    "true state in the 90 % set": _PrintedFigure(
-        "steps in which the set of states with a probability of 90 % has the true one", 100.0, "%"
-    ),
-}
-"""How figures are printed, by the beginning of their keys; others are counts of assets."""
-COUNTS_OF_FLEETS = (
-    "twins",
-    "flown",
-    "failed in flight",
-    "ended early",
-    "raised an alarm",
-    "left a gauge out",
-)
-"""Titles of the counts of assets, which are their keys."""
-
-
-def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
-    """Return the figures of groups as rows of a table: a title, and a cell for each group."""
-    keys: dict[str, None] = {}  # used as an ordered set
-    for figures in groups.values():
-        keys |= dict.fromkeys(figures)
-    rows = []
-    for key in keys:
-        printed_figure = _PrintedFigure(key)
-        for beginning, description in PRINTED_FIGURES_OF_FLEETS.items():
-            if key.startswith(beginning):
-                printed_figure = description._replace(
-                    title=description.title.format(of=key.removeprefix(beginning))
-                )
-        cells = [_figure_text(figures.get(key), printed_figure) for figures in groups.values()]
-        rows.append([printed_figure.title, *cells])
-    return rows
-
-
-def _figure_text(figure: Estimated | int | None, printed_figure: _PrintedFigure) -> str:
-    """Return a figure with its standard error and unit as text; empty if there is none."""
-    if figure is None:
-        return ""
-    if isinstance(figure, int):
-        return str(figure)
-    scale = printed_figure.scale
-    unit = printed_figure.unit
-    if figure.unit:
-        scale, unit = printed_state(figure.unit, "percentage points")
-    value = scale * figure.value
-    error = scale * figure.error
-    # One twin has no standard error.
-    text = plus_minus(value, error) if np.isfinite(error) else significant(value)
-    return f"{text} {unit}".rstrip()

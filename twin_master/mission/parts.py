@@ -27,6 +27,7 @@ from twin_master.network.planner import BeliefPolicy
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import Planner
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import is_policy_name
 
 ENTRY_POINT_GROUPS = {
     "policy": "uav_twin.policies",
@@ -57,7 +58,10 @@ class TwinBeforeFlight(Protocol):
 
 
 GivenPolicy = ArrayLike | BeliefPolicy | Planner | Path | str
-"""A policy (S, U), one on the belief, a function of the graphical model, a file, or a name."""
+"""A policy (S, U), one on the belief, a function of the graphical model, a file, or a name.
+
+A name is that of a policy of scenarios, such as "risk 0.05, hold 3", or of an object.
+"""
 GivenSensorModel = GaussianSensorModel | Callable[[TwinBeforeFlight], GaussianSensorModel] | str
 """A sensor model, a function that makes one, or the name of either."""
 GivenEstimator = Estimator | Callable[[TwinBeforeFlight], Estimator] | str
@@ -96,6 +100,12 @@ class TwinParts:
         """Return how sensor model and estimator are called, for ``config.json``."""
         given_parts = {"sensor_model": self.sensor_model, "estimator": self.estimator}
         return {role: description(part) for role, part in given_parts.items() if part is not None}
+
+    def in_scenario(self, scenario: Scenario) -> tuple[Scenario, "TwinParts"]:
+        """Return a scenario with the policy of scenarios that is named, and the other parts."""
+        if isinstance(self.policy, str) and is_policy_name(self.policy):
+            return scenario.with_policy(self.policy), replace(self, policy=None)
+        return scenario, self
 
     def with_objects(self) -> "TwinParts":
         """Return the parts with objects in the place of names.

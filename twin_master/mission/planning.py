@@ -244,7 +244,9 @@ def simulate_policy(
     scenario: Scenario, problem: DecisionProblem, policy: BeliefPolicy
 ) -> ComparedPolicy:
     """Return the returns of a policy on the belief in simulated missions."""
-    returns = _simulate(scenario, problem, lambda belief, _filtered, _step: policy.decide(belief))
+    returns = simulate_decisions(
+        scenario, problem, lambda belief, _filtered, _step: policy.decide(belief)
+    )
     return ComparedPolicy("planned on the belief", returns)
 
 
@@ -283,12 +285,12 @@ def compare_simple_rules(
             rules[name] = inspect_every(period)
     compared = []
     for name, rule in rules.items():
-        compared.append(ComparedPolicy(name, _simulate(scenario, problem, rule)))
+        compared.append(ComparedPolicy(name, simulate_decisions(scenario, problem, rule)))
     return tuple(compared)
 
 
-def _simulate(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
-    """Return the returns (B,) of simulated missions under a rule.
+def simulate_decisions(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Float:
+    """Return the discounted returns (B,) of simulated missions under a rule.
 
     The control of the first step is that of the scenario; the rule decides on the later ones.
     """

@@ -1,21 +1,15 @@
 """What a twin knows before its flight, made from a scenario, a source and a seed."""
 
-import io
-import json
-import os
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float
-from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.arrays import Float, Index
 from reporting.progress import Progress, SilentProgress
 from reporting.words import brief
 from twin_master.assets.asset_source import Asset, AssetSource
@@ -25,7 +19,6 @@ from twin_master.assets.resolution import (
     asset_source,
     resolve_scenario,
 )
-from twin_master.errors import RunFolderError
 from twin_master.gauges.monitor import WatchfulEstimator
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
@@ -38,7 +31,9 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import (
     BeliefPolicy,
+    Hold,
     PlannedPolicy,
+    RiskPolicy,
     evaluate_policy,
     value_iteration,
 )
@@ -48,6 +43,9 @@ from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
+
+_DIGITS_OF_HEALTH = 9
+"""Decimal digits to which the health rewards of two controls agree if their loads are equal."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ class Knowledge:
         The calibrated parameter.
     predicted : (E, S, U, G) array
         The observation that each draw predicts in each state and control, SI.
-    policy : (S, U) array, BeliefPolicy or None
+    policy : (S, U) array, BeliefPolicy, RiskPolicy or None
         The policy p(U | D), row-stochastic, or a policy on the belief, that is flown instead of a
         plan.
     true_values : (E, S, U, G) array or None
@@ -86,7 +84,7 @@ class Knowledge:
     model: GraphicalModel
     draws: ParameterDraws
     predicted: Float
-    policy: Float | BeliefPolicy | None = None
+    policy: Float | BeliefPolicy | RiskPolicy | None = None
     true_values: Float | None = None
     parts: TwinParts = NO_PARTS
 
@@ -167,18 +165,60 @@ class Knowledge:
         If `policy` is given, it is not planned: a policy by states is only evaluated, and a policy
         on the belief takes the place of the scenario's.
         """
-        transition = self.model.transition
-        discount = discounts(self.scenario)
-        if self.policy is not None and not isinstance(self.policy, BeliefPolicy):
+        if self.policy is not None and not isinstance(self.policy, BeliefPolicy | RiskPolicy):
             policy = self.model.policy(self.policy)
-            return evaluate_policy(transition, self.planning_reward, discount, policy)
-        plan = value_iteration(transition, self.planning_reward, discount)
-        return replace(plan, on_belief=self._belief_policy(plan))
+            return evaluate_policy(
+                self.model.transition, self.planning_reward, discounts(self.scenario), policy
+            )
+        return replace(self.plan_by_states, on_belief=self._belief_policy(self.plan_by_states))
 
-    def _belief_policy(self, plan: PlannedPolicy) -> BeliefPolicy | None:
+    @cached_property
+    def plan_by_states(self) -> PlannedPolicy:
+        """The best control of each state, by value iteration, eq. (36)."""
+        return value_iteration(
+            self.model.transition, self.planning_reward, discounts(self.scenario)
+        )
+
+    @cached_property
+    def hardness(self) -> Index:
+        """The rank of each control by its load, larger for a harder one: (U,).
+
+        A control is harder if its health reward, averaged over all states, is smaller; controls of
+        equal load have equal ranks. No control has a smaller rank than the safest one.
+        """
+        mean_health = self.rewards.planning_reward(1.0, 0.0).mean(axis=0)
+        _, rank = np.unique(-np.round(mean_health, _DIGITS_OF_HEALTH), return_inverse=True)
+        if rank[self.safest_control] > rank.min():
+            rank[self.safest_control] = rank.min() - 1
+        return np.asarray(rank, dtype=np.int64)
+
+    @property
+    def hold(self) -> Hold | None:
+        """How often a harder control must be proposed in a row; None if once is enough."""
+        if self.scenario.planner.hold == 1:
+            return None
+        return Hold(self.scenario.planner.hold, self.hardness)
+
+    @cached_property
+    def is_beyond_limit(self) -> NDArray[np.bool_]:
+        """Whether a control is harder than the best control of a state: (S, U)."""
+        return np.asarray(self.hardness > self.hardness[self.plan_by_states.control_index, None])
+
+    @cached_property
+    def is_needless(self) -> NDArray[np.bool_]:
+        """Whether a control is gentler than the best control of a state: (S, U)."""
+        return np.asarray(self.hardness < self.hardness[self.plan_by_states.control_index, None])
+
+    def _belief_policy(self, plan: PlannedPolicy) -> BeliefPolicy | RiskPolicy | None:
         """Return the policy on the belief; None if the policy by states decides."""
-        if isinstance(self.policy, BeliefPolicy):
+        if isinstance(self.policy, BeliefPolicy | RiskPolicy):
             return self.policy
+        if self.scenario.planner.risk is not None:
+            return RiskPolicy(
+                self.is_beyond_limit.astype(np.float64),
+                np.argsort(-self.hardness, kind="stable"),
+                self.scenario.planner.risk,
+            )
         if self.scenario.planner.policy == "qmdp":
             # QMDP averages the returns of the fully observed problem over the belief: one vector of
             # returns for each control (Littman, Cassandra and Kaelbling 1995).
@@ -311,6 +351,7 @@ class Knowledge:
             estimator=estimator or self.estimator,
             safest=self.safest_control,
             on_belief=policy_on_belief,
+            hold=self.hold,
         )
 
     @property
@@ -479,122 +520,3 @@ def prepare_without_folder(
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
         return prepare_knowledge(scenario, source, scenario.mission.seed)
-
-
-KNOWLEDGE_NAME = "twin.npz"
-"""The file of a run folder with what the twin knew before its flight."""
-EARLIER_KNOWLEDGE = "twin_{}.npz"
-"""The same for the models that a watch believed earlier, by their numbers from 0."""
-CALIBRATION_NAME = "calibration.json"
-"""The file of a run folder with the record of the calibration."""
-
-
-def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
-    """Write what a twin knows before its flight to a file; equal knowledge gives equal bytes.
-
-    If the calibration has a record, it is written to a second file.
-
-    The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); with a policy on
-    the belief also `belief_vectors` (N, S) and `belief_control` (N,); and `true` (E, S, U, G), SI,
-    if the sensors do not show the values of the structure itself.
-
-    Parameters
-    ----------
-    folder : Path
-        The path of the run folder.
-    knowledge : Knowledge
-        The knowledge to write.
-    number : int, optional
-        The number of an earlier model of a watch, from 0; left out for the last or only one.
-
-    Raises
-    ------
-    FileNotWrittenError
-        If the disk is full or the folder cannot be written.
-    """
-    arrays: dict[str, Any] = {
-        "predicted": knowledge.predicted,
-        "draws": knowledge.draws.values,
-        "policy": knowledge.plan.policy,
-    }
-    if knowledge.plan.on_belief is not None:
-        for name, array in vars(knowledge.plan.on_belief).items():
-            arrays[f"belief_{name}"] = array
-    if knowledge.true_values is not None:
-        arrays["true"] = knowledge.true_values
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    name = KNOWLEDGE_NAME if number is None else EARLIER_KNOWLEDGE.format(number)
-    atomic_write_bytes(folder / name, content.getvalue())
-    if knowledge.draws.record is not None:
-        text = json.dumps(knowledge.draws.record, sort_keys=True, allow_nan=False)
-        atomic_write_text(folder / CALIBRATION_NAME, text + "\n")
-
-
-def link_knowledge(folder: Path, other_folder: Path) -> None:
-    """Put the knowledge file of `folder` into `other_folder`, if it has none.
-
-    The file is a hard link if the file system allows it, and a copy otherwise.
-    """
-    if (other_folder / KNOWLEDGE_NAME).exists():
-        return
-    try:
-        os.link(folder / KNOWLEDGE_NAME, other_folder / KNOWLEDGE_NAME)
-    except OSError:
-        content = (folder / KNOWLEDGE_NAME).read_bytes()
-        atomic_write_bytes(other_folder / KNOWLEDGE_NAME, content)
-
-
-def load_knowledge(
-    folder: Path, scenario: Scenario, number: int | None = None, parts: TwinParts = NO_PARTS
-) -> Knowledge:
-    """Return the knowledge that the twin of a run had before its flight.
-
-    Parameters
-    ----------
-    folder : Path
-        The path of the run folder.
-    scenario : Scenario
-        The scenario in its `config.json`.
-    number : int, optional
-        The number of an earlier model of a watch, from 0; the last model if there is no such file.
-    parts : TwinParts
-        The sensor model and the estimator that a user gives in the place of the scenario's.
-
-    Raises
-    ------
-    RunFolderError
-        If the file is missing or damaged, or belongs to another scenario.
-    """
-    path = folder / EARLIER_KNOWLEDGE.format(number)
-    if not path.is_file():
-        path = folder / KNOWLEDGE_NAME
-    try:
-        with np.load(path, allow_pickle=False) as stored_arrays:
-            predicted_readings = np.asarray(stored_arrays["predicted"], dtype=np.float64)
-            draws = np.asarray(stored_arrays["draws"], dtype=np.float64)
-            policy: Float | BeliefPolicy = np.asarray(stored_arrays["policy"], dtype=np.float64)
-            true_values = None
-            if "true" in stored_arrays:
-                true_values = np.asarray(stored_arrays["true"], dtype=np.float64)
-            if "belief_control" in stored_arrays:
-                policy = BeliefPolicy.from_arrays(stored_arrays, "belief_")
-        calibration = scenario.calibration
-        parameter = ParameterDraws(
-            calibration.parameter,
-            draws,
-            float(draws.mean()),
-            float(draws.std()),
-            calibration.source,
-        )
-        model = build_graphical_model(scenario)
-        knowledge = Knowledge(
-            scenario, model, parameter, predicted_readings, policy, true_values, parts
-        )
-        _ = knowledge.plan  # planned now, so that arrays of another shape are refused here
-        return knowledge
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RunFolderError(
-            f"{path} is missing, damaged or of another scenario ({error}): "
-            "fly the run again with --replace."
-        ) from error

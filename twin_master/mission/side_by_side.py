@@ -22,7 +22,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, OperatedStep, Reading, Source
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
-from twin_master.network.planner import ration_controls
+from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, Twin, unbelievable_observation
 from twin_master.scenario.schema import Scenario
 
@@ -282,6 +282,7 @@ class TwinsSideBySide:
         self.steps = 0
         self.previous_control: Index = np.full(count, NO_CONTROL)
         self.proposed_control: Index = np.full(count, twin.proposed_control)
+        self._proposals: Index = np.zeros(count, dtype=np.int64)
         self._twin = twin
         self._flights = flights
         self._filter = ExactFilter(twin.model, twin.sensor_model, twin.name)
@@ -365,10 +366,14 @@ class TwinsSideBySide:
     def _decide(self, beliefs: Float, unexplained: Float) -> Index:
         """Return the next control of each of B twins, within the budget of inspections."""
         probability = self._twin.control_probabilities(beliefs, self.previous_control, unexplained)
+        if self._twin.hold is not None:
+            probability, self._proposals = self._twin.hold.apply(
+                probability, self.previous_control, self._proposals
+            )
         control = np.argmax(probability, axis=1)
         budget = self._scenario.planner.inspections_per_step
         policy_on_belief = self._twin.on_belief
-        if budget is not None and policy_on_belief is not None:
+        if budget is not None and isinstance(policy_on_belief, BeliefPolicy):
             flying = np.flatnonzero(self._flights.is_flying)
             control[flying] = ration_controls(
                 self._twin.model.transition,

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float, nan_where_masked, product_of_each
+from reporting.arrays import Float, Index, nan_where_masked, product_of_each
 from reporting.words import brief, comma_list
 from twin_master.errors import InvalidModelError
 from twin_master.network.transition import (
@@ -132,6 +132,45 @@ class StateSpace:
         pairs = zip(self.factors, levels, strict=True)
         indices = [factor.index(value) for factor, value in pairs]
         return int(np.ravel_multi_index(indices, self.shape))
+
+    def nearest(self, values: ArrayLike) -> Index:
+        """Return the index of the joint state nearest to values of the factors: (..., F) -> (...).
+
+        Half-way between two levels the higher one is taken, as also within rounding of that.
+        """
+        table = nan_where_masked(values)
+        level_of_factor = []
+        for axis, factor in enumerate(self.factors):
+            levels = np.asarray(factor.levels)
+            half_way = 0.5 * (levels[1:] + levels[:-1]) - factor.slack
+            level_of_factor.append(np.searchsorted(half_way, table[..., axis], side="right"))
+        return np.asarray(np.ravel_multi_index(level_of_factor, self.shape), dtype=np.int64)
+
+    def interpolate(self, table: ArrayLike, values: ArrayLike) -> Float:
+        """Return a function of the state at values of the factors between the levels.
+
+        The function is linear in each factor between its levels, and constant beyond them.
+
+        Parameters
+        ----------
+        table : (S, N) array
+            N functions of the state.
+        values : (..., F) array
+            The values of the factors, SI.
+
+        Returns
+        -------
+        (..., N) array
+            The functions at these values; NaN where a value is NaN.
+        """
+        from scipy.interpolate import RegularGridInterpolator  # slow to import
+
+        levels = [np.asarray(factor.levels) for factor in self.factors]
+        lowest = [of_factor[0] for of_factor in levels]
+        highest = [of_factor[-1] for of_factor in levels]
+        grid = np.asarray(table, dtype=np.float64).reshape(*self.shape, -1)
+        within_levels = np.clip(nan_where_masked(values), lowest, highest)
+        return np.asarray(RegularGridInterpolator(levels, grid)(within_levels))
 
     def certain(self, levels: Sequence[float]) -> Float:
         """Return the belief (S,) that is certain of the given levels."""

@@ -114,6 +114,104 @@ class BeliefPolicy:
 
 
 @dataclass(frozen=True)
+class RiskPolicy:
+    """A policy that takes the hardest control whose risk is below a level.
+
+    The risk of a control is the probability that it is beyond the limit: harder than the best
+    control of the state. It is averaged over the belief, and so over all hypotheses about the
+    sensors that are mixed into the belief. If no state explains the sensors, the state is taken to
+    be the worst one for each control.
+
+    Attributes
+    ----------
+    beyond_limit : (S, U) array
+        The probability that a control is beyond the limit in a state; zero for one control at
+        least, so that one is always allowed.
+    hardest_first : (U,) array
+        The indices of the controls from the hardest to the gentlest.
+    level : float
+        The risk below which a control is allowed, in (0, 1].
+    """
+
+    beyond_limit: Float
+    hardest_first: Index
+    level: float
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, AnyArray], prefix: str = "") -> RiskPolicy:
+        """Return the policy whose fields were stored as arrays, each named `{prefix}{field}`."""
+        return cls(
+            np.asarray(arrays[f"{prefix}beyond_limit"], dtype=np.float64),
+            np.asarray(arrays[f"{prefix}hardest_first"], dtype=np.int64),
+            float(arrays[f"{prefix}level"]),
+        )
+
+    def risk(self, belief: ArrayLike, unexplained: ArrayLike = 0.0) -> Float:
+        """Return the probability of each control to be beyond the limit: (..., S) -> (..., U).
+
+        Parameters
+        ----------
+        belief : (..., S) array
+            The belief about the state, given that some state explains the sensors.
+        unexplained : (...) array
+            The probability that no state explains the sensors.
+        """
+        doubt = np.asarray(unexplained, dtype=np.float64)[..., None]
+        explained_risk = product_of_each(checked_beliefs(belief), self.beyond_limit)
+        worst_risk = self.beyond_limit.max(axis=0)
+        return np.asarray((1.0 - doubt) * explained_risk + doubt * worst_risk)
+
+    def decide(self, belief: ArrayLike, unexplained: ArrayLike = 0.0) -> Index:
+        """Return the index of the control to take: beliefs (..., S) -> (...), as for `risk`."""
+        is_allowed = self.risk(belief, unexplained)[..., self.hardest_first] < self.level
+        return np.asarray(self.hardest_first[np.argmax(is_allowed, axis=-1)])
+
+
+@dataclass(frozen=True)
+class Hold:
+    """The rule that a harder control is taken only if it is proposed several times in a row.
+
+    Attributes
+    ----------
+    proposals : int
+        The number of proposals in a row that a change to a harder control needs.
+    hardness : (U,) array
+        The rank of each control, larger for a harder one.
+    """
+
+    proposals: int
+    hardness: Index
+
+    def apply(
+        self, probability: Float, control: Index, proposals_before: Index
+    ) -> tuple[Float, Index]:
+        """Return the probabilities of the next controls (B, U), and the proposals in a row (B,).
+
+        As long as a change to a harder control is held, the probabilities of all harder controls
+        are added to that of the control in force.
+
+        Parameters
+        ----------
+        probability : (B, U) array
+            The probability of each next control by the policy.
+        control : (B,) array
+            The indices of the controls in force.
+        proposals_before : (B,) array
+            How often in a row a harder control than the one in force was proposed before.
+        """
+        hardness_in_force = self.hardness[control]
+        is_harder = self.hardness > hardness_in_force[:, None]  # (B, U)
+        twins = np.arange(len(control))
+        proposes_harder = is_harder[twins, np.argmax(probability, axis=1)]
+        proposals = np.where(proposes_harder, proposals_before + 1, 0)
+        is_held = proposes_harder & (proposals < self.proposals)
+        held_back = np.where(is_held[:, None] & is_harder, probability, 0.0)
+        held_probability = probability - held_back
+        held_probability[twins, control] += held_back.sum(axis=1)
+        return held_probability, np.asarray(proposals, dtype=np.int64)
+
+
+@dataclass(frozen=True)
 class PlannedPolicy:
     """A policy of S states and U controls with its value.
 
@@ -127,7 +225,7 @@ class PlannedPolicy:
         p(U | D), row-stochastic.
     iterations : int
         The number of sweeps of value iteration; zero if the policy was given.
-    on_belief : BeliefPolicy or None
+    on_belief : BeliefPolicy, RiskPolicy or None
         A policy that decides by the belief. If it is given, `policy` serves only to predict.
     """
 
@@ -135,7 +233,7 @@ class PlannedPolicy:
     action_value: Float
     policy: Float
     iterations: int
-    on_belief: BeliefPolicy | None = None
+    on_belief: BeliefPolicy | RiskPolicy | None = None
 
     @cached_property
     def control_index(self) -> Index:
@@ -148,7 +246,7 @@ def decision_probability(
     filtered_belief: Float,
     control: Index,
     policy: Float,
-    on_belief: BeliefPolicy | None = None,
+    on_belief: BeliefPolicy | RiskPolicy | None = None,
     *,
     ahead: bool = False,
     unexplained: Float | None = None,
@@ -168,19 +266,25 @@ def decision_probability(
         The control in force in step t.
     policy : (S, U) array
         p(U | D), which is averaged over the belief.
-    on_belief : BeliefPolicy, optional
-        A policy that takes the place of `policy`; it decides by p(D_{t+1} | o_0..o_t).
+    on_belief : BeliefPolicy or RiskPolicy, optional
+        A policy that takes the place of `policy`. A `BeliefPolicy` always decides by
+        p(D_{t+1} | o_0..o_t).
     ahead : bool
-        Whether `policy` is averaged over p(D_{t+1} | o_0..o_t) instead of `filtered_belief`.
+        Whether the other policies decide by p(D_{t+1} | o_0..o_t) instead of `filtered_belief`.
     unexplained : (B,) array, optional
         The probability that no state explains the sensors, with which the safest control is taken.
     safest : (U,) array, optional
         One for the safest control, zero for the others; only the policy decides if left out.
     """
     belief = filtered_belief
-    if ahead or on_belief is not None:
+    if ahead or isinstance(on_belief, BeliefPolicy):
         pairs = zip(control.tolist(), filtered_belief, strict=True)
         belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
+    if isinstance(on_belief, RiskPolicy):
+        # The risk contains the case that no state explains the sensors.
+        doubt_of_twin = 0.0 if unexplained is None else np.nan_to_num(unexplained)
+        controls = on_belief.decide(np.nan_to_num(belief), doubt_of_twin)
+        return np.asarray(np.eye(policy.shape[1])[controls])
     if on_belief is not None:
         # The policy is deterministic: its control has the probability one.
         # A twin whose flight has failed has no belief, and its control is not used.

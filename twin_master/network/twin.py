@@ -35,7 +35,7 @@ from twin_master.network.graphical_model import (
     worsening_table,
 )
 from twin_master.network.inference import Predicted, predict
-from twin_master.network.planner import BeliefPolicy, decision_probability
+from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy, decision_probability
 from twin_master.network.transition import checked_beliefs, checked_controls
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
@@ -151,10 +151,13 @@ class _KeptStep:
         The observed values, SI; NaN where nothing was received.
     carried : Carried
         The arrays that the estimator needs of the step.
+    proposals : int
+        How often in a row a harder control was proposed, this step included; 0 without a `Hold`.
     """
 
     observation: Float
     carried: Carried
+    proposals: int = 0
 
 
 class Twin:
@@ -190,9 +193,10 @@ class Twin:
     safest : int or str, optional
         The control to take if no state explains the sensors. If left out, that case is ignored: the
         policy decides by the belief alone.
-    on_belief : BeliefPolicy, optional
-        A policy that decides by p(D_{t+1} | o_0..o_t). If it is given, `policy` serves only to
-        predict.
+    on_belief : BeliefPolicy or RiskPolicy, optional
+        A policy that decides by the belief. If it is given, `policy` serves only to predict.
+    hold : Hold, optional
+        How often a change to a harder control must be proposed in a row; once if left out.
 
     Raises
     ------
@@ -216,7 +220,8 @@ class Twin:
         first_control: int | str = 0,
         estimator: Estimator | None = None,
         safest: int | str | None = None,
-        on_belief: BeliefPolicy | None = None,
+        on_belief: BeliefPolicy | RiskPolicy | None = None,
+        hold: Hold | None = None,
     ) -> None:
         require_one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
@@ -230,6 +235,7 @@ class Twin:
         self.prediction_steps = prediction_steps
         self.decide_on = decide_on
         self.on_belief = on_belief
+        self.hold = hold
         self.lag = lag
         # The present step, `lag` steps before it, and one more: to filter the first of these again,
         # the arrays carried on from the step before it are needed.
@@ -343,7 +349,9 @@ class Twin:
             The observation and the control in force of each step.
         """
         kept_before = first - self._first_in_memory
-        previous_carried = self._kept_steps[kept_before - 1].carried if kept_before else None
+        step_before = self._kept_steps[kept_before - 1] if kept_before else None
+        previous_carried = step_before.carried if step_before else None
+        proposals = step_before.proposals if step_before else 0
         new_steps: list[_KeptStep] = []
         notices: list[Notice] = []
         for step, (observation, control_index) in enumerate(rows, start=first):
@@ -359,14 +367,16 @@ class Twin:
             # False for NaN as well.
             if not all(np.all(np.asarray(part) < LARGEST_CARRIED) for part in numbers):
                 raise unbelievable_observation(self.name, step)
-            new_steps.append(_KeptStep(observation, previous_carried))
+            proposals_before = proposals
+            proposals = self._proposals_after(estimate, proposals_before)
+            new_steps.append(_KeptStep(observation, previous_carried, proposals))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
         for _ in range(len(self._kept_steps) - kept_before):
             self._kept_steps.pop()
         self._kept_steps.extend(new_steps)
         self._steps = first + len(rows)
-        return self._decide(replace(estimate, notices=tuple(notices)))
+        return self._decide(replace(estimate, notices=tuple(notices)), proposals_before)
 
     def observed(self, step: int) -> Float:
         """Return the observation (G,) of a kept step; NaN for a sensor without a reading."""
@@ -417,6 +427,8 @@ class Twin:
         for index, kept_step in enumerate(kept_steps):
             arrays[f"{index}/observation"] = kept_step.observation
             arrays[f"{index}/control"] = np.array(kept_step.carried.control_index)
+            if self.hold is not None:
+                arrays[f"{index}/proposals"] = np.array(kept_step.proposals)
             for name, value in kept_step.carried.arrays.items():
                 arrays[f"{index}/carried/{name}"] = value
         return arrays_to_bytes(arrays)
@@ -491,10 +503,27 @@ class Twin:
             safest=self._safest,
         )
 
-    def _decide(self, estimate: Estimate) -> TwinStep:
+    def _proposals_after(self, estimate: Estimate, proposals_before: int) -> int:
+        """Return how often in a row a harder control is proposed, with that after an estimate."""
+        if self.hold is None:
+            return 0
+        control = np.array([estimate.carried.control_index])
+        unexplained = np.array([estimate.unexplained])
+        probability = self.control_probabilities(estimate.filtered[None], control, unexplained)
+        _, proposals = self.hold.apply(probability, control, np.array([proposals_before]))
+        return int(proposals[0])
+
+    def _decide(self, estimate: Estimate, proposals_before: int) -> TwinStep:
         """Return an estimate with prediction and decision, and set the proposed control.
 
         With the probability that no state explains the sensors, the safest control is taken.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            The estimate of the last step.
+        proposals_before : int
+            How often in a row a harder control was proposed before the step.
         """
         control_index = estimate.carried.control_index
         unexplained = estimate.unexplained
@@ -513,6 +542,11 @@ class Twin:
         probability, *under_hypotheses = self.control_probabilities(
             beliefs, controls_in_force, doubt
         )
+        if self.hold is not None:
+            held_probability, _ = self.hold.apply(
+                probability[None], controls_in_force[:1], np.array([proposals_before])
+            )
+            probability = held_probability[0]
         self._proposed = int(np.argmax(probability))
 
         # The hypothesis that decided adds most to the probability of the proposed control.
@@ -562,4 +596,8 @@ def _kept_step_from_arrays(arrays: Mapping[str, AnyArray], index: int) -> _KeptS
         if name.startswith(prefix)
     }
     control_index = int(arrays[f"{index}/control"])
-    return _KeptStep(arrays[f"{index}/observation"], Carried(control_index, carried_arrays))
+    return _KeptStep(
+        arrays[f"{index}/observation"],
+        Carried(control_index, carried_arrays),
+        int(arrays.get(f"{index}/proposals", 0)),
+    )

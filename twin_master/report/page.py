@@ -262,6 +262,11 @@ def _add_outcome(page: Page, run: Run) -> None:
         _add_notice(page, notice)
     if any(" DIR" in notice for notice in notices):
         page.add_paragraph("DIR is the folder of this page.")
+    if not notices and run.get("notice/none_of_these") is not None:
+        page.add_paragraph(
+            f"No notice was given. That does not prove the {run.sensors.word}s right: a fault that "
+            "moves all of them towards what another state would show is taken for that state."
+        )
     _add_notice(page, _true_parameter_sentence(run))
     is_lost = np.isnan(run.observations)
     if is_lost.any():

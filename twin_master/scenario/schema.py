@@ -67,6 +67,7 @@ class Scenario(ScenarioTables):
         groups = [FigureGroup("fallback", {})]
         groups += [FigureGroup("error", {"state": name}) for name in self.state_names]
         groups += [FigureGroup("reward", {"reward": name}) for name in REWARD_NAMES]
+        groups.append(FigureGroup("earned", {}))
         groups += self._parameter_figure_groups()
         groups.append(FigureGroup("evidence", {}))
         if self.learning is not None:
@@ -153,6 +154,10 @@ class Scenario(ScenarioTables):
         """
         changed_table = getattr(self, table).model_copy(update=changes)
         return self.model_copy(update={table: changed_table})
+
+    def with_policy(self, name: str) -> Self:
+        """Return the scenario with a policy by its name, such as "risk 0.05, hold 3"."""
+        return self.model_copy(update={"planner": self.planner.with_policy(name)})
 
     def _file_tables(self) -> dict[str, FileSection]:
         """Return the tables whose files a run folder has copies of, by name."""

@@ -1,5 +1,6 @@
 """Tables of a scenario: transitions, the truth, actions, learning, notices and the watch."""
 
+import re
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from itertools import pairwise
@@ -9,7 +10,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 from pydantic import BeforeValidator, Field
 
 from reporting.json_file import JsonRecord
-from reporting.toml_file import Check, NotNegative, Number, Positive
+from reporting.toml_file import Check, NotNegative, Number, Positive, validate
+from twin_master.errors import ScenarioError
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
@@ -345,6 +347,17 @@ class Action(Section):
         )
 
 
+_POLICY_NAME = re.compile(
+    r"(?P<policy>mode|qmdp|belief|risk (?P<risk>[0-9.]+))?(?:(?:^|, )hold (?P<hold>[0-9]+))?"
+)
+"""The name of a policy, such as "qmdp" or "risk 0.05, hold 3"."""
+
+
+def is_policy_name(text: str) -> bool:
+    """Return whether a text is the name of a policy that every scenario has."""
+    return bool(text) and _POLICY_NAME.fullmatch(text) is not None
+
+
 class Planner(Section):
     """How the twin decides: value iteration, eq. (36), or planning on the belief."""
 
@@ -355,16 +368,51 @@ class Planner(Section):
     predicted."""
     safest: Name | None = None
     """The control if no state explains the sensors; by default the one with the least load."""
-    policy: Literal["mode", "qmdp", "belief"] = "mode"
+    policy: Literal["mode", "qmdp", "belief", "risk"] = "mode"
     """`mode`: the most probable one of the best controls of each state; `qmdp`: the best control in
     the mean over the states, as if they were known from the next step on; `belief`: the control
-    that is planned on the belief."""
+    that is planned on the belief; `risk`: the hardest control whose risk is below `risk`."""
+    risk: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] | None = None
+    """`risk`: the probability to be beyond the limit below which a control is taken, over the
+    hypotheses about states and sensors. A control is beyond the limit in a state whose best control
+    is a gentler one [1]."""
+    hold: Count = 1
+    """How often in a row a harder control must be proposed before it is taken; gentler ones are
+    taken at once."""
     limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
     """`belief`: the fraction of the steps, discounted, in which a health limit may be exceeded
     [1]."""
 
     inspections_per_step: Count | None = None
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
+
+    @property
+    def policy_name(self) -> str:
+        """The name of the policy, such as "mode" or "risk 0.05, hold 3"."""
+        name = self.policy if self.risk is None else f"risk {self.risk:g}"
+        return name if self.hold == 1 else f"{name}, hold {self.hold}"
+
+    def with_policy(self, name: str) -> "Planner":
+        """Return the table with the policy of a name, see `policy_name`.
+
+        A name without a policy, such as "hold 3", keeps that of the table.
+
+        Raises
+        ------
+        ScenarioError
+            If the name has a number that is out of range.
+        """
+        match = _POLICY_NAME.fullmatch(name)
+        assert match is not None, name
+        keys = self.model_dump()
+        if match["policy"]:
+            keys |= {"policy": match["policy"].split()[0], "risk": None}
+            if match["policy"] not in ("belief", self.policy):
+                keys["limit_probability"] = None
+            if match["risk"]:
+                keys["risk"] = float(match["risk"])
+        keys["hold"] = int(match["hold"] or 1)
+        return validate(Planner, keys, f"the policy {name!r}", ScenarioError, what="a policy")
 
     def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: keys of another policy."""
@@ -373,7 +421,11 @@ class Planner(Section):
             "`planner.limit_probability` needs `planner.policy` `belief`",
         )
         yield (
-            self.inspections_per_step is not None and self.policy == "mode",
+            (self.risk is None) == (self.policy == "risk"),
+            "`planner.policy` `risk` and the probability `planner.risk` need each other",
+        )
+        yield (
+            self.inspections_per_step is not None and self.policy in ("mode", "risk"),
             "`planner.inspections_per_step` needs `planner.policy` `belief` or `qmdp`",
         )
 

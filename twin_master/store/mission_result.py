@@ -11,6 +11,7 @@ import numpy as np
 from reporting.arrays import Float
 from reporting.json_file import JsonObject, plain
 from reporting.words import capital, parameter_title
+from twin_master.mission.earnings import Earnings, discounted_return, earnings
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, spans_of_models
@@ -321,6 +322,27 @@ class MissionResult:
         """What the twin knew, each with the steps in which it did."""
         models = self.models or [BelievedModel(0, self.knowledge)]
         return spans_of_models(self.flight, models)
+
+    @cached_property
+    def earned(self) -> Earnings:
+        """What the controls earn in each step, by the model that the twin believed in it."""
+        flight = self.flight
+        step_count = len(flight.steps)
+        state = np.full((step_count, len(self.scenario.state)), np.nan)
+        if flight.simulated:
+            state = flight.state
+        earned_in_spans = []
+        for knowledge, span in self.spans:
+            earned_in_spans.append(
+                earnings(knowledge, flight.control_index[span], flight.filtered[span], state[span])
+            )
+        return Earnings.concatenate(earned_in_spans)
+
+    @property
+    def discounted_return(self) -> float:
+        """The sum of the rewards of the steps, discounted."""
+        control = self.flight.control_index
+        return float(discounted_return(self.scenario, self.earned.reward, control))
 
     @property
     def parameter_unit(self) -> str:

@@ -14,6 +14,7 @@ from reporting.table_file import table_text
 from twin_master.learning.expectation import Expectation, concatenate_expectations
 from twin_master.mission.plant import SensorStatus, Truth
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
+from twin_master.network.planner import BeliefPolicy
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
@@ -65,6 +66,8 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     groups["filtered"] = _filtered_group(result, builder)
     groups["smoothed"] = _smoothed_group(result, builder)
     groups["predicted"] = _predicted_group(result, builder)
+    earned = {**vars(result.earned), "return": result.discounted_return}
+    groups["earned"] = builder.group("earned", _plain_entries(earned))
     policy = {
         "control_index": plan.control_index,
         "action_value": plan.action_value,
@@ -184,8 +187,9 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     #   "policy averaged over {decided_on}; its mode is the control of the next step",
     #   "observation minus its filtered mean, in the standard deviations {how}".
     belief_of_decision = result.scenario.planner.decide_on
-    plans_over_beliefs = result.knowledge.plan.on_belief is not None
-    if plans_over_beliefs:  # such a plan always decides by the predicted belief
+    if isinstance(
+        result.knowledge.plan.on_belief, BeliefPolicy
+    ):  # such a plan always decides by the predicted belief
         belief_of_decision = "predicted"
     learns = result.knowledge.learning is not None
     fields = {

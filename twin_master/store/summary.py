@@ -257,6 +257,8 @@ def summarise(
     groups = [*first_groups]
     groups += _truth_figures(result) if result.flight.simulated else _watched_figures(result)
     groups += _reward_figures(reward_mean, result.scenario.mission.step_name)
+    if result.flight.simulated:
+        groups.append(_earned_figures(result))
     groups += _parameter_figures(result)
     groups.append(FigureGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
     groups += _learnt_figures(result)
@@ -300,6 +302,17 @@ def _reward_figures(reward_mean: Float, step_name: str) -> Iterator[FigureGroup]
         finite = rewards[np.isfinite(rewards)]
         mean = float(finite.mean()) if len(finite) else None
         yield FigureGroup("reward", {"reward": name, "step": step_name}, [mean])
+
+
+def _earned_figures(result: MissionResult) -> FigureGroup:
+    """Return the discounted return, and the percentages of steps beyond the limit and needless."""
+    earned = result.earned
+    values = [
+        result.discounted_return,
+        100.0 * float(np.mean(earned.beyond_limit)),
+        100.0 * float(np.mean(earned.needless)),
+    ]
+    return FigureGroup("earned", {"step": result.scenario.mission.step_name}, values)
 
 
 def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:

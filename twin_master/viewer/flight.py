@@ -30,7 +30,8 @@ from twin_master.learning.expectation import (
 )
 from twin_master.mission.journal import JOURNAL_NAME, records_in_file
 from twin_master.mission.journal_packing import array_from_json
-from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, load_knowledge
+from twin_master.mission.knowledge_file import KNOWLEDGE_NAME, load_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.recent_parts import RecentParts
 from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict

@@ -31,8 +31,9 @@ from twin_master.mission.journal import (
     records_backwards,
     short_record,
 )
+from twin_master.mission.knowledge_file import link_knowledge, save_knowledge
 from twin_master.mission.loop import log_notices, operate
-from twin_master.mission.preparation import link_knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.recent_parts import RecentParts, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep

@@ -30,13 +30,13 @@ from twin_master.errors import (
     RunFolderError,
 )
 from twin_master.fleet import flight
+from twin_master.fleet.comparison import earned_figures, group_figures
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.members import Member
 from twin_master.fleet.outcomes import Outcomes
 from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.reading import group_figures
 from twin_master.fleet.shard import result_of_unflown
 from twin_master.fleet.storage.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
 from twin_master.fleet.storage.store_address import STORE_NAME
@@ -95,15 +95,20 @@ def former_group(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> xr.Da
 
 
 def test_a_store_of_an_earlier_version_is_read_with_one_sentence(former_group, present_group):
-    assert former_group.equals(present_group)
-    assert group_figures(former_group) == group_figures(present_group)
+    """It has no rewards."""
+    assert former_group.equals(present_group.drop_nodes("earned"))
+    present_figures = group_figures(present_group)
+    former_figures = group_figures(former_group)
+    assert former_figures == {key: present_figures[key] for key in former_figures}
+    assert set(present_figures) - set(former_figures) == set(earned_figures(present_group))
 
 
 def test_variables_of_a_store_of_an_earlier_version_have_their_present_attributes(
     former_group, present_group
 ):
-    for node in present_group.subtree:
-        former = former_group[node.relative_to(present_group)]
+    known_groups = present_group.drop_nodes("earned")
+    for node in known_groups.subtree:
+        former = former_group[node.relative_to(known_groups)]
         for name, variable in node.variables.items():
             assert former[name].attrs == variable.attrs, name
 
@@ -458,6 +463,56 @@ def test_the_command_compares_fleets(flown_by_command):
     assert [group["twins"] for group in compared.values()] == [3, 2]
 
 
+@pytest.fixture(scope="module")
+def compared_policies(flown_by_command, library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What is said of three seeds under the paper's policy and, a copy apart, under one by risk."""
+    first, _, _ = flown_by_command
+    folder = tmp_path_factory.mktemp("risk")
+    text = text_of("growing_damage", ("[planner]", '[planner]\npolicy = "risk"\nrisk = 0.05\nhold = 2'))
+    words = ("run", written(folder, text), "--strain-library", library_file, "--workers", 0, "--seeds", "0:3")
+    said(*words, "--out", folder / "risk", "--no-report")
+    picture = folder / "returns.svg"
+    record = json.loads(said("compare", first, folder / "risk", "--picture", picture, "--json"))
+    return first, folder / "risk", record, picture
+
+
+def test_policies_are_compared_by_name(compared_policies):
+    assert [group["policy"] for group in compared_policies[2].values()] == ["mode", "risk 0.05, hold 2"]
+
+
+def test_returns_are_compared_seed_by_seed(compared_policies):
+    first, second, record, _ = compared_policies
+    (one,), (other,) = (open_fleet(folder).children.values() for folder in (first, second))
+    difference = (other["earned/return"] - one["earned/return"].values).values
+    compared = record[str(second)][f"return beyond {first}"]
+    assert compared["value"] == pytest.approx(difference.mean())
+    assert compared["error"] == pytest.approx(difference.std(ddof=1) / np.sqrt(3))
+
+
+def test_the_shares_of_all_controls_are_one(compared_policies):
+    for figures in compared_policies[2].values():
+        assert figures["steps with 2g"]["value"] + figures["steps with 3g"]["value"] == pytest.approx(1.0)
+
+
+def test_what_was_promised_stands_beside_what_was_flown(compared_policies):
+    for figures in compared_policies[2].values():
+        keys = list(figures)
+        assert keys.index("return promised") - keys.index("return") in (1, 2)
+
+
+def test_the_returns_are_drawn(compared_policies):
+    assert b"<svg" in compared_policies[3].read_bytes()
+
+
+def test_a_run_and_a_fleet_store_the_same_rewards(flown_by_command, library_file, tmp_path):
+    (group,) = open_fleet(flown_by_command[0]).children.values()
+    new_run("growing_damage", tmp_path / "run", {"seed": 2, "strain_library": library_file}, report=False)
+    earned = open_run(tmp_path / "run")["earned"]
+    for name in ("reward", "health", "beyond_limit", "needless"):
+        assert group[f"earned/{name}"][2].values == pytest.approx(earned[name].values, rel=1e-6), name
+    assert float(group["earned/return"][2]) == pytest.approx(float(earned["return"]), rel=1e-12)
+
+
 def test_a_store_that_lacks_a_variable_is_refused(flown_by_command, tmp_path):
     first, second, _ = flown_by_command
     damaged = shutil.copytree(second, tmp_path / "b")
@@ -547,6 +602,14 @@ def inspected(library_file: Path) -> Side:
 def test_each_inspected_twin_flies_what_it_flies_alone(inspected):
     assert inspected.knowledge.model.transition.is_product is False
     check_flown_alone(inspected)
+
+
+@pytest.mark.parametrize("keys", [{"hold": 3}, {"policy": "risk", "risk": 0.1, "hold": 2}])
+def test_each_twin_with_a_safer_policy_flies_what_it_flies_alone(library_file, keys):
+    knowledge, asset = known("growing_damage", library_file)
+    safer = replace(knowledge, scenario=knowledge.scenario.with_changes("planner", **keys))
+    side = flown_side_by_side(safer, asset)
+    check_flown_alone(side)
 
 
 def test_a_region_is_sound_behind_its_repair(inspected):

@@ -18,6 +18,7 @@ from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
+from twin_master.fleet.comparison import outcomes_of_group
 from twin_master.fleet.configuration import fleet_config, group_folder
 from twin_master.fleet.learning.evidence import (
     TransitionFamily,
@@ -44,14 +45,9 @@ from twin_master.fleet.page.overview import overview_of_group
 from twin_master.fleet.page.report import fleet_page, write_fleet_report
 from twin_master.fleet.page.view import ATTENTION_ROWS
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.reading import (
-    ControlForecast,
-    outcomes_of_group,
-    probability_of_leaving,
-    severity,
-)
+from twin_master.fleet.reading import ControlForecast, probability_of_leaving, severity
 from twin_master.fleet.storage.store_layout import ALL_ROWS, observation_rows, row_blocks
-from twin_master.mission.preparation import load_knowledge, save_knowledge
+from twin_master.mission.knowledge_file import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario

@@ -18,10 +18,10 @@ from tests.twin_master.fleet.recordings import (
     write_fleet,
 )
 from tests.twin_master.runs import journal
+from twin_master.fleet.comparison import group_figures
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.reading import group_figures
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
 
 NOTICES = ("alarm", "gauge_left_out")

@@ -13,13 +13,14 @@ from reporting.files import TEMPORARY_SUFFIX
 from tests.twin_master.runs import written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
+from twin_master.fleet.comparison import group_figures
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.members import ListedMembers, RecordedMembers
 from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import Fleet, Group, ensemble, load_fleet
-from twin_master.fleet.reading import group_figures, open_groups
+from twin_master.fleet.reading import open_groups
 from twin_master.fleet.storage.chunk_file import ChunkFile
 from twin_master.fleet.storage.store_writing import CHUNKS_PER_FILE, _ChunkCodec
 from twin_master.mission.journal import JournalFile

@@ -20,6 +20,8 @@ from twin_master.errors import FleetError
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
+from twin_master.mission.earnings import discounted_return, earnings, promised_return
+from twin_master.mission.knowledge_file import load_knowledge
 from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     compare_simple_rules,
@@ -28,7 +30,7 @@ from twin_master.mission.planning import (
     share_beyond_limit,
     simulate_policy,
 )
-from twin_master.mission.preparation import Knowledge, load_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, ration_controls
@@ -258,9 +260,8 @@ def planned() -> tuple[Any, Any]:
 def flown_and(known: Knowledge, mean: float, half_width: float) -> tuple[float, float]:
     """Return what 300 flown missions bring, and half its 99 % interval: what was said lies inside."""
     flown = side_by_side(known, 300)
-    place = np.rint(flown.state / 0.4).astype(int) @ (2, 1)
-    reward = known.planning_reward[place, flown.control_index]
-    total = reward @ known.scenario.planner.gamma ** np.arange(reward.shape[1])
+    earned = earnings(known, flown.control_index, flown.filtered, flown.state)
+    total = discounted_return(known.scenario, earned.reward, flown.control_index)
     half = 2.58 * total.std() / np.sqrt(len(total))
     assert abs(total.mean() - mean) <= np.hypot(half, 2.58 / 1.96 * half_width)
     return total.mean(), half
@@ -280,6 +281,13 @@ def test_simpler_rules_bring_what_is_said_of_them(decide_on, monkeypatch):
         known = of_wing(scenario(*FOUR_STATES, policy=policy, decide_on=decide_on))[0]
         rule = compare_simple_rules(known.scenario, planned()[0])[policy == "qmdp"]
         flown_and(known, rule.mean, rule.half_width)
+
+
+def test_the_promise_of_a_plan_is_that_of_its_twin():
+    known, (problem, plan) = knowledge(*FOUR_STATES), planned()
+    said = simulate_policy(known.scenario, problem, plan.policy)
+    promised = promised_return(following(known, plan.policy))
+    assert np.array_equal(promised.returns, said.returns)
 
 
 def test_a_limit_is_kept_by_the_plan():

@@ -10,7 +10,7 @@ from tests.conftest import synthetic_calibration
 from twin_master.feeds.rejected import REJECTED_NAME, RejectedFile
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import JOURNAL_NAME, encode_line, records
-from twin_master.mission.preparation import load_knowledge
+from twin_master.mission.knowledge_file import load_knowledge
 from twin_master.mission.recent_parts import RECENT_NAMES
 from twin_master.run_folder import read_config, read_scenario
 from uav_twin import fly

@@ -25,7 +25,7 @@ from tests.twin_master.watch.conftest import HANGS, served, viewed
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, encode_line, record_of_line
-from twin_master.mission.preparation import KNOWLEDGE_NAME
+from twin_master.mission.knowledge_file import KNOWLEDGE_NAME
 from twin_master.viewer.flight import Flight, StepBeliefs
 from twin_master.viewer.flight_page import LATEST, FlightPage, Request
 from uav_twin import fly, load_scenario, open_run

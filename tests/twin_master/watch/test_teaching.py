@@ -19,7 +19,7 @@ from twin_master.errors import MissionInputError
 from twin_master.feeds.csv_feed import CsvFeed
 from twin_master.mission.decision_record import decision_line
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.preparation import load_knowledge, save_knowledge
+from twin_master.mission.knowledge_file import load_knowledge, save_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.store.writing import open_run

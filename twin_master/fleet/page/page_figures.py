@@ -1,12 +1,15 @@
-"""Figures of a group of assets: a map of their health, and their health over time."""
+"""Figures of groups of assets: maps of their health, their health over time, their returns."""
+
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from reporting import figures as style
 from reporting.arrays import Float
 from twin_master.fleet.reading import severity
-from twin_master.report.reading import printed_factors
+from twin_master.report.reading import NORMAL_95, printed_factors
 from twin_master.scenario.schema import Scenario
 
 _LETTERS = "abcdefgh"
@@ -102,4 +105,44 @@ def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
         axes.set_xlabel(scenario.mission.step_name)
         axes.set_ylabel(f"{factor.title} ({factor.unit})")
         style.panel_label(axes, _LETTERS[number % len(_LETTERS)])
+    return figure
+
+
+_HEIGHT_OF_GROUP = 0.42
+"""Height of the row of a group in the figure of returns [in]."""
+_LEAST_WIDTH = 1e-3
+"""Half the width of the figure of returns, as a fraction of the returns, at least."""
+
+
+@style.publication_style()
+def returns_figure(returns: Mapping[str, Float]) -> Figure:
+    """Draw the discounted returns of the flights of groups, a row for each group.
+
+    Bands hold 90 % and 50 % of the flights, the mean has its 95 % interval. Groups without a return
+    are left out.
+
+    Parameters
+    ----------
+    returns : mapping of str to (B,) array
+        The returns of the flights of each group by its name.
+    """
+    groups = {name: values for name, values in returns.items() if len(values)}
+    height = 0.75 + _HEIGHT_OF_GROUP * len(groups)
+    figure, ((axes,),) = style.panels(1, 1, height, 0.2, 0.45, left=0.3)
+    for row, values in enumerate(groups.values()):
+        low, lower_quartile, upper_quartile, high = np.quantile(values, [0.05, 0.25, 0.75, 0.95])
+        for begin, end in ((low, high), (lower_quartile, upper_quartile)):
+            axes.barh(row, end - begin, left=begin, height=0.6, color=style.PRESENT, alpha=0.2)
+        mean = float(values.mean())
+        half_width = NORMAL_95 * float(values.std()) / np.sqrt(len(values))
+        axes.errorbar(mean, row, xerr=half_width, fmt="D", color=style.PRESENT, capsize=3)
+    axes.set_yticks(range(len(groups)), list(groups))
+    axes.set_ylim(len(groups) - 0.5, -0.5)
+    axes.set_xlabel("return: rewards of a flight, discounted")
+    axes.grid(axis="x")
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    low, high = axes.get_xlim()
+    middle = 0.5 * (low + high)
+    half_width = max(0.5 * (high - low), _LEAST_WIDTH * abs(middle))
+    axes.set_xlim(middle - half_width, middle + half_width)
     return figure

@@ -19,14 +19,15 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError
+from twin_master.fleet.comparison import figure_rows, group_figures, returns_of_group
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.learning.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.page.asset_states import AssetStates, states_of_watched_assets
 from twin_master.fleet.page.overview import GroupOverview, overview_of_group
-from twin_master.fleet.page.page_figures import course_figure, map_figure
-from twin_master.fleet.reading import figure_rows, group_figures, open_groups
+from twin_master.fleet.page.page_figures import course_figure, map_figure, returns_figure
+from twin_master.fleet.reading import open_groups
 from twin_master.fleet.storage.store import WITHIN
 from twin_master.fleet.watched.watched_asset import read_standing, watched_fleet_counts
 from twin_master.report.reading import PrintedFactor, printed_factors
@@ -136,6 +137,9 @@ def _add_flown_fleet(
     WORDS.add_table(
         page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
     )
+    returns = {name: returns_of_group(group) for name, group in groups.items()}
+    if any(len(values) for values in returns.values()):
+        page.add_report_figure(WORDS.figure("returns", returns_figure(returns)))
     _add_lessons(page, folder)
 
 

@@ -24,6 +24,7 @@ from twin_master.fleet.storage.store_layout import (
     observed_columns,
     stored_layout,
 )
+from twin_master.mission.earnings import discounted_return, earnings
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
@@ -82,12 +83,16 @@ def stored_variables(
     standard_deviation = [states.standard_deviation(belief) for belief in flights.filtered]
     fallbacks = fallbacks_of(knowledge, flights)
     notices = _notices(flights)
+    earned = earnings(knowledge, flights.control_index, flights.filtered, flights.state)
+    returns = discounted_return(knowledge.scenario, earned.reward, flights.control_index)
     values: dict[str, object] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
         **_observed_variables(knowledge.scenario, flights.observation_rows),
         "observed/control_index": flights.control_index,
         "truth/state": flights.state,
+        **{f"earned/{name}": values_of_steps for name, values_of_steps in vars(earned).items()},
+        "earned/return": np.where(has_failed, np.nan, returns),
         "filtered/mean": mean,
         "filtered/standard_deviation": standard_deviation,
         "filtered/log_evidence": flights.log_evidence,
@@ -333,7 +338,10 @@ def open_group(folder: Path, group: str, *, names: bool = True) -> "xr.DataTree"
         all_names = [members.name(row) for row in range(len(members))] if names else None
         tree = in_present_layout(stored_group, scenario, all_names)
     # A path with braces is a template, such as "{input}", whose arrays differ between groups.
-    required_paths = {path for path in SCHEMA["fleet"] if "{" not in path}
+    # Stores of earlier versions have no rewards.
+    required_paths = {
+        path for path in SCHEMA["fleet"] if "{" not in path and not path.startswith("earned/")
+    }
     missing_paths = [path for path in sorted(required_paths) if path not in _paths_of(tree)]
     if missing_paths:
         raise FleetError(

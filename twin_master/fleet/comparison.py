@@ -1,0 +1,378 @@
+"""The figures of groups of fleets: what flights earned, errors and counts, side by side."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from reporting.arrays import Float
+from reporting.json_file import JsonRecord
+from reporting.words import between, plus_minus, rounded, significant
+from twin_master.fleet.configuration import fleet_config
+from twin_master.fleet.outcomes import EarnedOutcomes, Estimated, Moments, Outcomes
+from twin_master.fleet.reading import knowledge_of_scenario, notice_counts, open_groups
+from twin_master.fleet.storage.store import ENDED, FAILED, FLOWN, WITHIN, flown_rows
+from twin_master.fleet.storage.store_layout import row_blocks, stored_values
+from twin_master.mission.earnings import promised_return
+from twin_master.report.reading import NORMAL_95
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Figure = Estimated | int | str
+"""A figure of a group: an estimate, a count, or a name."""
+Figures = dict[str, dict[str, Figure]]
+"""The figures of each group, by the name of the group and of the figure."""
+
+
+def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
+    """Return the outcomes of the twins of a group of the store."""
+    return Outcomes.from_blocks(
+        partial(stored_values, group, rows=rows) for rows in row_blocks(group)
+    )
+
+
+def earned_figures(group: "xr.DataTree") -> dict[str, Figure]:
+    """Return what the flights of a group earned, by title; empty for stores without rewards."""
+    if "earned" not in group.children:
+        return {}
+    controls = list(group.attrs["controls"])
+    blocks = (partial(stored_values, group, rows=rows) for rows in row_blocks(group))
+    earned = EarnedOutcomes.from_blocks(blocks, len(controls))
+    figures: dict[str, Figure] = {
+        RETURN: earned.discounted_return,
+        "reward of a step": earned.reward,
+    }
+    for control, share in zip(controls, earned.control_share, strict=True):
+        figures[f"steps with {control}"] = share
+    figures["steps beyond the limit"] = earned.beyond_limit
+    figures["needless steps"] = earned.needless
+    figures["steps beyond a health limit"] = earned.beyond_health_limit
+    figures["changes of control"] = earned.changes
+    return figures
+
+
+def group_figures(group: "xr.DataTree") -> dict[str, Figure]:
+    """Return counts of a group's twins, and the figures of their outcomes, by title.
+
+    The figures are means over the twins with their standard errors; a group without a flown twin
+    has counts alone. Figures that need the true state are left out for real assets.
+    """
+    figures, flown_count = _counts_of_twins(group)
+    if not flown_count:
+        return figures
+    figures |= earned_figures(group)
+    outcomes = outcomes_of_group(group)
+    is_truth_known = not np.isnan(outcomes.bias[0].value)  # NaN for real assets
+    if is_truth_known:
+        if not np.isnan(outcomes.prompt_fallbacks.value):
+            steps = f"{group.attrs['step_name']}s"
+            figures[f"fallback within {WITHIN} {steps}, of those called for"] = (
+                outcomes.prompt_fallbacks
+            )
+        if not np.isnan(outcomes.early_fallbacks.value):
+            figures["early fallback"] = outcomes.early_fallbacks
+        state_unit = unit_of_states(group)
+        for name, rms, bias in zip(
+            stored_values(group, "filtered/region"), outcomes.rms, outcomes.bias, strict=True
+        ):
+            figures[f"filtered rms error of {name}"] = replace(rms, unit=state_unit)
+            figures[f"bias of {name}"] = replace(bias, unit=state_unit)
+    figures["log evidence of a step"] = outcomes.log_evidence
+    if is_truth_known:
+        figures["true state in the 90 % set"] = outcomes.credible_coverage
+    return figures
+
+
+class NamedGroup(NamedTuple):
+    """A group of a fleet, as it is compared with others.
+
+    Attributes
+    ----------
+    name : str
+        The name of the group; of several folders, with the folder, or the folder alone if it has
+        one group.
+    folder : Path
+        The folder of the fleet.
+    record : dict
+        The record of the group in `config.json`.
+    group : DataTree
+        The stored results.
+    policy : str
+        The policy that decides: the name of the scenario's, or "given" for one that the user gave.
+    """
+
+    name: str
+    folder: Path
+    record: JsonRecord
+    group: "xr.DataTree"
+    policy: str
+
+
+def groups_of_fleets(folders: Sequence[Path]) -> list[NamedGroup]:
+    """Return all groups of several fleets.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If a folder does not hold a fleet, or if its store cannot be read.
+    """
+    named_groups = []
+    for folder in folders:
+        fleet = fleet_config(folder)["fleet"]
+        groups = open_groups(folder)
+        for record in fleet["groups"]:
+            name = record["name"]
+            full_name = f"{folder}: {name}"
+            if len(folders) == 1:
+                full_name = name
+            elif len(groups) == 1:
+                full_name = str(folder)
+            policy = Scenario.model_validate(record["scenarios"][0]).planner.policy_name
+            if "policy" in fleet.get("parts", {}):
+                policy = "given"
+            named_groups.append(NamedGroup(full_name, folder, record, groups[name], policy))
+    return named_groups
+
+
+def figures_of_fleets(folders: Sequence[Path]) -> Figures:
+    """Return the figures of each group by name; of several folders, the name has the folder.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If a folder does not hold a fleet, or if its store cannot be read.
+    """
+    return {named.name: group_figures(named.group) for named in groups_of_fleets(folders)}
+
+
+def compare_fleets(folders: Sequence[Path]) -> Figures:
+    """Return the figures of each group, beside what was promised and what the first group earned.
+
+    Groups are compared seed by seed, because flights of one seed meet the same damage and noise
+    (common random numbers): the difference of their returns varies less than either of them.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If a folder does not hold a fleet, or if its store cannot be read.
+    """
+    named_groups = groups_of_fleets(folders)
+    first = named_groups[0]
+    figures: Figures = {}
+    for named in named_groups:
+        figures[named.name] = {"policy": named.policy} | group_figures(named.group)
+        if RETURN not in figures[named.name]:
+            continue
+        if len(named.record["scenarios"]) == 1:
+            promised = promised_return(knowledge_of_scenario(named.folder, named.record, 0))
+            figures[named.name] = _with_figure_after(
+                figures[named.name],
+                RETURN,
+                RETURN_PROMISED,
+                Estimated(promised.mean, promised.half_width / NORMAL_95),
+            )
+        if named is not first and RETURN in figures[first.name]:
+            difference = _difference_of_returns(named.group, first.group)
+            figures[named.name] = _with_figure_after(
+                figures[named.name], RETURN, f"{RETURN_BEYOND}{first.name}", difference
+            )
+    return figures
+
+
+def _with_figure_after(
+    figures: dict[str, Figure], previous_key: str, key: str, figure: Figure
+) -> dict[str, Figure]:
+    """Return figures with a further one after that of another key."""
+    ordered: dict[str, Figure] = {}
+    for known_key, known_figure in figures.items():
+        ordered[known_key] = known_figure
+        if known_key == previous_key:
+            ordered[key] = figure
+    return ordered
+
+
+def returns_of_group(group: "xr.DataTree") -> Float:
+    """Return the discounted returns of the flights of a group that did not fail: (B,).
+
+    The array is empty for stores without rewards.
+    """
+    if "earned" not in group.children:
+        return np.empty(0)
+    rows = flown_rows(stored_values(group, "status"))
+    return np.asarray(stored_values(group, "earned/return")[rows], dtype=np.float64)
+
+
+def _difference_of_returns(group: "xr.DataTree", other_group: "xr.DataTree") -> Estimated:
+    """Return by how much flights earn more than those of another group under the same seeds.
+
+    It is NaN if no seed is that of one flight in each group.
+    """
+    returns_by_seed = []
+    for tree in (group, other_group):
+        rows = flown_rows(stored_values(tree, "status"))
+        seeds, first_rows, counts = np.unique(
+            stored_values(tree, "seed")[rows], return_index=True, return_counts=True
+        )
+        is_single = counts == 1
+        returns = stored_values(tree, "earned/return")[rows][first_rows]
+        returns_by_seed.append((seeds[is_single], returns[is_single]))
+    (seeds, returns), (other_seeds, other_returns) = returns_by_seed
+    _, rows, other_rows = np.intersect1d(
+        seeds, other_seeds, assume_unique=True, return_indices=True
+    )
+    moments = Moments()
+    moments.add(returns[rows] - other_returns[other_rows])
+    return moments.mean
+
+
+def unit_of_states(group: "xr.DataTree") -> str:
+    """Return the unit of the stored factors of the state; empty if they differ in it."""
+    unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
+    return "" if ", " in unit else unit
+
+
+def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Figure], int]:
+    """Return the numbers of twins by title, and the number of twins that have outcomes.
+
+    Counted are twins that flew, failed, ended early, or gave notices.
+    """
+    status_counts = np.zeros(max(FLOWN, FAILED, ENDED) + 1, dtype=np.int64)
+    alarmed = 0
+    left_gauge_out = 0
+    for rows in row_blocks(group):
+        status = stored_values(group, "status", rows)
+        status_counts += np.bincount(status, minlength=len(status_counts))
+        alarmed += int(np.sum(notice_counts(group, "alarm", rows) > 0))
+        left_gauge_out += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
+    figures: dict[str, Figure] = {
+        "twins": int(status_counts.sum()),
+        "flown": int(status_counts[FLOWN]),
+        "failed in flight": int(status_counts[FAILED]),
+    }
+    if status_counts[ENDED]:
+        figures["ended early"] = int(status_counts[ENDED])
+    if group.attrs.get("gives_notice"):
+        figures["raised an alarm"] = alarmed
+    if left_gauge_out:
+        figures["left a gauge out"] = left_gauge_out
+    return figures, int(status_counts[FLOWN] + status_counts[ENDED])
+
+
+class _PrintedFigure(NamedTuple):
+    """How a figure of a group is printed.
+
+    Attributes
+    ----------
+    title : str
+        What it is called; the field `{of}` is the rest of its key.
+    scale : float
+        The factor from the stored to the printed values.
+    unit : str
+        The printed unit; empty for a plain number.
+    interval : bool
+        Whether the 95 % interval is printed, not the standard error.
+    """
+
+    title: str
+    scale: float = 1.0
+    unit: str = ""
+    interval: bool = False
+
+
+_LEAST_PRINTED_ERROR = 1e-5
+"""The relative standard error to which values with an interval are printed."""
+RETURN = "return"
+"""The key of the discounted return of a flight."""
+RETURN_PROMISED = "return promised"
+"""The key of the return that the twin's own model expects."""
+RETURN_BEYOND = "return beyond "
+"""The beginning of the key of a difference of returns, before the name of the other group."""
+PRINTED_FIGURES_OF_FLEETS = {
+    RETURN_PROMISED: _PrintedFigure("return that the twin's model promises", interval=True),
+    RETURN_BEYOND: _PrintedFigure("return beyond that of {of}, seed by seed", interval=True),
+    RETURN: _PrintedFigure("return: rewards of a flight, discounted", interval=True),
+    "reward of a step": _PrintedFigure("reward of a step", interval=True),
+    "steps with ": _PrintedFigure("steps flown with {of}", 100.0, "%"),
+    "steps beyond the limit": _PrintedFigure(
+        "steps with a harder control than the best one of the state", 100.0, "%"
+    ),
+    "needless steps": _PrintedFigure(
+        "steps with a gentler control than the best one of the state", 100.0, "%"
+    ),
+    "steps beyond a health limit": _PrintedFigure("steps beyond a health limit", 100.0, "%"),
+    "changes of control": _PrintedFigure("changes of control in a flight"),
+    f"fallback within {WITHIN} ": _PrintedFigure(
+        f"assets whose control changed within {WITHIN} steps of the damage that called for it",
+        100.0,
+        "%",
+    ),
+    "early fallback": _PrintedFigure(
+        "assets whose control changed before the damage called for it", 100.0, "%"
+    ),
+    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of}"),
+    "bias of ": _PrintedFigure("mean error of the estimated {of}"),
+    "log evidence of a step": _PrintedFigure("log evidence of a step", unit="nat"),
+    "true state in the 90 % set": _PrintedFigure(
+        "steps in which the set of states with a probability of 90 % has the true one", 100.0, "%"
+    ),
+}
+"""How figures are printed, by the beginning of their keys; others are counts of assets."""
+COUNTS_OF_FLEETS = (
+    "twins",
+    "flown",
+    "failed in flight",
+    "ended early",
+    "raised an alarm",
+    "left a gauge out",
+)
+"""Titles of the counts of assets, which are their keys."""
+
+
+def figure_rows(groups: Mapping[str, Mapping[str, Figure]]) -> list[list[str]]:
+    """Return the figures of groups as rows of a table: a title, and a cell for each group."""
+    keys: list[str] = []
+    for figures in groups.values():
+        position = 0
+        for key in figures:
+            if key not in keys:
+                keys.insert(position, key)  # after the figure that stands before it
+            position = keys.index(key) + 1
+    rows = []
+    for key in keys:
+        printed_figure = _PrintedFigure(key)
+        for beginning, description in PRINTED_FIGURES_OF_FLEETS.items():
+            if key.startswith(beginning):
+                printed_figure = description._replace(
+                    title=description.title.format(of=key.removeprefix(beginning))
+                )
+                break
+        cells = [_figure_text(figures.get(key), printed_figure) for figures in groups.values()]
+        rows.append([printed_figure.title, *cells])
+    return rows
+
+
+def _figure_text(figure: Figure | None, printed_figure: _PrintedFigure) -> str:
+    """Return a figure with its standard error and unit as text; empty if there is none."""
+    if figure is None:
+        return ""
+    if isinstance(figure, int | str):
+        return str(figure)
+    scale = printed_figure.scale
+    unit = printed_figure.unit
+    if figure.unit:
+        scale, unit = printed_state(figure.unit, "percentage points")
+    value = scale * figure.value
+    error = scale * figure.error
+    if printed_figure.interval and np.isfinite(error):
+        error = max(error, abs(value) * _LEAST_PRINTED_ERROR)
+        low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
+        return f"{rounded(value, error)} ({between(low, high, error)})"
+    # One twin has no standard error.
+    text = plus_minus(value, error) if np.isfinite(error) else significant(value)
+    return f"{text} {unit}".rstrip()

@@ -1,0 +1,158 @@
+"""What a flight earns: rewards, the discounted return, and steps beyond the limit.
+
+This is the only computation of earned rewards: runs, fleets and watches store its result.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from reporting.arrays import Float, Index, product_of_each
+from twin_master.mission.planning import ComparedPolicy, discounts, simulate_decisions
+from twin_master.mission.preparation import Knowledge
+from twin_master.network.planner import BeliefPolicy, RiskPolicy
+from twin_master.scenario.schema import Scenario
+
+
+@dataclass(frozen=True)
+class Earnings:
+    """What the controls of flights earn in each of T steps; NaN in steps that were not flown.
+
+    Attributes
+    ----------
+    reward : (..., T) array
+        The reward for which controls are planned, eq. (36) [1].
+    health : (..., T) array
+        The health reward, eq. (9), below zero beyond a health limit [1].
+    beyond_limit : (..., T) array
+        The probability that the control is harder than the best control of the state [1].
+    needless : (..., T) array
+        The probability that it is gentler than that [1].
+    """
+
+    reward: Float
+    health: Float
+    beyond_limit: Float
+    needless: Float
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Earnings"]) -> "Earnings":
+        """Return the earnings of successive spans of one flight."""
+        joined = {name: np.concatenate([vars(part)[name] for part in parts]) for name in FIELDS}
+        return cls(**joined)
+
+
+FIELDS = ("reward", "health", "beyond_limit", "needless")
+"""The fields of `Earnings`, which are the names of variables in stores."""
+
+
+def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) -> Earnings:
+    """Return what controls earn, in the true state or, where it is unknown, under the belief.
+
+    Between the levels of the state, rewards are interpolated, and the best control is that of the
+    nearest level.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        The knowledge of the twin.
+    control : (..., T) array
+        The indices of the controls in force; negative in steps that were not flown.
+    belief : (..., T, S) array
+        The filtered beliefs.
+    state : (..., T, F) array
+        The true state, SI; NaN where it is not known.
+    """
+    states = knowledge.model.states
+    controls = len(knowledge.model.controls)
+    # The rewards of a state side by side: those of all controls, then their health rewards.
+    rewards = np.hstack(
+        [knowledge.planning_reward, knowledge.rewards.planning_reward(1.0, 0.0)]
+    )  # (S, 2 U)
+    steps_to_table = np.hstack([rewards, knowledge.is_beyond_limit, knowledge.is_needless])
+    is_flown = control >= 0
+    is_state_known = is_flown & np.isfinite(state).all(axis=-1)
+    of_all_controls = np.full((*control.shape, 4 * controls), np.nan)
+    known_states = state[is_state_known]
+    of_all_controls[is_state_known] = np.hstack(
+        [
+            states.interpolate(rewards, known_states),
+            steps_to_table[states.nearest(known_states), 2 * controls :],
+        ]
+    )
+    is_believed = is_flown & ~is_state_known
+    of_all_controls[is_believed] = product_of_each(belief[is_believed], steps_to_table)
+    by_field = of_all_controls.reshape(*control.shape, 4, controls)
+    in_force = np.maximum(control, 0)[..., None, None]
+    reward, health, beyond_limit, needless = np.moveaxis(
+        np.take_along_axis(by_field, in_force, axis=-1).squeeze(axis=-1), -1, 0
+    )
+    return Earnings(reward, health, beyond_limit, needless)
+
+
+def discounted_return(scenario: Scenario, reward: Float, control: Index) -> Float:
+    """Return the sum of the rewards of the steps of flights, each discounted: (..., T) -> (...).
+
+    Steps that were not flown earn nothing; a flight without a step has the return NaN.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario, which has the discount factor of a step.
+    reward : (..., T) array
+        The reward of each step, see `Earnings`.
+    control : (..., T) array
+        The indices of the controls in force; negative in steps that were not flown.
+    """
+    factor = discounts(scenario)[control]
+    factor_before = np.ones_like(factor)
+    factor_before[..., 1:] = np.cumprod(factor[..., :-1], axis=-1)
+    is_flown = control >= 0
+    earned = np.where(is_flown, factor_before * reward, 0.0).sum(axis=-1)
+    return np.where(is_flown.any(axis=-1), earned, np.nan)
+
+
+def promised_return(knowledge: Knowledge) -> ComparedPolicy:
+    """Return the returns of the policy of a twin in missions that its own model simulates.
+
+    They are what `uav-twin plan` expects of a policy. A flight earns something else if damage grows
+    otherwise than the model says, or if sensors do not show what it says.
+    """
+    returns = simulate_decisions(
+        knowledge.scenario, knowledge.problem, _SimulatedDecisions(knowledge).decide
+    )
+    return ComparedPolicy(knowledge.scenario.planner.policy_name, returns)
+
+
+class _SimulatedDecisions:
+    """The decisions of B twins in simulated missions, with what a twin keeps for its `Hold`."""
+
+    def __init__(self, knowledge: Knowledge) -> None:
+        scenario = knowledge.scenario
+        self._plan = knowledge.plan
+        self._hold = knowledge.hold
+        self._decides_on_predicted = scenario.planner.decide_on == "predicted"
+        self._first_control = scenario.control_names.index(scenario.mission.first_control)
+        self._control: Index = np.empty(0, dtype=np.int64)
+        self._proposals: Index = np.empty(0, dtype=np.int64)
+
+    def decide(self, belief: Float, filtered_belief: Float, step: int) -> Index:
+        """Return the controls of a step after the first one, see `Decide`."""
+        if step == 1:
+            self._control = np.full(len(belief), self._first_control)
+            self._proposals = np.zeros(len(belief), dtype=np.int64)
+        decided_on = belief if self._decides_on_predicted else filtered_belief
+        policy_on_belief = self._plan.on_belief
+        if isinstance(policy_on_belief, BeliefPolicy):
+            probability = np.eye(self._plan.policy.shape[1])[policy_on_belief.decide(belief)]
+        elif isinstance(policy_on_belief, RiskPolicy):
+            probability = np.eye(self._plan.policy.shape[1])[policy_on_belief.decide(decided_on)]
+        else:
+            probability = product_of_each(decided_on, self._plan.policy)
+        if self._hold is not None:
+            probability, self._proposals = self._hold.apply(
+                probability, self._control, self._proposals
+            )
+        self._control = np.argmax(probability, axis=1)
+        return self._control
