@@ -100,8 +100,6 @@ class SearchSettings:
     """Single effects this far below 'none' are not fitted exactly."""
     largest_longer_set_deficit: float = 2.0
     """Sets this far below the set with one effect fewer are not fitted exactly."""
-    family_fit_range: float = 30.0
-    """Families of effects within this log evidence of the best are fitted: they may overtake it."""
 
     # ---------------------------------------------------------------- far from the truth
     far_chi_square: float = 1.5

@@ -489,6 +489,32 @@ class Problem:
         problem._prepare_trials(trials)
         return problem
 
+    def with_second_sensor(self, channel_name: str, second_name: str) -> "Problem":
+        """Return a problem in which a further channel measures what a channel measures.
+
+        The further channel has the same noise, and no gain error. The trials do not have it.
+
+        Parameters
+        ----------
+        channel_name : str
+            The name of the channel.
+        second_name : str
+            The name of the further channel.
+        """
+        channel = self.campaign.channels[channel_name]
+        second_channel = replace(channel, name=second_name, gain_deviation=0.0)
+        number = self.channel_names.index(channel_name)
+        problem = copy(self)
+        problem.campaign = replace(
+            self.campaign, channels={**self.campaign.channels, second_name: second_channel}
+        )
+        problem.channel_names = (*self.channel_names, second_name)
+        problem.noise_models = {**self.noise_models, second_name: self.noise_models[channel_name]}
+        problem.record_freedom = np.append(self.record_freedom, self.record_freedom[number])
+        problem.is_whiteness_tested = [*self.is_whiteness_tested, self.is_whiteness_tested[number]]
+        problem.sample_counts = np.append(self.sample_counts, 0.0)
+        return problem
+
     def with_first_samples(self, count: int) -> "Problem":
         """Return the problem in which only the first samples of each trial in motion are compared.
 

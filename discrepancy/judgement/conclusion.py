@@ -384,10 +384,17 @@ def calibrated_parameters(
 
 
 def effects_text(effects: Iterable[NamedEffect]) -> str:
-    """Return effects with their places in words, such as "friction at slide and gain at g1"."""
+    """Return effects with their places in words, such as "friction at slide and gain at g1".
+
+    A law whose shape was fitted is called by its family, with the shape in brackets.
+    """
     texts = []
     for effect in effects:
-        texts.append(f"{effect.name} at {effect.place}" if effect.place else effect.name)
+        text = effect.name
+        if effect.shape:
+            shape = ", ".join(f"{item.name} {item.value:.2g}" for item in effect.shape)
+            text = f"a law of the family {effect.family} ({shape})"
+        texts.append(f"{text} at {effect.place}" if effect.place else text)
     return listing(dict.fromkeys(texts))
 
 

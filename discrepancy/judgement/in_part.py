@@ -297,7 +297,7 @@ def _group_outcome(
         The probability that one of them is true.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
-    sentence = _group_sentence(comparison, members, effects_by_member)
+    sentence = _group_sentence(comparison, members, effects_by_member, probability)
     common_pairs = frozenset.intersection(*(effect_place_pairs(member) for member in members))
     common_effects = []
     for effect in effects_by_member[0]:
@@ -329,8 +329,12 @@ def _group_sentence(
     comparison: Comparison[HypothesisT],
     members: Sequence[HypothesisT],
     effects_by_member: Sequence[Sequence[NamedEffect]],
+    probability: float,
 ) -> str:
-    """Return the sentence that lists the members of a group and the share that each explains."""
+    """Return the sentence that lists the members of a group and the share that each explains.
+
+    The probability is that one of the members is true.
+    """
     member_texts = []
     for member, effects in zip(members, effects_by_member, strict=True):
         member_share = comparison.errors(member).closed
@@ -338,7 +342,10 @@ def _group_sentence(
         if member_share is not None:
             share_in_brackets = f" ({percent_with_interval(member_share)})"
         member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
-    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
+    sentence = (
+        f"Either {listing(member_texts, 'or')} is missing (probability "
+        f"{probability_text(probability)}); these data cannot tell which."
+    )
     best_share = comparison.errors(members[0]).closed
     if best_share is None:
         return f"{sentence} {capital(comparison.closed_share_clause(members[0]))}."

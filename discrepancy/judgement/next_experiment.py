@@ -20,7 +20,7 @@ from discrepancy.fits.normal_equations import check_finite
 from discrepancy.fits.problem import Problem
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.verdict import Experiment
-from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
+from fe.runtime.patch import SENSORS, ModelPatch, ModulusTemperature, PointMass
 
 OUTCOME_SAMPLES = 300
 """Simulated outcomes of a trial for each hypothesis."""
@@ -35,6 +35,10 @@ LEAST_PROBABILITY = 1e-3
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
+SECOND_SENSOR = "second sensor"
+"""Name of a sensor that is mounted beside another one."""
+COST_OF_SENSOR = 2.0
+"""Cost of a trial with one more sensor, which has to be mounted first."""
 LEAST_SINGULAR_VALUE = 1e-6
 """Singular value, relative to the largest, below which a direction in the space of readings is left
 out: all hypotheses predict the same there."""
@@ -54,6 +58,8 @@ class Proposal:
         The cost relative to one more trial of a kind that was done already.
     added_patch : ModelPatch
         The change of the structure for this trial, such as a mass at the tip.
+    doubled_channel : str
+        The channel beside which a second sensor is mounted for this trial; empty for none.
     """
 
     trial: Trial
@@ -61,6 +67,7 @@ class Proposal:
     reason: str
     cost: float
     added_patch: ModelPatch = field(default_factory=ModelPatch)
+    doubled_channel: str = ""
 
 
 def next_experiments(
@@ -84,7 +91,11 @@ def next_experiments(
     fits = [fit for fit, _ in open_fits]
     is_oscillating = oscillates(problem, fits[0]) if fits else True
     experiments = []
-    for proposal in feasible_proposals(problem, is_oscillating=is_oscillating):
+    proposals = [
+        *feasible_proposals(problem, is_oscillating=is_oscillating),
+        *second_sensor_proposals(problem, fits),
+    ]
+    for proposal in proposals:
         try:
             information = mutual_information(problem, proposal, fits, probabilities)
         except DiscrepancyError:  # the model cannot simulate this trial
@@ -124,8 +135,16 @@ def mutual_information(
         if len(proposal.added_patch)
         else problem.model
     )
-    trial_problem = problem.with_trials((proposal.trial,), model)
     recorded_over_actual_noise = _recorded_over_actual_noise(problem, most_probable_fit=fits[0])
+    trial = proposal.trial
+    if proposal.doubled_channel:
+        number = problem.channel_names.index(proposal.doubled_channel)
+        problem = problem.with_second_sensor(proposal.doubled_channel, SECOND_SENSOR)
+        trial = _with_second_sensor(trial, proposal.doubled_channel)
+        recorded_over_actual_noise = np.append(
+            recorded_over_actual_noise, recorded_over_actual_noise[number]
+        )
+    trial_problem = problem.with_trials((trial,), model)
     predictions = [_predicted_trial(trial_problem, fit, recorded_over_actual_noise) for fit in fits]
     gaussians = _reduce_dimensions(predictions, weights)
     return _simulate_information(gaussians, weights)
@@ -347,6 +366,45 @@ def feasible_proposals(problem: Problem, *, is_oscillating: bool = True) -> Iter
             proposal_table["cost"],
             changed_trial.added_patch,
         )
+
+
+def second_sensor_proposals(problem: Problem, fits: Sequence[CandidateFit]) -> Iterator[Proposal]:
+    """Yield a trial with a second sensor beside each one that may have an error.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign, whose trial of the highest level is repeated, and the model.
+    fits : sequence of CandidateFit
+        The hypotheses. A sensor may have an error if one of them says so.
+    """
+    doubtful_channels: set[str] = set()
+    for fit in fits:
+        patch = fit.candidate.patch(problem.setting, fit.effect)
+        doubtful_channels.update(getattr(item, "channel", "") for item in patch.of(*SENSORS))
+    for name in problem.channel_names:
+        if name not in doubtful_channels:
+            continue
+        trials = [trial for trial in problem.campaign.trials if name in trial.channels]
+        trial = max(trials, key=lambda trial: trial.level)
+        yield Proposal(
+            trial,
+            f"Repeat {trial.name!r} with a second sensor beside {name!r}.",
+            "An error of a sensor does not show in another one.",
+            COST_OF_SENSOR,
+            doubled_channel=name,
+        )
+
+
+def _with_second_sensor(trial: Trial, channel_name: str) -> Trial:
+    """Return a trial with a further channel, which has the readings of a channel."""
+    column = trial.channels.index(channel_name)
+    return replace(
+        trial,
+        channels=(*trial.channels, SECOND_SENSOR),
+        values=np.column_stack((trial.values, trial.values[:, column])),
+        used=np.column_stack((trial.used, trial.used[:, column])),
+    )
 
 
 class _ChangedTrial(NamedTuple):

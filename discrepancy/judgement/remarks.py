@@ -22,7 +22,7 @@ KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
 KINDS_WITH_NAME = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY)
 """Kinds of verdicts that name one set of effects, or its family."""
 MOST_MENTIONED = 3
-"""Windows, or effects that were not tested, that a sentence mentions one by one."""
+"""Windows that a sentence mentions one by one."""
 
 
 def moment_text(moment: Moment) -> str:
@@ -124,11 +124,10 @@ def active_windows_sentence(effects: Sequence[NamedEffect]) -> str:
 def verdict_with_untested_effects(
     verdict: Verdict, setting: Setting, effects: Sequence[Effect]
 ) -> Verdict:
-    """Return the verdict with a sentence on the effects that could not be tested.
+    """Return the verdict with a sentence on effects that may be the cause, but cannot be tested.
 
-    The sentence is added only to a verdict on a group or on several effects. An effect that needs
-    another trial or port cannot be a member of the group, even if it acts in the same way. Effects
-    that are easily mistaken for a member are mentioned first.
+    They are easily mistaken for an effect of the verdict, and act on trials of these kinds. But
+    they need another trial, port or place, so that none of them could be compared.
 
     Parameters
     ----------
@@ -139,25 +138,23 @@ def verdict_with_untested_effects(
     effects : sequence of Effect
         The effects of the catalogue.
     """
-    is_name = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
-    names_several = is_name and len(verdict.effects) > 1
-    if verdict.kind is not VerdictKind.GROUP and not names_several:
+    if verdict.kind not in (*KINDS_WITH_NAME, VerdictKind.GROUP):
         return verdict
-    untested = [effect for effect in effects if effect.unavailable(setting) is not None]
-    if not untested:
+    kinds = {trial.kind for trial in setting.campaign.trials}
+    identifiers = {named_effect.identifier for named_effect in verdict.effects}
+    members = [effect for effect in effects if effect.identifier in identifiers]
+    names = []
+    for effect in effects:
+        looks_alike = any(are_related(effect, member) for member in members)
+        if effect.identifier in identifiers or not looks_alike or not effect.acts_on & kinds:
+            continue
+        if effect.unavailable(setting) is not None:
+            names.append(effect.name)
+    if not names:
         return verdict
-    by_identifier = {effect.identifier: effect for effect in effects}
-    members = []
-    for named_effect in verdict.effects:
-        if named_effect.identifier in by_identifier:
-            members.append(by_identifier[named_effect.identifier])
-    untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
-    names = [effect.name for effect in untested[:MOST_MENTIONED]]
-    unmentioned_count = len(untested) - MOST_MENTIONED
-    if unmentioned_count > 0:
-        names.append(f"{unmentioned_count} more")
-    untested_sentence = f"These trials cannot test all effects that may act so: {listing(names)}."
-    return replace(verdict, sentence=f"{verdict.sentence} {untested_sentence}")
+    it_or_they = "it" if len(names) == 1 else "they"
+    sentence = f"Not excluded, because {it_or_they} cannot be tested here: {listing(names)}."
+    return replace(verdict, sentence=f"{verdict.sentence} {sentence}")
 
 
 def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
@@ -177,30 +174,23 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     """
     if verdict.kind is not VerdictKind.NAMED:
         return None
-    # similar effects that were compared, and those that were not
     named_effects = {effect.identifier: effect.name for effect in verdict.effects}
     compared_by_identifier = {effect.identifier: effect for effect in compared}
     similar_identifiers = _similar_effects(set(named_effects), compared_by_identifier)
     compared_similar = sorted(similar_identifiers & compared_by_identifier.keys())
-    not_compared_similar = sorted(similar_identifiers - compared_by_identifier.keys())
     does = "does" if len(named_effects) == 1 else "do together"
     names_text = " and ".join(named_effects.values())
     remark = (
         "A cause that is not in the catalogue would get the same name if it acts on these trials "
         f"as {names_text} {does}, within the noise."
     )
-    not_compared = (
-        f"{', '.join(not_compared_similar)} {_was_or_were(not_compared_similar)} not compared."
+    if not compared_similar:
+        return remark
+    was_or_were = "was" if len(compared_similar) == 1 else "were"
+    return (
+        f"{remark} Of the effects that are known to look similar, {', '.join(compared_similar)} "
+        f"{was_or_were} compared and had less evidence."
     )
-    if compared_similar:
-        remark += (
-            f" Of the effects that are known to look similar, {', '.join(compared_similar)} "
-            f"{_was_or_were(compared_similar)} compared and had less evidence"
-        )
-        return f"{remark}; {not_compared}" if not_compared_similar else f"{remark}."
-    if not_compared_similar:
-        return f"{remark} Of the effects that are known to look similar, {not_compared}"
-    return remark
 
 
 def _similar_effects(named_identifiers: set[str], compared: Mapping[str, Effect]) -> set[str]:
@@ -215,8 +205,3 @@ def _similar_effects(named_identifiers: set[str], compared: Mapping[str, Effect]
     for identifier in named_identifiers & compared.keys():
         similar_identifiers.update(compared[identifier].confusable)
     return similar_identifiers - named_identifiers
-
-
-def _was_or_were(names: Sequence[str]) -> str:
-    """Return "was" for one name and "were" for several."""
-    return "was" if len(names) == 1 else "were"

@@ -24,8 +24,10 @@ from .conclusion import (
     Conclusion,
     VerdictOutcome,
     below_limit_sentence,
+    effects_text,
     named_effects,
     names_without_free_shape,
+    probability_text,
 )
 from .consistency_gate import check_consistency
 
@@ -253,11 +255,15 @@ class VerdictCase:
         probability = total_probability(
             self.probabilities[member.effect_names] for member in passing_members
         )
-        # an effect with its canonical and with a free shape is one member
+        # an effect with its canonical and with a free shape is one member, and what explains the
+        # readings alone needs no further effect beside it
         distinct_members: dict[EffectSet, FittedEffectSet] = {}
         for member in passing_members:
             distinct_members.setdefault(names_without_free_shape(member.effect_names), member)
-        group = list(distinct_members.values())
+        group = []
+        for names, member in distinct_members.items():
+            if not any(set(other) < set(names) for other in distinct_members):
+                group.append(member)
         if not group or len(group) > SEARCH.largest_group:
             return self._no_group_verdict(members[0], len(group))
         return self._group_verdict(group, probability)
@@ -316,12 +322,17 @@ class VerdictCase:
         effects: list[NamedEffect] = []
         for fit in fits:
             effects.extend(named_effects(self.problem, fit))
-        names = listing((" + ".join(member.effect_names) for member in members), "or")
+        texts = [effects_text(named_effects(self.problem, fit)) for fit in fits]
+        names = listing(texts, "or")
         if len(members) > 1:
-            sentence = f"Either {names} is missing; these data cannot tell which."
+            sentence = (
+                f"Either {names} is missing (probability {probability_text(probability)}); these "
+                "data cannot tell which."
+            )
         else:
             sentence = (
-                f"There is a gap that {names} fits, but not with the probability that a name needs."
+                f"There is a gap that {names} fits, but its probability of "
+                f"{probability_text(probability)} is less than a name needs."
             )
         return self.conclusion.build_outcome(
             VerdictKind.GROUP,

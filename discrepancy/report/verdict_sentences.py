@@ -21,7 +21,6 @@ from reporting.words import counted
 
 ROLE_OF_PROBABILITY = {
     VerdictKind.NOTHING_MISSING: "probability that nothing is missing",
-    VerdictKind.GROUP: "together they have the probability",
     VerdictKind.FAMILY: "probability",
     VerdictKind.BELOW_LIMIT: "probability that nothing is missing",
 }

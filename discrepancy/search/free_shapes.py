@@ -49,27 +49,19 @@ def _is_not_refuted(candidates: FittedCandidates, fit: CandidateFit) -> bool:
 def _single_fits_to_free(candidates: FittedCandidates) -> list[CandidateFit]:
     """Return the single effects that are to be fitted with a free shape, the best first.
 
-    If the best effect does not explain the data, these are the best ones, at most
-    `SEARCH.most_exact_fits`. If it does, these are the effects that explain the data too, with a
-    score at most `SEARCH.family_fit_range` below that of the best. There are none if there is only
-    one such effect, or if the model without effect explains the data: the test of shape
-    (`gates.check_shape`) then examines the best effect later.
+    They are the best ones, at most `SEARCH.most_exact_fits`, also if one of them explains the data:
+    a law that is not in the catalogue explains them with another shape. There are none if the model
+    without effect explains the data.
 
     Parameters
     ----------
     candidates : FittedCandidates
         All candidates that were fitted so far, with the problem.
     """
+    if _is_not_refuted(candidates, candidates.no_effect):
+        return []
     single_fits = []
     for fit in candidates.exact_fits.values():
         if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
             single_fits.append(fit)
-    single_fits = sorted(single_fits, key=candidates.score, reverse=True)[: SEARCH.most_exact_fits]
-    explaining_fits = [fit for fit in single_fits if _is_not_refuted(candidates, fit)]
-    if not explaining_fits or explaining_fits[0] is not single_fits[0]:
-        return single_fits
-    least_score = candidates.score(single_fits[0]) - SEARCH.family_fit_range
-    competing_fits = [fit for fit in explaining_fits if candidates.score(fit) > least_score]
-    if len(competing_fits) == 1 or _is_not_refuted(candidates, candidates.no_effect):
-        return []
-    return competing_fits
+    return sorted(single_fits, key=candidates.score, reverse=True)[: SEARCH.most_exact_fits]

@@ -403,10 +403,10 @@ def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
 
 def test_a_headline_has_one_probability():
     named = Verdict(VerdictKind.NAMED, "The model lacks drag (probability 0.998).", 0.998, 12.0)
-    group = Verdict(VerdictKind.GROUP, "One of a, b is missing.", 0.97, 12.0)
+    nothing = Verdict(VerdictKind.NOTHING_MISSING, "The model explains the data.", 0.97, 12.0)
     broken = Verdict(VerdictKind.DATA_ERROR, "Channel x is clipped.", float("nan"), float("nan"))
     assert headline(named).count("probability") == 1
-    assert headline(group) == "One of a, b is missing (together they have the probability 0.970)."
+    assert headline(nothing) == "The model explains the data (probability that nothing is missing 0.970)."
     assert headline(broken) == "Channel x is clipped."
 
 
