@@ -11,6 +11,8 @@ from reporting.words import between, brief, listing, rounded
 
 RATE_OF = "the rate of "
 """How the name of an input's rate begins, among the variables that may order a missing force."""
+STATE = "displacement and velocity"
+"""The name of the motion of a port as a whole, among these variables."""
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
 
@@ -291,7 +293,7 @@ class ForceAtPort:
     orders : mapping of str to float
         Fraction of the force's variance that is explained by its mean at equal displacement,
         velocity, amplitude, time, recorded input or rate of an input, by the name of that variable
-        [1].
+        [1]; at equal displacement and velocity if these explain clearly more together.
     ordered_by : tuple of str
         Variables that explain the force about as well as the best one; empty if none explains it.
     law : str

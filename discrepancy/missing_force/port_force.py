@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.spatial import KDTree
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import DiscrepancyError
@@ -13,7 +14,7 @@ from discrepancy.estimation.estimate import LEAST_EVIDENCE, Estimate
 from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.verdict import RATE_OF, ForceAtPort, ForceLeft, ForceMoment
+from discrepancy.verdict import RATE_OF, STATE, ForceAtPort, ForceLeft, ForceMoment
 from reporting.arrays import LEAST_DIVISOR
 
 from .gap_share import GapShare
@@ -30,6 +31,13 @@ LEAST_ORDER = 0.3
 """Least share of a force's variance that a variable explains if it orders the force."""
 TIED_SHARE = 0.05
 """Difference of these shares up to which two variables order a force equally well."""
+LARGEST_SINGLE_SHARE = 0.6
+"""Largest share by a single variable, over that by displacement and velocity together, if the force
+follows the two together. On simulated rigs it is at most 0.5 for impacts with loss, and at least
+0.68 for forces of one of the two."""
+NEIGHBOURS, CANDIDATE_NEIGHBOURS = 3, 100
+"""Number of neighbours whose mean force predicts that of a sample, and of samples among which they
+are looked for."""
 RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
 """Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
@@ -60,6 +68,49 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
     variance_within = sum(squares_by_bin) / (count - bin_count)
     variance = max(float(np.var(force, ddof=1)), LEAST_DIVISOR)
     return max(1.0 - variance_within / variance, 0.0)
+
+
+def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
+    """Return the share of a force's variance that displacement and velocity explain together.
+
+    The force at each sample is predicted by its mean at the nearest states of the port, of all
+    trials together. States half a period before and after the sample do not count: there the force
+    is similar whatever it follows (Theiler 1986, Phys. Rev. A 34, 2427-2432).
+
+    Parameters
+    ----------
+    trial_forces : sequence of TrialForce
+        The force and the motion of the port in each trial.
+    """
+    force = np.concatenate([trial.force for trial in trial_forces])
+    position = np.concatenate([trial.position for trial in trial_forces])
+    speed = np.concatenate([trial.speed for trial in trial_forces])
+    sample_count = len(force)
+    if sample_count <= CANDIDATE_NEIGHBOURS:
+        return 0.0
+    trial_of_sample = np.repeat(
+        np.arange(len(trial_forces)), [len(trial.force) for trial in trial_forces]
+    )
+    # half a period: the mean number of samples between two changes of the sign of the speed
+    sign_changes = sum(np.count_nonzero(np.diff(np.sign(trial.speed))) for trial in trial_forces)
+    half_period = sample_count / max(sign_changes, 1)
+    scaled_state = np.column_stack(
+        [values / max(float(np.std(values)), LEAST_DIVISOR) for values in (position, speed)]
+    )
+    _, candidates = KDTree(scaled_state).query(scaled_state, CANDIDATE_NEIGHBOURS)
+    is_other_trial = trial_of_sample[candidates] != trial_of_sample[:, np.newaxis]
+    distance_in_time = np.abs(candidates - np.arange(sample_count)[:, np.newaxis])
+    counts = is_other_trial | (distance_in_time > half_period)
+    is_neighbour = counts & (np.cumsum(counts, axis=1) <= NEIGHBOURS)
+    is_predicted = is_neighbour.sum(axis=1) == NEIGHBOURS
+    if np.count_nonzero(is_predicted) < sample_count / 2:
+        return 0.0  # the motion hardly comes back to a state
+    neighbours = candidates[is_predicted][is_neighbour[is_predicted]].reshape(-1, NEIGHBOURS)
+    errors = force[is_predicted] - force[neighbours].mean(axis=1)
+    # the mean of n independent neighbours has an n-th of the variance around the function
+    variance_around = float(np.mean(errors**2)) / (1.0 + 1.0 / NEIGHBOURS)
+    variance = max(float(np.var(force, ddof=1)), LEAST_DIVISOR)
+    return max(1.0 - variance_around / variance, 0.0)
 
 
 def ordering_variables(
@@ -338,7 +389,11 @@ def _force_at_port(
 def _variables_that_order(
     trial_forces: Sequence[TrialForce],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return what `ordering_variables` returns for the force in all trials together."""
+    """Return what `ordering_variables` returns for the force in all trials together.
+
+    Displacement and velocity together are a further variable, if they explain clearly more than
+    each variable alone, as for an impact with loss or a law with memory.
+    """
     # an input that was not recorded in a trial did not act there
     names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)
     further = {
@@ -347,13 +402,18 @@ def _variables_that_order(
         )
         for name in names
     }
-    return ordering_variables(
+    shares, ordered_by = ordering_variables(
         force=np.concatenate([trial.force for trial in trial_forces]),
         position=np.concatenate([trial.position for trial in trial_forces]),
         speed=np.concatenate([trial.speed for trial in trial_forces]),
         time=np.concatenate([trial.time for trial in trial_forces]),
         further=further,
     )
+    share_of_state = variance_explained_by_state(trial_forces)
+    is_by_one_variable = max(shares.values()) > LARGEST_SINGLE_SHARE * share_of_state
+    if is_by_one_variable or share_of_state < LEAST_ORDER:
+        return shares, ordered_by
+    return {**shares, STATE: share_of_state}, (STATE,)
 
 
 def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialForce]:

@@ -43,9 +43,7 @@ def beam_investigation(exponent):
     noise = NOISE * np.random.default_rng(11).standard_normal(16)
     sweep = kit.blank_trial("sweep", TrialKind.STATIC, ("deflection",), load, load_place="tip")
     sweep = replace(sweep, values=(deflection + noise)[:, np.newaxis])
-    sensor = Channel(
-        "deflection", Quantity.DISPLACEMENT, "deflection", NoiseRecord(NOISE, 100.0), 0.0, 5e-4
-    )
+    sensor = Channel("deflection", Quantity.DISPLACEMENT, "deflection", NoiseRecord(NOISE, 100.0), 0.0, 5e-4)
     campaign = Campaign("beam", {"deflection": sensor}, (sweep,), None, {}, "")
     return investigate(campaign, model_of(BEAM))
 

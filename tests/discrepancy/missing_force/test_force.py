@@ -28,7 +28,13 @@ from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.missing_force.port_force import explained_variance, missing_force, relaxed_displacement
+from discrepancy.missing_force.port_force import (
+    TrialForce,
+    explained_variance,
+    missing_force,
+    relaxed_displacement,
+    variance_explained_by_state,
+)
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
@@ -40,7 +46,7 @@ from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.trials_in_motion.ported_trial import ported_trial
 from discrepancy.trials_in_motion.trajectory import LawArguments, Trajectory
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict import STATE, Verdict, VerdictKind
 from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.costs import once
@@ -538,6 +544,39 @@ def test_a_spring_behind_a_damper_follows_the_relaxed_displacement():
     (variable,) = told.ordered_by
     assert variable.startswith("the displacement relaxed within 0.0")
     assert told.orders[variable] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("contact", "variable"),
+    [
+        (lambda x, v: max(1500.0 * (x - 0.006) + 40.0 * v, 0.0), STATE),
+        (lambda x, v: 1500.0 * (x - 0.006), "displacement"),
+    ],
+    ids=["with loss", "without loss"],
+)
+def test_an_impact_with_loss_follows_displacement_and_velocity_together(contact, variable):
+    def rate(now, state):
+        x, v = state
+        force = np.interp(now, TIME_OF_DRIVE, RECORDED)
+        stop = contact(x, v) if x > 0.006 else 0.0
+        return [v, (force - 1.6 * v - 800.0 * x - stop) / 2.0]
+
+    told = missing_beside_spring(rate, [0.0, 0.0], RECORDED).at_port
+    assert told.ordered_by == (variable,)
+
+
+def test_the_state_of_a_port_explains_a_function_of_it_and_no_function_of_the_time():
+    time = 0.01 * np.arange(3000)
+    x = np.sin(6.0 * time) + 0.7 * np.sin(9.1 * time)
+    v = np.gradient(x, time)
+
+    def explained(force):
+        return variance_explained_by_state(
+            [TrialForce("record", time, x, v, {}, force, np.zeros(3000), None)]
+        )
+
+    assert explained(np.where(x > 0.5, x - 0.5 + 0.1 * v, 0.0)) > 0.9
+    assert explained(np.sin(0.37 * time)) < 0.2
 
 
 def test_a_relaxed_displacement_is_that_of_the_closed_form():
