@@ -17,7 +17,7 @@ from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, wing_plan
 from discrepancy.system.sensing import observe
 from discrepancy.system.structures import WingModel
-from fe.runtime.patch import ModelPatch, PowerDamping, RootCompliance
+from fe.runtime.patch import ModelPatch, PowerDamping, SupportCompliance
 
 SEED = 20210527
 ROUNDS = 3
@@ -29,7 +29,7 @@ def run() -> Iterator[Measurement]:
     model = WingModel.of_design()
     cases = {
         "nothing hidden": ModelPatch(),
-        "compliant root hidden": ModelPatch((RootCompliance(5e-6),)),
+        "compliant root hidden": ModelPatch((SupportCompliance("root", "rx", 5e-6),)),
         "quadratic drag hidden": ModelPatch((PowerDamping("planform", 2.0, 2.0, 0.0, 1.0, 1.0),)),
     }
     _problem(model, ModelPatch(), SEED)  # compiles

@@ -34,7 +34,7 @@ from fe.runtime.patch import (
     PointMass,
     Primitive,
     RegionStiffnessLoss,
-    RootCompliance,
+    SupportCompliance,
     Washout,
 )
 from fe.runtime.port_laws import port_laws
@@ -121,7 +121,7 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
         elif isinstance(primitive, PointMass):
             row = displacement_row(primitive.station)
             extra += primitive.mass * np.outer(row, row)
-        elif isinstance(primitive, RootCompliance):
+        elif isinstance(primitive, SupportCompliance):
             compliance += primitive.compliance
     stiffness = np.zeros((SIZE, SIZE))
     h = STEP
@@ -169,6 +169,7 @@ class Cantilever(Model):
     ports = tuple(PORTS)
     shows_ports = False
     stations: tuple[float, float] | None = (0.0, LENGTH)
+    support_motions = (("root", "rx"),)
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -255,7 +256,7 @@ def _motion(
     trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
-    structural = patch.of(PointMass, RootCompliance, LocalStiffnessLoss)
+    structural = patch.of(PointMass, SupportCompliance, LocalStiffnessLoss)
     softening = sum(
         primitive.coefficient for primitive in patch if isinstance(primitive, ModulusTemperature)
     )

@@ -14,7 +14,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.lumped_file import SHIPPED_MODELS
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.structures import StructureModel, WingModel
-from fe.reduction.model_cache import reduced_model
+from fe.reduction.model_cache import changeable_model
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure, load_structure, structure_hash
 from fe.wing.design import SHIPPED_DESIGN, WingDesign
@@ -264,7 +264,7 @@ def _choose_patched(path: Path, progress: Progress | None) -> ModelChoice:
 def _choose_structure(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a structure's file, reduced with its ports."""
     with ModelError.instead_of(FiniteElementError):
-        reduced = reduced_model(path, progress=progress, with_ports=True)
+        reduced = changeable_model(path, progress)
         source_hash = structure_hash(load_structure(path), path.parent, with_ports=True)
     return ModelChoice(
         StructureModel(reduced),

@@ -140,9 +140,9 @@ def root_compliance(generator: np.random.Generator, bench: Bench) -> Hidden:
     arm = bench.length - 0.05
     compliance = log_uniform(generator, 0.02, 0.3) * bench.compliance / arm**2
     return Hidden(
-        "root_compliance",
+        "support_compliance",
         Changes(root_compliance=compliance),
-        {"root_compliance.compliance": compliance},
+        {"support_compliance.compliance": compliance},
     )
 
 

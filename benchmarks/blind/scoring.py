@@ -44,7 +44,7 @@ FAMILIES = {
     "unmodelled_mode": "line",
     "clock_error": "clock",
     "stiffness_drift": "time",
-    "root_compliance": "compliance",
+    "support_compliance": "compliance",
     "local_stiffness_loss": "compliance",
     "temperature_dependent_modulus": "temperature",
 }

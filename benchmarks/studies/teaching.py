@@ -24,9 +24,9 @@ from fe.runtime.patch import (
     LocalStiffnessLoss,
     PointMass,
     Primitive,
-    RootCompliance,
     SensorGain,
     SensorSaturation,
+    SupportCompliance,
 )
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
@@ -44,7 +44,7 @@ HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "skin from 0.45 to 0.85 m has lost 30 %": (LocalStiffnessLoss(0.3, 0.45, 0.4),),
     "gauge 17 shows 12 % too little": (SensorGain("strain[17]", -0.12),),
     "point mass of 0.2 kg at 1.6 m": (PointMass(0.2, 1.6),),
-    "root compliance of 3e-5 rad/(N m)": (RootCompliance(3e-5),),
+    "root compliance of 3e-5 rad/(N m)": (SupportCompliance("root", "rx", 3e-5),),
     "all gauges saturate softly at 4000 microstrain": (SensorSaturation("*", 4e-3, "strain"),),
 }
 STEPS = 50

@@ -28,7 +28,8 @@ as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_
 `NEEDS`), `spectral` and `at_several_places` (see `Effect`), `[[shape]]` (as a parameter, with
 `canonical` in place of `unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are
 the parameters and `SCALES`. Text values of a primitive (port, channel, run) are taken as they are;
-"place" stands for the place, "quantity of the place" for what it measures. A primitive with `if` is
+"place" stands for the place, "quantity of the place" for what it measures, "motion of the place"
+for the motion of a support. A primitive with `if` is
 left out where that is zero.
 
 Time and events of the campaign (`docs/explanation/when.md`)::
@@ -286,7 +287,11 @@ class _PrimitiveTemplate:
             What the place stands for.
         """
         # texts of a primitive that stand for the place of the effect
-        words = {"place": target.name, "quantity of the place": target.quantity}
+        words = {
+            "place": target.name,
+            "quantity of the place": target.quantity,
+            "motion of the place": target.motion,
+        }
         formulas = PRIMITIVES[self.kind].formula_fields
         row: dict[str, str | float] = {}
         for name, value in self.values.items():

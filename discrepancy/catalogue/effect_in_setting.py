@@ -21,6 +21,13 @@ SKINS = {"lower skin": 1.0, "upper skin": -1.0}
 """Skin with a crack, and the sign of x that opens it: upward bending stretches the lower skin."""
 SIDES = {"open at positive x": 1.0, "open at negative x": -1.0}
 """Side on which a crack opens in a model without skins, and the sign of the port's x there."""
+MOTION_WORDS = {
+    **{axis: f"shift along {axis}" for axis in "xyz"},
+    **{f"r{axis}": f"turn about {axis}" for axis in "xyz"},
+}
+"""Words for each motion of a support in the names of places."""
+MOTION_OF_WORDS = {words: motion for motion, words in MOTION_WORDS.items()}
+"""The motion of a support by these words."""
 EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states."""
 ALL = "all "
@@ -192,6 +199,12 @@ class EffectInSetting:
             return (Target(port, number=(SKINS | SIDES)[skin]),)
         if place == EVERY_PORT:
             return tuple(Target(port) for port in self.state_ports)
+        if self.section.places == "supports":
+            if not place:  # no choice, such as at a wing
+                ((support, motion),) = self.setting.model.support_motions
+                return (Target(support, motion=motion),)
+            support, _, words = place.rpartition(", ")
+            return (Target(support, motion=MOTION_OF_WORDS[words]),)
         if self.section.places == "mains lines":
             line, _, channels = place.partition(", ")
             frequency = float(line.split()[0])
@@ -222,8 +235,11 @@ class Target:
         Quantity of the channels that are meant; empty for any.
     number : float
         Number in the place's name: the side of a skin, or the frequency of a line [Hz].
+    motion : str
+        Motion of a support, such as "rx".
     """
 
     name: str
     quantity: str = ""
     number: float = 0.0
+    motion: str = ""

@@ -11,11 +11,17 @@ from discrepancy.catalogue.effect_in_setting import (
     ALL,
     CHANNELS_OR_ALL_OF_A_QUANTITY,
     EVERY_PORT,
+    MOTION_WORDS,
     EffectInSetting,
     Names,
 )
 from discrepancy.catalogue.entry import Setting
-from fe.runtime.patch import EVERY_CHANNEL, LocalStiffnessLoss, RegionStiffnessLoss
+from fe.runtime.patch import (
+    EVERY_CHANNEL,
+    ROOT_TURN,
+    LocalStiffnessLoss,
+    RegionStiffnessLoss,
+)
 
 _SAME_FREQUENCY = 0.01
 """Relative difference up to which a line is seen at its own frequency, beside rounded times."""
@@ -60,6 +66,17 @@ def _damage_regions(effect: EffectInSetting) -> Names:
     if model.supports(LocalStiffnessLoss) or not model.supports(RegionStiffnessLoss):
         return ()
     return model.regions
+
+
+def _supports(effect: EffectInSetting) -> Names:
+    """Return the supports that may yield, with the motion, such as "CLAMP, turn about z".
+
+    There is no choice if the root is the only one.
+    """
+    support_motions = effect.setting.model.support_motions
+    if support_motions == (ROOT_TURN,):
+        return ("",)
+    return tuple(f"{support}, {MOTION_WORDS[motion]}" for support, motion in support_motions)
 
 
 def _calibrated_channels(effect: EffectInSetting) -> Names:
@@ -186,6 +203,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "skins at ports": _skins_at_ports,
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
+    "supports": _supports,
     "calibrated channels": _calibrated_channels,
     "timed gauges": _gauges_read_repeatedly,
     "zeroed runs": _zeroed_runs,
@@ -220,6 +238,7 @@ NO_PLACES = {
     ),
     "ports of states": _NO_STATE,
     "ports of states, or all": _NO_STATE,
+    "supports": "The model names no support that could yield.",
     "calibrated channels": (
         "The campaign has no channel whose gain is known, so no gain can be wrong."
     ),

@@ -197,6 +197,12 @@ def _largest_region_loss(context: BuildContext) -> float:
     return max(1.0 - (1.0 - largest_loss) / remaining, 0.0)
 
 
+def _support_compliance(context: BuildContext) -> float:
+    """Return the compliance of the support's motion that doubles that of the structure."""
+    target = context.target
+    return context.setting.scales.support_compliance(target.name, target.motion)
+
+
 def _station_of_end(end: int, context: BuildContext) -> float:
     """Return the station of an end of the model [m]: 0 for its root, 1 for its tip."""
     stations = context.setting.model.stations or (0.0, 0.0)
@@ -222,6 +228,7 @@ SCALES: dict[str, Callable[[BuildContext], float]] = {
     "largest_release": _largest_release,
     "sampling_interval": _sampling_interval,
     "region_largest_loss": _largest_region_loss,
+    "support_compliance": _support_compliance,
     "number": lambda context: context.target.number,
     "port_displacement": lambda context: context.port.displacement,
     "port_stiffness": lambda context: context.port.stiffness,

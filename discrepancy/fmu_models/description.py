@@ -14,7 +14,14 @@ from discrepancy.system.model_file import (
     ParameterSection,
     Section,
 )
-from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
+from fe.runtime.patch import (
+    LOADS,
+    PRIMITIVES,
+    ROOT_TURN,
+    STRUCTURE,
+    StiffnessDrift,
+    SupportCompliance,
+)
 from reporting.toml_file import Check, Name, Number, Positive
 from scenarios import binding_files
 
@@ -266,6 +273,11 @@ class FmuModelDescription(ModelDescription):
         inputs = self.inputs
         lacks_temperature = inputs.temperature_reference is not None and inputs.temperature is None
         yield lacks_temperature, "temperature_reference needs the input temperature"
+
+    @property
+    def support_motions(self) -> tuple[tuple[str, str], ...]:
+        """The turn of the root if the FMU carries its compliance, else none."""
+        return (ROOT_TURN,) if SupportCompliance.kind in self.effects else ()
 
     def binding_file(self, folder: Path) -> Path | None:
         """Return the path of the named binding, shipped or in a folder; None if none is named."""

@@ -97,15 +97,15 @@ class FmuModel(DescribedModel):
             section.name: self.variables.variable(section.variable) for section in description.input
         }
         self.load_places = tuple(self._force_inputs)
+        self.support_motions = description.support_motions
         limits = [self.fmu.largest_input(name) for name in self._force_inputs.values()]
         self.largest_losses = {
             region: self.fmu.largest_input(self.variables.variable(name))
             for region, name in inputs.regions.items()
         }
         self.largest_force = 0.5 * min(limits, default=np.inf)
-        mean = Conditions(self.prior_mean())
         self.fmu.nominal_point = self._operating_point(
-            trial_without_readings(TrialKind.RINGDOWN, 1.0), mean
+            trial_without_readings(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())
         )
 
     @classmethod

@@ -48,10 +48,9 @@ def effect_parameters(
             )
         parameters[f"{effect}.active"] = 1.0
         for key, value in primitive.to_mapping().items():
-            if key == "kind":
-                continue
-            assert isinstance(value, int | float)  # an effect of an FMU has numbers alone
-            parameters[f"{effect}.{key}"] = float(value)
+            # the place of an effect of an FMU is fixed: only its numbers are parameters
+            if isinstance(value, int | float):
+                parameters[f"{effect}.{key}"] = float(value)
     return parameters
 
 

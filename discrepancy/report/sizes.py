@@ -1,6 +1,7 @@
 """Sizes of added effects in SI units, as the sentences of a verdict show them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import isfinite
 
 from discrepancy.campaign.records import Campaign, Quantity
@@ -12,7 +13,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.response import EITHER, MOVES, TURNS
 from discrepancy.verdict import NamedEffect, VerdictKind
 from discrepancy.workflow import Investigation
-from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
+from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive, SupportCompliance
 from reporting.words import between, rounded
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
@@ -48,13 +49,37 @@ def si_sizes(
             continue
         half_width = 0.0
         interval = ""
+        if isinstance(primitive, SupportCompliance):
+            size = _as_spring(size, primitive)
+            unit = size.unit
         if isfinite(size.low) and isfinite(size.high) and size.low < size.high:
             half_width = 0.5 * (size.high - size.low)
             interval = f" ({between(size.low, size.high, half_width)})"
         name = _size_name(size.parameter, primitive, unit)
+        if isinstance(primitive, SupportCompliance):
+            motion = _motion_text(primitive.motion)
+            name = f"the support {primitive.support} {motion} against a spring of"
         place_text = _location_text(primitive, size, model, campaign)
         sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
     return ", ".join(sizes)
+
+
+def _as_spring(size: PrimitiveInterval, primitive: SupportCompliance) -> PrimitiveInterval:
+    """Return the interval of the spring of a support that yields: the inverse of its compliance."""
+    turns = primitive.motion.startswith("r")
+    return replace(
+        size,
+        value=1.0 / size.value,
+        low=1.0 / size.high,
+        high=1.0 / size.low,
+        unit="N m/rad" if turns else "N/m",
+    )
+
+
+def _motion_text(motion: str) -> str:
+    """Return a motion of a support as a predicate: "turns about z"."""
+    axis = motion[-1]
+    return f"turns about {axis}" if motion.startswith("r") else f"shifts along {axis}"
 
 
 def size_sentence(
@@ -149,6 +174,8 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         return _channel_unit(primitive, campaign) if unit == CHANNEL_UNIT else ""
     if " or " not in unit:
         return unit_text(unit)
+    if isinstance(primitive, SupportCompliance):
+        return unit.split(" or ")[primitive.motion.startswith("r")]
     port = str(getattr(primitive, "port", ""))
     unit_if_moving, unit_if_turning = unit.split(" or ")
     force_unit, state_unit = model.port_units(port)

@@ -71,6 +71,8 @@ class Model(ABC):
         Largest stiffness loss of each damage region that the model can have.
     kinds : frozenset of TrialKind
         The kinds of trials that it can simulate.
+    support_motions : tuple of (str, str)
+        The supports that may yield, each with a motion, such as "rx".
     load_places : tuple of str, optional
         The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
@@ -95,6 +97,7 @@ class Model(ABC):
     regions: tuple[str, ...] = ()
     largest_losses: Mapping[str, float] = MappingProxyType({})
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
+    support_motions: tuple[tuple[str, str], ...] = ()
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False

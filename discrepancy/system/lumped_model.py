@@ -67,6 +67,8 @@ class LumpedModel(DescribedModel, SystemModel):
         self._places = sorted(description.place, key=lambda place: place.station)
         if self._places:
             self.stations = (self._places[0].station, self._places[-1].station)
+        if description.root is not None:
+            self.support_motions = (changes.ROOT_TURN,)
         self._inputs = {section.name: section for section in description.input}
         self._outputs = {section.name: section for section in description.output}
 
@@ -96,7 +98,7 @@ class LumpedModel(DescribedModel, SystemModel):
             changes.StiffnessDrift: description.displacement_count > 0,
             changes.ModulusTemperature: True,
             changes.PointMass: bool(self._places),
-            changes.RootCompliance: description.root is not None,
+            changes.SupportCompliance: bool(self.support_motions),
             changes.LoadGain: True,
             changes.LoadPlace: can_move_load,
             PortLoad: bool(self.port_rows),

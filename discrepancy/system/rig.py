@@ -21,7 +21,7 @@ from discrepancy.system.lumped_sections import (
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.system_state import SystemState
 from discrepancy.system.time_history import RecordedHistory
-from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, RootCompliance
+from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, SupportCompliance
 
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this fraction of the stiffness is refused."""
@@ -224,7 +224,7 @@ def _apply_patch(
         if isinstance(primitive, PointMass):
             row = _row_at_station(places, primitive.station)[: len(mass)]
             mass += primitive.mass * np.outer(row, row)
-        elif isinstance(primitive, RootCompliance) and description.root is not None:
+        elif isinstance(primitive, SupportCompliance) and description.root is not None:
             # A rotational spring of compliance c in series with the structure: the flexibility
             # becomes K^-1 + c l l^T, with the lever l. By Sherman and Morrison its inverse is
             # K - K l l^T K c / (1 + c l^T K l).

@@ -1,7 +1,7 @@
 """Natural scales of a model under a campaign: they make dimensionless effects physical."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 
@@ -100,6 +100,10 @@ class Scales:
     ports : mapping of str to PortScale
         By port name: those of `Model.ports`, and the places of forces that are distributed over the
         structure.
+    support_compliances : mapping of (str, str) to float
+        For each support of a structure that may yield, and each of its motions, the compliance that
+        doubles the compliance of the structure under the load, or in the mode, where it matters
+        most [m/N or rad/(N m)].
     """
 
     length: float
@@ -111,3 +115,13 @@ class Scales:
     duration: float
     campaign_time: float
     ports: Mapping[str, PortScale]
+    support_compliances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+
+    def support_compliance(self, support: str, motion: str) -> float:
+        """Return the compliance of a support that doubles the compliance of the structure.
+
+        Of the root of a wing or a lumped model it is that whose turn doubles the displacement of
+        the tip under a force there [rad/(N m)].
+        """
+        root_compliance = 1.0 / (self.tip_stiffness * self.length**2)
+        return self.support_compliances.get((support, motion), root_compliance)

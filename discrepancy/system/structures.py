@@ -13,7 +13,7 @@ from calibration.errors import CalibrationError
 from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
-from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
@@ -22,14 +22,22 @@ from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import MOVES, TURNS, Outputs, Place
-from discrepancy.system.scales import ForceShare, PortScale
+from discrepancy.system.scales import ForceShare, PortScale, Scales
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
+from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    PRIMITIVES,
+    ROOT_TURN,
+    SENSORS,
+    ModelPatch,
+    Primitive,
+)
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.port_laws import PLANFORM, STATION_PORTS
@@ -87,7 +95,8 @@ class StructureModel(SystemModel):
     Parameters
     ----------
     model : ReducedModel
-        The structure, with the ports of its file (`reduced_model(..., with_ports=True)`).
+        The structure. One from `fe.reduction.model_cache.changeable_model` has the ports of its
+        file, and its supports may yield.
 
     Raises
     ------
@@ -118,7 +127,13 @@ class StructureModel(SystemModel):
         self.largest_force = 0.5 * min(limits, default=np.inf)
         # outputs
         names = (*model.gauges, *model.displacements, *model.accelerations)
-        self._rows = dict(zip(names, (*model.output_rows, *model.acceleration_rows), strict=True))
+        if isinstance(model, ChangeableModel):
+            self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
+            rows, self._unit_loads = model.whole_output, model.whole_load.T
+        else:
+            rows = np.concatenate((model.output_rows, model.acceleration_rows))
+            self._unit_loads = model.unit_loads
+        self._rows = dict(zip(names, rows, strict=True))
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -176,7 +191,7 @@ class StructureModel(SystemModel):
     def _load_of_controls(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
         coefficients = self.model.load_coefficients(self._input_vector(state, controls))
-        return np.asarray(self.model.unit_loads @ coefficients)
+        return np.asarray(self._unit_loads @ coefficients)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
         """Return the load (n,) per unit of a control."""
@@ -198,8 +213,8 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, losses of its damage regions, and errors of its
-        forces.
+        It carries sensors, laws at its ports, losses of its damage regions, supports that yield,
+        and errors of its forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
@@ -207,6 +222,8 @@ class StructureModel(SystemModel):
             return bool(self.regions)
         if primitive is changes.LoadGain:
             return bool(self.forces)
+        if primitive is changes.SupportCompliance:
+            return bool(self.support_motions)
         return primitive in SENSORS
 
     def force_row(
@@ -246,8 +263,28 @@ class StructureModel(SystemModel):
         OutsideModelError
             If a value lies outside the validity box of the reduced model.
         """
-        structure = self.model.structure_at(self._input_vector(state, {}))
+        vector = self._input_vector(state, {})
+        if not isinstance(self.model, ChangeableModel):
+            structure: StructureWithMatrices = self.model.structure_at(vector)
+        else:
+            structure = ChangedStructure(self.model, vector, state.structure)
         return _linear_system(structure, self.model.damping, self.port_rows)
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales under a campaign, with those of supports that may yield."""
+        scales = super().scales(campaign)
+        if not isinstance(self.model, ChangeableModel):
+            return scales
+        state = SystemState(
+            tuple(self.prior_mean(campaign).tolist()), losses=(0.0,) * len(self.regions)
+        )
+        gains = self.model.compliance_gains(self._input_vector(state, {}))
+        largest_gains = gains.max(axis=1, initial=0.0).tolist()
+        compliances = {
+            motion: 1.0 / gain if gain > 0.0 else 1.0
+            for motion, gain in zip(self.support_motions, largest_gains, strict=True)
+        }
+        return replace(scales, support_compliances=compliances)
 
 
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
@@ -354,6 +391,7 @@ class WingModel(SystemModel):
         self.largest_losses = {region: validity[region][1] for region in arrays.regions}
         self.length = self.wing.span
         self.stations = (0.0, self.wing.span)
+        self.support_motions = (ROOT_TURN,)
         self.port_rows = self.wing.port_rows
         self.ports = tuple(PORTS)
 

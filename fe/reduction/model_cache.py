@@ -20,6 +20,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fe.runtime.arrays import FloatArray, IntArray, StoredArrays
+from fe.runtime.changeable import ChangeableModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash
@@ -138,7 +139,6 @@ def reduced_model(
     progress: Progress | None = None,
     *,
     memory_limit: float | None = None,
-    with_ports: bool = False,
 ) -> ReducedModel: ...
 
 
@@ -148,7 +148,6 @@ def reduced_model(
     settings: StructureSettings | None = None,
     *,
     memory_limit: float | None = None,
-    with_ports: bool = False,
 ) -> ReducedModel:
     """Return the reduced model of a wing or of a structure file, from the cache if possible.
 
@@ -163,10 +162,6 @@ def reduced_model(
     memory_limit : float, optional
         Bytes that assembly and factorisation of a structure may take, as in
         `fe.structure.operators.load_and_assemble`.
-    with_ports : bool
-        Whether the model of a structure also has the force and the displacement at each port of the
-        file, see `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without
-        them.
 
     Raises
     ------
@@ -174,7 +169,7 @@ def reduced_model(
         If the design or the structure cannot be read, modelled or reduced.
     """
     if isinstance(source, Path | str):
-        return _reduced_structure(source, progress, memory_limit, with_ports=with_ports)
+        return _reduced_structure(source, progress, memory_limit)
     wing = source or load_design()
     return _cached(
         ReducedModel,
@@ -263,11 +258,7 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
 
 
 def _reduced_structure(
-    file: Path | str,
-    progress: Progress | None,
-    memory_limit: float | None,
-    *,
-    with_ports: bool,
+    file: Path | str, progress: Progress | None, memory_limit: float | None
 ) -> ReducedModel:
     """Return the reduced model of a structure file; the parameters are those of `reduced_model`."""
 
@@ -278,12 +269,44 @@ def _reduced_structure(
 
         with reporter(progress).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
-        if with_ports:
-            structure = structure.pushed_at_ports()
         return reduce_structure(structure, progress=progress).model
 
-    path = _structure_cache_file(Path(file), with_ports=with_ports)
-    return _cached(ReducedModel, path, build)
+    return _cached(ReducedModel, _structure_cache_file(Path(file)), build)
+
+
+def changeable_model(file: Path | str, progress: Progress | None = None) -> ChangeableModel:
+    """Return the model of a structure file that a campaign is compared with, from the cache.
+
+    It has the force and the displacement at each port of the file, see
+    `AffineStructure.pushed_at_ports`, and the columns that changes of the structure need. Its
+    `design_hash` is that of the model without ports.
+
+    Parameters
+    ----------
+    file : Path or str
+        The path of the structure file.
+    progress : Progress, optional
+        The display of the progress, if the model must be built.
+
+    Raises
+    ------
+    FiniteElementError
+        If the structure cannot be read, modelled or reduced.
+    """
+
+    def build() -> ChangeableModel:
+        from fe.structure.operators import assemble_structure
+
+        from .change_basis import with_changes
+        from .reduced_basis import reduce_structure
+
+        with reporter(progress).stage("Reading the mesh and assembling"):
+            yielding = assemble_structure(file, yielding=True).pushed_at_ports()
+        reduction = reduce_structure(yielding.held(), progress=progress)
+        with reporter(progress).stage("Reducing the changes of the structure"):
+            return with_changes(yielding, reduction)
+
+    return _cached(ChangeableModel, _structure_cache_file(Path(file), with_ports=True), build)
 
 
 def check_structure(file: Path | str) -> None:
@@ -304,7 +327,8 @@ def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
     """Return the cache file of the reduced model of a structure file, with its ports or without."""
     design = load_structure(file)
     design_hash = structure_hash(design, file.parent, with_ports=with_ports)
-    return cache_file("structure", design_hash, design.reduction)
+    kind = "changeable" if with_ports else "structure"
+    return cache_file(kind, design_hash, design.reduction)
 
 
 def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:

@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
-from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
+from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, SupportCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedStructure, PatchedWing
 from fe.structure.affine import natural_frequencies
@@ -396,7 +396,7 @@ def _patched_state(
             change.start * wing.span,
             (0.02 + 0.28 * change.length) * wing.span,
         ),
-        RootCompliance(change.compliance * arrays.largest_compliance),
+        SupportCompliance("root", "rx", change.compliance * arrays.largest_compliance),
         PointMass(change.mass * arrays.largest_mass, (0.1 + 0.9 * change.station) * wing.span),
     )
     patch = ModelPatch(

@@ -40,6 +40,8 @@ class Reduction:
         Parameters and losses of the full solutions, in the order of the search.
     bound_history : tuple of float
         The largest relative bound on the training set after each round of full solutions.
+    terms : ReductionTerms
+        The full model, with its factorised stiffness.
     """
 
     model: ReducedModel
@@ -47,6 +49,7 @@ class Reduction:
     modal_basis: FloatArray
     snapshots: tuple[State, ...]
     bound_history: tuple[float, ...]
+    terms: ReductionTerms
 
 
 def reduce_structure(
@@ -97,6 +100,7 @@ def reduce_structure(
         modal_basis=modal.basis,
         snapshots=tuple(static.snapshots),
         bound_history=history,
+        terms=terms,
     )
 
 

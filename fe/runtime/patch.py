@@ -42,6 +42,11 @@ from .sensor_primitives import SensorRotation as SensorRotation
 from .sensor_primitives import SensorSaturation as SensorSaturation
 from .sensor_primitives import ThermalStrain as ThermalStrain
 
+ROOT_TURN = ("root", "rx")
+"""Support and motion of the root of a wing or a lumped model: its turn about the flapping axis."""
+FORMER_ROOT_COMPLIANCE = "root_compliance"
+"""Kind of a compliance of the root in files of earlier versions."""
+
 # ---------------------------------------------------------------- mass and stiffness
 
 
@@ -55,10 +60,17 @@ class PointMass(Primitive):
     station: Annotated[float, "m"]
 
 
-class RootCompliance(Primitive):
-    """A rotational spring is in series with the root: `compliance` about the flapping axis."""
+class SupportCompliance(Primitive):
+    """A support yields: a motion that it holds is against a spring of this `compliance`.
 
-    compliance: Annotated[float, "rad/(N m)"]
+    The motion is "x", "y" or "z", along an axis, or "rx", "ry" or "rz", about an axis through the
+    centre of the support. If a spring resists it already, the new one is in series with it. The
+    root of a wing or of a lumped model is the support "root" with the motion "rx".
+    """
+
+    support: str
+    motion: str
+    compliance: Annotated[float, "m/N or rad/(N m)"]
 
 
 class LocalStiffnessLoss(Primitive):
@@ -143,7 +155,12 @@ class PortLoad(Primitive):
     force: str
 
 
-STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
+STRUCTURE = (
+    PointMass,
+    SupportCompliance,
+    LocalStiffnessLoss,
+    ModulusTemperature,
+)
 """Primitives that change the linear structure, which must be solved anew."""
 INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
@@ -283,6 +300,9 @@ _WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 def _primitive_from_row(row: object, where: str) -> Primitive:
     """Return the primitive of a row of a file; raises `InvalidPatchError` as `from_list` does."""
+    if isinstance(row, Mapping) and row.get("kind") == FORMER_ROOT_COMPLIANCE:
+        support, motion = ROOT_TURN
+        row = {**row, "kind": SupportCompliance.kind, "support": support, "motion": motion}
     kind = row.get("kind") if isinstance(row, Mapping) else row
     if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
         raise InvalidPatchError(

@@ -16,12 +16,13 @@ from .dense_matrices import lowest_modes
 from .errors import InvalidPatchError
 from .patch import (
     LOADS,
+    ROOT_TURN,
     LoadGain,
     ModelPatch,
     ModulusTemperature,
     PointMass,
     RegionStiffnessLoss,
-    RootCompliance,
+    SupportCompliance,
 )
 from .port_laws import STATION_PORTS, port_laws
 from .skin_losses import remaining_skin
@@ -219,13 +220,19 @@ class PatchedWing(WingRows):
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
         """Put the root compliances of a patch in series with the spring at the root, in place.
 
-        Raises `InvalidPatchError` if no spring remains.
+        Raises `InvalidPatchError` if no spring remains, or another support is to yield.
         """
         spring = self.arrays.flap_spring
-        compliance = sum(
-            (primitive.compliance for primitive in patch if isinstance(primitive, RootCompliance)),
-            0.0,
-        )
+        compliance = 0.0
+        for primitive in patch:
+            if not isinstance(primitive, SupportCompliance):
+                continue
+            if (primitive.support, primitive.motion) != ROOT_TURN:
+                raise InvalidPatchError(
+                    f"The wing has no support {primitive.support!r} with the motion "
+                    f"{primitive.motion!r}; it has {' '.join(ROOT_TURN)}."
+                )
+            compliance += primitive.compliance
         if compliance == 0.0:
             return
         flexibility = 1.0 / spring + compliance

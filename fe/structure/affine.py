@@ -54,6 +54,28 @@ class LoadTerm(NamedTuple):
     mass: str | None = None
 
 
+class SupportMotion(NamedTuple):
+    """A motion of a support that is an unknown of a structure.
+
+    Attributes
+    ----------
+    support : str
+        Name of the support: its set of nodes, or its nodes.
+    motion : str
+        One of `tables.MOTIONS`.
+    unknown : int
+        Number of the unknown [m or rad].
+    spring : float
+        Spring that resists it [N/m or N m/rad]; zero for a motion that is held unless the support
+        yields.
+    """
+
+    support: str
+    motion: str
+    unknown: int
+    spring: float
+
+
 class SystemMatrices(NamedTuple):
     """A structure at certain values.
 
@@ -117,6 +139,9 @@ class AffineStructure:
         Rows that give the displacement of a port [1]; transposed, a force of 1 N there.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
+    support_motions : tuple of SupportMotion
+        Unknowns that are motions of supports: those against springs and, of a structure whose
+        supports yield, those that are held otherwise. The latter come last.
     design_hash : str
         Hash of the design with its mesh.
     """
@@ -141,6 +166,7 @@ class AffineStructure:
     acceleration_output: sparse.csr_array
     port_output: sparse.csr_array
     expansion: sparse.csr_array
+    support_motions: tuple[SupportMotion, ...]
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
@@ -273,6 +299,29 @@ class AffineStructure:
             displacements=(*self.displacements, *names),
             displacement_output=sparse.vstack(
                 (self.displacement_output, self.port_output), format="csr"
+            ),
+        )
+
+    def held(self) -> "AffineStructure":
+        """Return the structure with all supports held; of one that does not yield, itself."""
+        released = [motion for motion in self.support_motions if motion.spring == 0.0]
+        if not released:
+            return self
+        free = slice(0, self.unknowns - len(released))
+        return replace(
+            self,
+            stiffness_terms=tuple(
+                term._replace(matrix=term.matrix[free, free]) for term in self.stiffness_terms
+            ),
+            mass_terms=tuple(term[free, free] for term in self.mass_terms),
+            load_terms=tuple(term._replace(vector=term.vector[free]) for term in self.load_terms),
+            gauge_output=self.gauge_output[:, free],
+            displacement_output=self.displacement_output[:, free],
+            acceleration_output=self.acceleration_output[:, free],
+            port_output=self.port_output[:, free],
+            expansion=self.expansion[:, free],
+            support_motions=tuple(
+                motion for motion in self.support_motions if motion.spring != 0.0
             ),
         )
 

@@ -8,7 +8,7 @@ from scipy import sparse
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidDesignError
 
-from .affine import LoadTerm
+from .affine import LoadTerm, SupportMotion
 from .tables import StructureDesign
 
 
@@ -52,6 +52,7 @@ class AffineFields(TypedDict):
     acceleration_output: sparse.csr_array
     port_output: sparse.csr_array
     expansion: sparse.csr_array
+    support_motions: tuple[SupportMotion, ...]
 
 
 def affine_fields(
@@ -61,6 +62,7 @@ def affine_fields(
     point_masses: Iterable[sparse.csr_array],
     loads: Iterable[FloatArray],
     outputs: OutputRows,
+    support_motions: tuple[SupportMotion, ...] = (),
 ) -> AffineFields:
     """Return the fields of the affine model of a design, without design, stiffness terms and hash.
 
@@ -79,6 +81,8 @@ def affine_fields(
         acts on the free masses, too.
     outputs : OutputRows
         Rows of the design's gauges, displacements, accelerations and ports.
+    support_motions : tuple of SupportMotion
+        The unknowns that are motions of supports.
 
     Raises
     ------
@@ -95,7 +99,9 @@ def affine_fields(
         for mass_name, matrix in masses.items():
             load_terms.append(LoadTerm(load.name, restriction @ (matrix @ vector), mass_name))
     port_output = (outputs.port @ expansion).tocsr()
-    _check_ports_can_move(design, port_output)
+    released = [motion for motion in support_motions if motion.spring == 0.0]
+    held_count = port_output.shape[1] - len(released)
+    _check_ports_can_move(design, port_output[:, :held_count])
     return {
         "parameters": {parameter.name: parameter.nominal for parameter in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
@@ -117,6 +123,7 @@ def affine_fields(
         "acceleration_output": (outputs.acceleration @ expansion).tocsr(),
         "port_output": port_output,
         "expansion": expansion,
+        "support_motions": support_motions,
     }
 
 

@@ -139,4 +139,5 @@ class Body(Generic[Mesh]):
             point_masses,
             loads,
             outputs,
+            self.supports.motions,
         )

@@ -8,6 +8,7 @@ force of 1 N there.
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -17,7 +18,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
-from .affine import AffineStructure, StiffnessTerm
+from .affine import AffineStructure, StiffnessTerm, SupportMotion
 from .affine_fields import AffineFields, OutputRows, affine_fields
 from .matrix_design import (
     Extension,
@@ -41,7 +42,9 @@ _MOST_FREE_MOTIONS = 7
 """Free motions that are counted at most."""
 
 
-def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> AffineStructure:
+def assemble_matrices(
+    design: MatrixDesign, folder: Path, design_hash: str, *, yielding: bool = False
+) -> AffineStructure:
     """Make the affine operators of a structure from matrices.
 
     Parameters
@@ -52,6 +55,10 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         The folder of its files.
     design_hash : str
         The hash of the design and its files.
+    yielding : bool
+        Whether the motions that the supports hold are unknowns, behind all others. The nodes of a
+        support then shift together, and turn each by the same angle: files of matrices have no
+        places of nodes about which they could turn together.
 
     Raises
     ------
@@ -69,15 +76,61 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         )
     free_places = [files.places[row] for row in free_rows]
     _check_structure(stiffness[free_rows][:, free_rows], mass[free_rows][:, free_rows], free_places)
-    fields = _fields(design, files, mass, free_rows)
+    unknowns = _Unknowns(sparse.eye_array(len(files.places), format="csc")[:, free_rows].tocsr())
+    if yielding:
+        unknowns = _with_held_motions(design, files, unknowns)
+    fields = _fields(design, files, mass, unknowns)
     # The expansion of the model gives displacements of nodes, not the rows of the matrices.
-    fields["expansion"] = _nodal_displacements(files)[:, free_rows]
+    fields["expansion"] = (_nodal_displacements(files) @ unknowns.expansion).tocsr()
     return AffineStructure(
         design=design,
         **fields,
-        stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free_rows)),
+        stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, unknowns)),
         design_hash=design_hash,
     )
+
+
+class _Unknowns(NamedTuple):
+    """The unknowns of a structure from matrices.
+
+    Attributes
+    ----------
+    expansion : csr (R, n)
+        Unknowns to the R rows of the matrices: first the free rows, then motions of supports.
+    motions : tuple of SupportMotion
+        These motions.
+    """
+
+    expansion: sparse.csr_array
+    motions: tuple[SupportMotion, ...] = ()
+
+    @property
+    def free_count(self) -> int:
+        """The number of unknowns that are free rows."""
+        return int(self.expansion.shape[1]) - len(self.motions)
+
+
+def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unknowns) -> _Unknowns:
+    """Return the unknowns with the motions that the supports of the design hold behind them."""
+    columns: dict[tuple[str, str], FloatArray] = {}
+    for label, support in design.numbered("support"):
+        numbers = sorted(support.nodes)
+        name = f"node {numbers[0]}" if len(numbers) == 1 else f"nodes {numbers[0]} to {numbers[-1]}"
+        for motion in support.hold:
+            component = MOTIONS.index(motion) + 1
+            column = columns.setdefault((name, motion), np.zeros(len(files.places)))
+            for node in support.nodes:
+                column[files.rows_of((node, component), label)] = 1.0
+    motions = tuple(
+        SupportMotion(name, motion, unknowns.free_count + number, 0.0)
+        for number, (name, motion) in enumerate(columns)
+    )
+    # a turn is counted in units of length, as all rows are
+    blocks = [
+        sparse.csr_array(column[:, np.newaxis] * (files.unit if "r" in motion else 1.0))
+        for (_, motion), column in columns.items()
+    ]
+    return _Unknowns(sparse.hstack((unknowns.expansion, *blocks)).tocsr(), motions)
 
 
 def _places(design: MatrixDesign, folder: Path) -> list[Place]:
@@ -125,9 +178,9 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 
 
 def _fields(
-    design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free_rows: IntArray
+    design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, unknowns: _Unknowns
 ) -> AffineFields:
-    """Return the fields of the affine model; its expansion enters the free rows into all rows."""
+    """Return the fields of the affine model; its expansion enters the unknowns into all rows."""
     size = len(files.places)
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
     loads = (_load(load, files, label) for label, load in design.numbered("load"))
@@ -141,7 +194,7 @@ def _fields(
 
     return affine_fields(
         design,
-        expansion=sparse.eye_array(size, format="csc")[:, free_rows].tocsr(),
+        expansion=unknowns.expansion,
         mass=mass,
         point_masses=point_masses,
         loads=loads,
@@ -151,6 +204,7 @@ def _fields(
             acceleration=output_rows("acceleration"),
             port=output_rows("port"),
         ),
+        support_motions=unknowns.motions,
     )
 
 
@@ -208,7 +262,10 @@ def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:
 
 
 def _stiffness_terms(
-    design: MatrixDesign, files: MatrixFiles, whole_stiffness: sparse.csr_array, free_rows: IntArray
+    design: MatrixDesign,
+    files: MatrixFiles,
+    whole_stiffness: sparse.csr_array,
+    unknowns: _Unknowns,
 ) -> Iterator[StiffnessTerm]:
     """Yield a stiffness term for each part of the design, then one for the rest of the structure.
 
@@ -222,8 +279,8 @@ def _stiffness_terms(
         The matrix files of the design, with R rows.
     whole_stiffness : sparse (R, R) array
         The stiffness of the whole structure.
-    free_rows : (n,) array of int
-        The rows that are not held; the terms have these alone.
+    unknowns : _Unknowns
+        The unknowns, which the terms have.
 
     Raises
     ------
@@ -239,7 +296,7 @@ def _stiffness_terms(
         free_part = _free_part(
             whole_stiffness,
             matrix,
-            free_rows,
+            unknowns,
             refusal=f"{label} takes stiffness away somewhere; its file is of another run or part.",
         )
         if not free_part.nnz:
@@ -249,7 +306,7 @@ def _stiffness_terms(
     free_remainder = _free_part(
         whole_stiffness,
         remainder,
-        free_rows,
+        unknowns,
         refusal="the parts are together stiffer than the whole; two parts must not overlap.",
     )
     if free_remainder.nnz:
@@ -272,9 +329,9 @@ def _part_matrix(
 
 
 def _free_part(
-    whole_stiffness: sparse.csr_array, part: sparse.csr_array, free_rows: IntArray, *, refusal: str
+    whole_stiffness: sparse.csr_array, part: sparse.csr_array, unknowns: _Unknowns, *, refusal: str
 ) -> sparse.csr_array:
-    """Return the free rows and columns (n, n) of a part's stiffness.
+    """Return a part's stiffness (n, n) on the unknowns.
 
     Entries that are rounding errors of the whole stiffness are left out.
 
@@ -282,8 +339,8 @@ def _free_part(
     ----------
     whole_stiffness, part : sparse (R, R) array
         The stiffness of the whole structure and of the part.
-    free_rows : (n,) array of int
-        The rows that are not held.
+    unknowns : _Unknowns
+        The unknowns.
     refusal : str
         The sentence with which an indefinite part is refused.
 
@@ -296,10 +353,14 @@ def _free_part(
     scale = np.sqrt(np.abs(whole_stiffness.diagonal()))
     is_rounding = np.abs(entries.data) <= _ROUNDING * scale[entries.row] * scale[entries.col]
     entries.data[is_rounding] = 0.0
-    free_part = entries.tocsr()[free_rows][:, free_rows]
-    free_part.eliminate_zeros()
-    _check_definite(free_part + _INDEFINITE * whole_stiffness[free_rows][:, free_rows], refusal)
-    return free_part
+    expansion = unknowns.expansion
+    part_of_unknowns = (expansion.T @ (entries.tocsr() @ expansion)).tocsr()
+    part_of_unknowns.eliminate_zeros()
+    free = slice(0, unknowns.free_count)
+    free_expansion = expansion[:, free]
+    free_whole = free_expansion.T @ (whole_stiffness @ free_expansion)
+    _check_definite(part_of_unknowns[free, free] + _INDEFINITE * free_whole, refusal)
+    return part_of_unknowns
 
 
 def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:

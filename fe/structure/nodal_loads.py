@@ -133,9 +133,21 @@ def _force_weights(mesh: StructureMesh, part: MeshLoad | MeshPort, where: str) -
     """Return the weights (nodes,) of nodes in a force at a point or on a set; their sum is one."""
     if part.point is not None:
         return point_weights(mesh, part.point, where)
-    # a force on a set: by area if it holds faces, else equally among the nodes
-    nodes = mesh.nodes_of(str(part.set), where)
-    surface = mesh.faces_between(str(part.set), nodes)
+    return set_weights(mesh, str(part.set), where)
+
+
+def set_weights(mesh: StructureMesh, name: str, where: str) -> FloatArray:
+    """Return the weights (nodes,) of the nodes of a set in its mean displacement.
+
+    They are by area if the set holds faces, else equal; their sum is one.
+
+    Raises
+    ------
+    MeshError
+        If the set is missing or empty.
+    """
+    nodes = mesh.nodes_of(name, where)
+    surface = mesh.faces_between(name, nodes)
     if len(surface):
         weights = face_areas(mesh, surface).areas
     else:

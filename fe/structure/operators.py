@@ -30,7 +30,7 @@ from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .nodal_loads import nodal_load, point_weights, port_row
-from .supports import supports_of_design
+from .supports import Supports, supports_of_design
 from .vtu import write_vtu
 
 
@@ -165,7 +165,11 @@ def _stiffness_parts(
 
 
 def load_and_assemble(
-    file: Path | str, memory_limit: float | None = None, *, mass_as_stiffness: bool = False
+    file: Path | str,
+    memory_limit: float | None = None,
+    *,
+    mass_as_stiffness: bool = False,
+    yielding: bool = False,
 ) -> Structure:
     """Read a structure file with its mesh, check both and assemble the affine operators.
 
@@ -178,6 +182,9 @@ def load_and_assemble(
     mass_as_stiffness : bool
         Integrate the mass at the points of the stiffness, as CalculiX does; this is not exact for
         tetrahedra.
+    yielding : bool
+        Whether the motions that the supports hold are unknowns, too, see
+        `fe.structure.supports.supports_of_design`.
 
     Raises
     ------
@@ -201,7 +208,14 @@ def load_and_assemble(
     _check_materials(mesh, material_of)
     region_of = _part_of_cells(mesh, list(design.numbered("damage")), "damage region")
     # the body, its loads and outputs
-    body = _body(design, mesh, material_of, region_of, mass_as_stiffness=mass_as_stiffness)
+    body = _body(
+        design,
+        mesh,
+        material_of,
+        region_of,
+        supports_of_design(design, mesh, yielding=yielding),
+        mass_as_stiffness=mass_as_stiffness,
+    )
     gauges, gauges_moved = gauge_rows(mesh, design.gauge)
     outputs = OutputRows(
         gauge=gauges,
@@ -237,16 +251,17 @@ def _body(
     mesh: StructureMesh,
     material_of: IntArray,
     region_of: IntArray,
+    supports: Supports,
     *,
     mass_as_stiffness: bool,
 ) -> Body[StructureMesh]:
-    """Return the body of a design, from material and region (nc,) of each cell."""
+    """Return the body of a design, from material and region (nc,) of each cell, and supports."""
     parts = _stiffness_parts(design, material_of, region_of)
     elasticities = np.array([material.elasticity for material in design.material])
     densities = np.array([material.density for material in design.material])
     return Body(
         mesh=mesh,
-        supports=supports_of_design(design, mesh),
+        supports=supports,
         elasticity=elasticities[material_of],
         density=densities[material_of],
         part=parts.part_of,
@@ -259,7 +274,9 @@ def _body(
     )
 
 
-def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
+def assemble_structure(
+    file: Path | str, memory_limit: float | None = None, *, yielding: bool = False
+) -> AffineStructure:
     """Read a structure file with its mesh or its matrices, and assemble the affine operators.
 
     Parameters
@@ -268,6 +285,8 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
         The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
+    yielding : bool
+        Whether the motions that the supports hold are unknowns, too.
 
     Raises
     ------
@@ -279,8 +298,9 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
     design = load_structure(file)
     folder = Path(file).parent
     if isinstance(design, MatrixDesign):
-        return assemble_matrices(design, folder, structure_hash(design, folder))
-    return load_and_assemble(file, memory_limit)
+        design_hash = structure_hash(design, folder)
+        return assemble_matrices(design, folder, design_hash, yielding=yielding)
+    return load_and_assemble(file, memory_limit, yielding=yielding)
 
 
 def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) -> sparse.csr_array:

@@ -1,6 +1,6 @@
 """Supports of a mesh: held, sprung and rigid nodes, and whether the structure is free to move."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,8 +10,10 @@ from scipy import sparse
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 
+from .affine import SupportMotion
 from .design import MeshDesign, Support
 from .mesh import StructureMesh
+from .nodal_loads import set_weights
 from .tables import MOTIONS
 
 _FREE = 1e-8
@@ -50,11 +52,15 @@ class Supports(NamedTuple):
         Displacements that are free unknowns themselves, the first of these.
     springs : (n,) array
         Springs to the ground [N/m, N m/rad].
+    motions : tuple of SupportMotion
+        Motions of supports that are unknowns: those of rigid sets on springs and, of yielding
+        supports, the motions that would be held, which come last.
     """
 
     expansion: sparse.csr_array
     free_displacements: IntArray
     springs: FloatArray
+    motions: tuple[SupportMotion, ...] = ()
 
     @property
     def stiffness(self) -> sparse.csr_array:
@@ -92,10 +98,12 @@ def supports(
     return Supports(expansion.tocsr(), free_displacements, all_springs)
 
 
-def _body_expansion(points: FloatArray, body: RigidSet) -> sparse.coo_array:
-    """Return the displacements (3 nodes, m) of all nodes by the m free motions of a rigid body."""
+def _body_expansion(
+    points: FloatArray, body: RigidSet, is_moving: BoolArray | None = None
+) -> sparse.coo_array:
+    """Return the displacements (3 nodes, m) of all nodes by m motions of a body, the free ones."""
     motions = rigid_motions(points[body.nodes], body.point, 2.0)
-    moving = sparse.coo_array(motions[:, ~body.held])
+    moving = sparse.coo_array(motions[:, ~body.held if is_moving is None else is_moving])
     number_in_body, component = np.divmod(moving.row, 3)
     node = body.nodes[number_in_body]
     displacement = 3 * node + component
@@ -125,7 +133,9 @@ class _NodeSupports:
         return np.asarray(self.held | (self.springs > 0.0))
 
 
-def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
+def supports_of_design(
+    design: MeshDesign, mesh: StructureMesh, *, yielding: bool = False
+) -> Supports:
     """Return the supports of a design.
 
     Parameters
@@ -134,6 +144,9 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
         The design, as read from its file.
     mesh : StructureMesh
         The mesh of the structure, with its nodes in metres.
+    yielding : bool
+        Whether the motions that the supports hold are unknowns, behind all others. What a set of
+        nodes holds then moves as a rigid body does, by six motions about the centre of the set.
 
     Raises
     ------
@@ -161,7 +174,82 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
     _check_no_shared_nodes(mesh, nodal, bodies)
     rigid_sets = tuple(bodies.values())
     _check_rigid_motions(mesh, nodal, rigid_sets)
-    return supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
+    held_supports = supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
+    sets_of_bodies = [
+        support.set for _, support in design.numbered("support") if support.rigid_about is not None
+    ]
+    first_of_bodies = len(held_supports.free_displacements)
+    sprung = _sprung_motions(sets_of_bodies, rigid_sets, first_of_bodies)
+    held_supports = held_supports._replace(motions=sprung)
+    if not yielding:
+        return held_supports
+    held = dict(_held_motions(design, mesh))
+    for set_name, body in zip(sets_of_bodies, rigid_sets, strict=True):
+        for number in np.flatnonzero(body.held).tolist():
+            column = _body_expansion(mesh.points, body, np.arange(len(MOTIONS)) == number)
+            held[set_name, MOTIONS[number]] = column
+    return _with_unknown_motions(held_supports, held)
+
+
+def _sprung_motions(
+    sets: Iterable[str], bodies: Iterable[RigidSet], first: int
+) -> tuple[SupportMotion, ...]:
+    """Return motions of rigid sets against springs; unknown `first` is the first free motion."""
+    motions = []
+    unknown = first
+    for set_name, body in zip(sets, bodies, strict=True):
+        for number in np.flatnonzero(~body.held).tolist():
+            spring = float(body.springs[number])
+            if spring > 0.0:
+                motions.append(SupportMotion(set_name, MOTIONS[number], unknown, spring))
+            unknown += 1
+    return tuple(motions)
+
+
+def _held_motions(
+    design: MeshDesign, mesh: StructureMesh
+) -> Iterator[tuple[tuple[str, str], sparse.coo_array]]:
+    """Yield set and motion of what sets of nodes hold, with its displacements (full, 1).
+
+    A set with several tables is held as all of them say. Motions that move none of the held
+    displacements, such as a turn of nodes on a line about this line, are left out.
+    """
+    held_of_set: dict[str, BoolArray] = {}
+    for label, support in design.numbered("support"):
+        if support.rigid_about is not None or not support.hold:
+            continue
+        nodes = mesh.nodes_of(support.set, label)
+        is_held = np.zeros((len(mesh.points), 3), dtype=bool)
+        is_held[nodes] = np.isin(MOTIONS[:3], support.hold)
+        held_of_set[support.set] = held_of_set.get(support.set, False) | is_held
+    for set_name, is_held in held_of_set.items():
+        centre = set_weights(mesh, set_name, f"support {set_name!r}") @ mesh.points
+        motions = rigid_motions(mesh.points, centre, mesh.size)
+        motions[~is_held.ravel()] = 0.0
+        lengths = np.linalg.norm(motions, axis=0)
+        for number, motion in enumerate(MOTIONS):
+            if lengths[number] > _FREE * lengths.max():
+                # a turn by one radian, not by one in units of the size
+                scale = 1.0 if number < 3 else 0.5 * mesh.size
+                yield (set_name, motion), sparse.coo_array(scale * motions[:, [number]])
+
+
+def _with_unknown_motions(
+    held_supports: Supports, columns: dict[tuple[str, str], sparse.coo_array]
+) -> Supports:
+    """Return supports with further unknowns: motions by set and name, as columns (full, 1)."""
+    first = held_supports.expansion.shape[1]
+    motions = tuple(
+        SupportMotion(set_name, motion, first + number, 0.0)
+        for number, (set_name, motion) in enumerate(columns)
+    )
+    expansion = sparse.hstack((held_supports.expansion, *columns.values()))
+    return Supports(
+        expansion=expansion.tocsr(),
+        free_displacements=held_supports.free_displacements,
+        springs=np.pad(held_supports.springs, (0, len(columns))),
+        motions=held_supports.motions + motions,
+    )
 
 
 def _check_no_shared_nodes(

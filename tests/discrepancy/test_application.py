@@ -275,7 +275,7 @@ def test_a_patch_is_refused_once_the_file_of_its_model_has_changed(python_round_
         trip.file.write_text(text, encoding="utf-8")
 
 
-ROOT_OR_CRACK = chosen("root_compliance", "breathing_crack")
+ROOT_OR_CRACK = chosen("support_compliance", "breathing_crack")
 
 
 class GroupVerdict:
@@ -285,7 +285,7 @@ class GroupVerdict:
         self.folder = folder / "verdict"
         self.campaign = folder / "campaign"
         choice = choose_model("three_mass_chain")
-        hidden = ("root_compliance", {"compliance_share": 0.11}, "")
+        hidden = ("support_compliance", {"compliance_share": 0.11}, "")
         campaign = simulated(choice.model, "static", 3, hidden, self.campaign)
         self.verdict = verdict_of(choice, campaign, ROOT_OR_CRACK, self.folder).verdict
 
@@ -298,7 +298,7 @@ def group_verdict(tmp_path_factory):
 def test_a_static_campaign_cannot_tell_a_compliant_root_from_a_crack(group_verdict):
     verdict = group_verdict.verdict
     assert verdict.kind is VerdictKind.GROUP, verdict.sentence
-    assert set(verdict.group) == {"root_compliance", "breathing_crack"}
+    assert set(verdict.group) == {"support_compliance", "breathing_crack"}
 
 
 class AppliedMember:

@@ -246,8 +246,8 @@ def test_a_breathing_crack_takes_at_most_nine_tenths_of_a_stiffness(
     assert (crack.side, crack.exponent, crack.coefficient) == (side, 1.0, pytest.approx(force))
 
 
-def test_a_root_compliance_has_its_fraction_of_the_tip_compliance(setting):
-    spring = only(setting, "root_compliance", {"compliance_share": 0.1})
+def test_a_support_compliance_has_its_fraction_of_the_tip_compliance(setting):
+    spring = only(setting, "support_compliance", {"compliance_share": 0.1})
     assert spring.compliance * LENGTH**2 * setting.scales.tip_stiffness == pytest.approx(0.1)
 
 

@@ -59,7 +59,7 @@ def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock():
         "release", TrialKind.RINGDOWN, ("x",), 0.02 * np.arange(200), load_place="tip",
         release=Release(0.01, 0.02, mode_count=1),
     )  # fmt: skip
-    effects = ("point_mass", "root_compliance", "clock_error")
+    effects = ("point_mass", "support_compliance", "clock_error")
     exact = Campaign("", {"x": channel}, (trial,), None, {"stiffness_factor": (1.0, 1e-4)}, "")
     found = decided(model, exact, *effects)
     assert set(group_of(found, "point_mass")) == set(effects)
@@ -124,7 +124,7 @@ def test_one_gauge_at_one_load_factor_cannot_tell(kind, group):
 
 SEPARATED = (
     "point_mass",
-    "root_compliance",
+    "support_compliance",
     "quadratic_damping",
     "coulomb_friction",
     "load_cell",
@@ -174,7 +174,7 @@ def refitted_chi_square(measured: Campaign, model: LumpedModel, term: EffectTerm
     return fit(changed, Candidate(), changed.prior_mean_point(Candidate())).chi_square
 
 
-@pytest.mark.parametrize("identifier", ["root_compliance", "stiffness_drift"])
+@pytest.mark.parametrize("identifier", ["support_compliance", "stiffness_drift"])
 def test_the_least_detectable_size_of_an_effect_leaves_its_squared_distance_after_a_refit(identifier):
     """Also where other parameters imitate it so well that this size is far below the prior's median."""
     bench = kit.chain_bench(static=False)
@@ -187,7 +187,7 @@ def test_the_least_detectable_size_of_an_effect_leaves_its_squared_distance_afte
 
 def test_a_change_is_shrunk_by_the_factor_that_is_told():
     """However small it becomes: the stated distances are scaled back by this factor."""
-    (effect,) = kit.chosen("root_compliance")
+    (effect,) = kit.chosen("support_compliance")
     term = EffectTerm(effect, "")
     (prior,) = (parameter.prior for parameter in term.parameters if parameter.magnitude)
     shrunk = term.multiply_magnitudes(np.zeros(len(term.parameters)), 1e-9)
@@ -196,7 +196,7 @@ def test_a_change_is_shrunk_by_the_factor_that_is_told():
 
 def test_an_effect_within_the_noise_of_anything_is_not_confused_with_all_others():
     """A gain of a millionth."""
-    *others, gauge = kit.chosen("root_compliance", "quadratic_damping", "gauge_gain")
+    *others, gauge = kit.chosen("support_compliance", "quadratic_damping", "gauge_gain")
     (gain,) = gauge.parameters
     tiny = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
     tiny_gain = replace(gauge, parameters=(replace(gain, prior=tiny),))

@@ -170,7 +170,7 @@ def test_gains_and_zeros_are_named_too():
 
 
 FRICTION, CUBIC = "coulomb_friction", "cubic_stiffness"
-ROOT, CRACK = "root_compliance", "breathing_crack"
+ROOT, CRACK = "support_compliance", "breathing_crack"
 
 
 def rig(drag=0.0, kind="laboratory", **changes):

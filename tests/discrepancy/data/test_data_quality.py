@@ -146,7 +146,7 @@ def hidden_effects(campaign):
     return [
         ModelPatch(()),
         ModelPatch((patches.PointMass(0.3 * scales.modal_mass, 0.6),)),
-        ModelPatch((patches.RootCompliance(0.3 / scales.tip_stiffness / 0.36),)),
+        ModelPatch((patches.SupportCompliance("root", "rx", 0.3 / scales.tip_stiffness / 0.36),)),
         ModelPatch((patches.PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),)),
         ModelPatch((SensorGain("base_strain", -0.15), patches.HighPass("x3", 0.5))),
     ]

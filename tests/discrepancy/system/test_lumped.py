@@ -72,7 +72,7 @@ WARM, SOFTER = np.array([0.0, 10.0, 0.0, -20.0]), patches.ModulusTemperature(2e-
     [
         ((), [0.0, 1.0, -3.0], np.outer([0, 1, -3], END), {}),
         ((), [1.0], [np.linalg.solve(SCALED, [0, 0, 1])], {"parameters": np.array([1.1, 0.8, 2.0])}),
-        ((patches.RootCompliance(3e-4),), [2.0], [2.0 * ROOT[:, 2]], {}),  # in series
+        ((patches.SupportCompliance("root", "rx", 3e-4),), [2.0], [2.0 * ROOT[:, 2]], {}),  # in series
         ((patches.LoadGain(0.05, 0.5),), [0.0, 4.0], np.outer([0.0, 4.7], END), {}),
         (TWO_GAINS, [0.0, 4.0], np.outer([0.0, 5.83], END), {}),
         ((patches.LoadPlace(-0.05, 0.0),), [3.0], [np.linalg.solve(STIFFNESS, [0, 0.75, 2.25])], {}),

@@ -23,7 +23,7 @@ from discrepancy.system.system_state import SystemState
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import cache_file
 from fe.reduction.reduced_basis import reduce_structure
-from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, Primitive, RootCompliance
+from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, Primitive, SupportCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure
@@ -302,10 +302,10 @@ def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> N
 # ---------------------------------------------------------------- the wing
 
 
-CARRIED = {"mass": PointMass(0.02, 1.2), "root": RootCompliance(1e-5)}
+CARRIED = {"mass": PointMass(0.02, 1.2), "root": SupportCompliance("root", "rx", 1e-5)}
 """Effects that the FMU is packed with."""
 
-ADDED = [PointMass(0.3, 0.9), RootCompliance(3e-4)]
+ADDED = [PointMass(0.3, 0.9), SupportCompliance("root", "rx", 3e-4)]
 """Effects that a hypothesis adds to them."""
 
 LOADS = record(TrialKind.STATIC, 5, 0.002, force=np.linspace(-10.0, 10.0, 5))

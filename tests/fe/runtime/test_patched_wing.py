@@ -12,7 +12,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime import patch
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
+from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, SupportCompliance
 from fe.wing.gauges import gauge_output
 from fe.wing.operators import (
     AffineOperators,
@@ -73,7 +73,7 @@ def change_root(wings: WingComparison, fraction: float) -> ChangedStructure:
     softer_spring = 1.0 / (1.0 / wings.design.root.flap_spring + compliance)
     operators = assemble(wings.design.changed(root={"flap_spring": softer_spring}))
     return ChangedStructure(
-        patched=wings.patched_structure(RootCompliance(compliance)),
+        patched=wings.patched_structure(SupportCompliance("root", "rx", compliance)),
         operators=operators,
         stiffness=full_stiffness(operators),
     )

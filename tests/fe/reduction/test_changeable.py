@@ -1,0 +1,271 @@
+"""Structures whose supports yield: closed forms, and the full model with springs."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
+from fe.reduction.change_basis import with_changes
+from fe.reduction.reduced_basis import reduce_structure
+from fe.runtime.arrays import FloatArray
+from fe.runtime.changeable import ChangeableModel, ChangedStructure
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import ModelPatch, SupportCompliance
+from fe.structure.affine import AffineStructure
+from fe.structure.operators import assemble_structure
+
+WriteBeam = Callable[..., Path]
+
+LENGTH = 0.1
+INERTIA = 0.02 * 0.01**3 / 12.0
+MODULUS = 7e10
+BENDING = MODULUS * INERTIA / LENGTH
+"""Stiffness against a turn of the tip by a moment there [N m/rad]."""
+SLENDER = {
+    "poisson_ratio = 0.33": "poisson_ratio = 0.0",
+    "free = true": "free = false",
+    "mass = 0.05": "mass = 1e-9",
+}
+CLAMP_AT_ROOT = 'support = [{ set = "root", hold = ["x", "y", "z"] }]'
+PROPPED = """support = [{ set = "root", hold = ["x", "y", "z"] }, { set = "end", hold = ["z"] }]"""
+INNER_PUSH = {
+    'set = "end", force': "point = [60, 10, 10], force",
+    "point = [100, 10, 5]": "point = [70, 10, 5]",
+}
+"""Load and outputs between the supports."""
+FLANGE = """support = [{ set = "root", rigid_about = [0, 10, 5], \
+hold = ["x", "y", "z", "rx", "rz"], springs = [0, 0, 0, 0, 2000.0, 0] }]"""
+PUSH = {"push": 50.0, "load_factor": 0.0}
+
+
+class Yielding(NamedTuple):
+    """A structure whose supports yield, and its reduced model."""
+
+    full: AffineStructure
+    model: ChangeableModel
+
+    def changed(
+        self, *primitives: SupportCompliance, values: dict[str, float] | None = None
+    ) -> ChangedStructure:
+        vector = self.model.vector(values or {})
+        return ChangedStructure(self.model, vector, ModelPatch(primitives))
+
+    def outputs(self, structure: ChangedStructure, values: dict[str, float]) -> FloatArray:
+        """Return strains and displacements at rest under the loads of the reduced model."""
+        coefficients = self.model.load_coefficients(self.model.vector(values))
+        static_count = len(self.model.gauges) + len(self.model.displacements)
+        displacements = structure.static(self.model.whole_load.T @ coefficients)
+        return np.asarray(self.model.whole_output[:static_count] @ displacements)
+
+    def full_system(self, compliances: dict[int, float], values: dict[str, float]):
+        """Return stiffness, mass and load of the full model, its other supports held."""
+        system = self.full.system_at(values)
+        stiffness = system.stiffness.tolil()
+        held = []
+        for number, motion in enumerate(self.full.support_motions):
+            if number in compliances:
+                spring = motion.spring
+                stiffness[motion.unknown, motion.unknown] += (
+                    1.0 / compliances[number]
+                    if spring == 0.0
+                    else 1.0 / (1.0 / spring + compliances[number]) - spring
+                )
+            elif motion.spring == 0.0:
+                held.append(motion.unknown)
+        free = np.setdiff1d(np.arange(self.full.unknowns), held)
+        matrix = stiffness.tocsr()[free][:, free]
+        return matrix, system.mass[free][:, free], system.load[free], free
+
+    def full_answers(
+        self, compliances: dict[int, float], values: dict[str, float]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return outputs at rest and natural frequencies of the full model."""
+        stiffness, mass, load, free = self.full_system(compliances, values)
+        displacements = Factorisation(stiffness).solve(load)
+        full = self.full
+        rows = np.concatenate((full.gauge_output.toarray(), full.displacement_output.toarray()))
+        squares, _ = lowest_eigenpairs(stiffness, mass, self.model.mode_count)
+        return rows[:, free] @ displacements, np.sqrt(squares) / (2.0 * np.pi)
+
+
+def yielding_beam(file: Path) -> Yielding:
+    """Return the structure of a file with yielding supports."""
+    full = assemble_structure(file, yielding=True)
+    return Yielding(full, with_changes(full, reduce_structure(full.held())))
+
+
+@pytest.fixture(scope="module")
+def slender(write_beam: WriteBeam, tmp_path_factory: pytest.TempPathFactory) -> Yielding:
+    """A cantilever that bends as an Euler-Bernoulli beam nearly does, without masses on it."""
+    return yielding_beam(write_beam(tmp_path_factory.mktemp("slender"), SLENDER, cells=8))
+
+
+@pytest.fixture(scope="module")
+def propped(write_beam: WriteBeam, tmp_path_factory: pytest.TempPathFactory) -> Yielding:
+    """The beam on two supports, which is statically indeterminate."""
+    changes = {CLAMP_AT_ROOT: PROPPED, **INNER_PUSH}
+    return yielding_beam(write_beam(tmp_path_factory.mktemp("propped"), changes))
+
+
+@pytest.fixture(scope="module")
+def flanged(write_beam: WriteBeam, tmp_path_factory: pytest.TempPathFactory) -> Yielding:
+    """The beam behind a rigid flange, which turns about y against a spring."""
+    return yielding_beam(write_beam(tmp_path_factory.mktemp("flanged"), {CLAMP_AT_ROOT: FLANGE}))
+
+
+def test_a_clamp_that_turns_moves_the_tip_and_no_strain(slender: Yielding) -> None:
+    """Under a force F at the tip the clamp turns by c F L."""
+    compliance = 0.3 / BENDING
+    held = slender.outputs(slender.changed(), PUSH)
+    soft = slender.outputs(slender.changed(SupportCompliance("root", "ry", compliance)), PUSH)
+    assert soft[:3] == pytest.approx(held[:3], rel=1e-9)
+    assert soft[3] - held[3] == pytest.approx(50.0 * compliance * LENGTH**2, rel=1e-6)
+
+
+def test_a_clamp_that_shifts_moves_the_tip_as_much(slender: Yielding) -> None:
+    held = slender.outputs(slender.changed(), PUSH)
+    soft = slender.outputs(slender.changed(SupportCompliance("root", "z", 2e-7)), PUSH)
+    assert soft[3] - held[3] == pytest.approx(50.0 * 2e-7, rel=1e-6)
+
+
+@pytest.mark.parametrize("relative_spring", [0.5, 3.0, 30.0])
+def test_a_first_frequency_is_that_of_a_cantilever_on_a_rotational_spring(
+    slender: Yielding, relative_spring: float
+) -> None:
+    """Blevins 1979: 1 + cos b cosh b + b (cos b sinh b - sin b cosh b) EI / (k L) = 0."""
+
+    def root(spring: float) -> float:
+        def equation(b: float) -> float:
+            coupling = np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)
+            return float(1.0 + np.cos(b) * np.cosh(b) + b * coupling / spring)
+
+        return float(brentq(equation, 1e-3, 1.8752))
+
+    soft = slender.changed(SupportCompliance("root", "ry", 1.0 / (relative_spring * BENDING)))
+    ratio = soft.modes.frequency[0] / slender.changed().modes.frequency[0]
+    assert ratio == pytest.approx((root(relative_spring) / 1.8751) ** 2, rel=5e-3)
+
+
+MOTIONS_OF_BEAMS = [
+    ("slender", 4),
+    ("slender", 2),
+    ("propped", 4),
+    ("propped", 6),
+    ("flanged", 0),
+    ("flanged", 3),
+]
+
+
+@pytest.mark.parametrize("gain", [0.01, 1.0])
+@pytest.mark.parametrize(("beam", "number"), MOTIONS_OF_BEAMS)
+def test_both_ends_of_the_range_are_those_of_the_full_model(
+    request, beam: str, number: int, gain: float
+) -> None:
+    """In a state with losses, for outputs and frequencies."""
+    made: Yielding = request.getfixturevalue(beam)
+    motion = made.full.support_motions[number]
+    values = {"z1": 0.5, "z2": 0.3, **PUSH}
+    compliance = gain / float(made.model.compliance_gains(made.model.vector())[number].max())
+    expected, frequency = made.full_answers({number: compliance}, values)
+    structure = made.changed(
+        SupportCompliance(motion.support, motion.motion, compliance), values=values
+    )
+    outputs = made.outputs(structure, values)
+    for group in (slice(0, 3), slice(3, None)):
+        assert np.abs(outputs[group] - expected[group]).max() < 1e-3 * np.abs(expected[group]).max()
+    assert structure.modes.frequency == pytest.approx(frequency, rel=1e-3)
+
+
+@pytest.mark.parametrize("beam", ["slender", "propped", "flanged"])
+def test_the_stated_errors_are_small(request, beam: str) -> None:
+    assert request.getfixturevalue(beam).model.support_errors.max() < 1e-3
+
+
+def test_two_supports_may_yield_at_once(propped: Yielding) -> None:
+    names = [(motion.support, motion.motion) for motion in propped.full.support_motions]
+    compliances = {names.index(("root", "ry")): 0.4 / BENDING, names.index(("end", "z")): 3e-7}
+    primitives = [SupportCompliance(*names[number], value) for number, value in compliances.items()]
+    structure = propped.changed(*primitives)
+    expected, frequency = propped.full_answers(compliances, PUSH)
+    assert propped.outputs(structure, PUSH)[:3] == pytest.approx(expected[:3], rel=1e-3)
+    assert structure.modes.frequency[:3] == pytest.approx(frequency[:3], rel=1e-3)
+
+
+def test_a_motion_that_moves_nothing_that_is_held_is_left_out(propped: Yielding) -> None:
+    """The end, a face across x, is held along z alone: a turn about y moves it along x alone."""
+    motions = [motion.motion for motion in propped.full.support_motions if motion.support == "end"]
+    assert motions == ["z", "rx"]
+
+
+@settings(max_examples=20, deadline=None)
+@given(exponent=st.floats(-14.0, -8.0))
+def test_a_support_that_hardly_yields_is_held(slender: Yielding, exponent: float) -> None:
+    held, soft = slender.changed(), slender.changed(SupportCompliance("root", "ry", 10.0**exponent))
+    assert soft.modes.frequency == pytest.approx(held.modes.frequency, rel=1e-4)
+    assert slender.outputs(soft, PUSH) == pytest.approx(slender.outputs(held, PUSH), rel=1e-4)
+
+
+def test_compliances_of_one_motion_add_up(flanged: Yielding) -> None:
+    one = flanged.changed(SupportCompliance("root", "ry", 5e-4))
+    two = flanged.changed(*[SupportCompliance("root", "ry", 2.5e-4)] * 2)
+    assert two.modes.frequency == pytest.approx(one.modes.frequency, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("primitive", "sentence"),
+    [
+        (
+            SupportCompliance("flange", "rz", 1e-6),
+            "no support 'flange' with the motion 'rz'; it has root x",
+        ),
+        (SupportCompliance("root", "ry", -1e-6), "'root' must not be negative, but is -1e-06"),
+    ],
+)
+def test_what_cannot_yield_is_refused(
+    slender: Yielding, primitive: SupportCompliance, sentence: str
+) -> None:
+    with pytest.raises(InvalidPatchError, match=sentence):
+        slender.changed(primitive)
+
+
+CHAIN = """
+name = "chain"
+length_unit = "m"
+stiffness_matrix = "k.mtx"
+mass_matrix = "m.mtx"
+unknowns = "dof"
+support = [{ nodes = [1], hold = ["x"] }]
+control = [{ name = "push", unit = "N", nominal = 1 }]
+load = [{ name = "push", control = "push", node = 3, force = [1, 0, 0] }]
+damage = [{ name = "z1" }]
+part = [{ matrix = "part.mtx", damage = "z1" }]
+displacement = [{ name = "end", node = 3, direction = [1, 0, 0] }]
+"""
+
+
+def test_a_support_of_matrices_yields_in_series(tmp_path: Path) -> None:
+    """Two springs of 1000 and 500 N/m behind one of 250 N/m: 1/1000 + 1/500 + 1/250."""
+    header = "%%MatrixMarket matrix coordinate real symmetric\n"
+    (tmp_path / "k.mtx").write_text(
+        f"{header}3 3 5\n1 1 1000\n2 1 -1000\n2 2 1500\n3 2 -500\n3 3 500\n", encoding="utf-8"
+    )
+    (tmp_path / "part.mtx").write_text(
+        f"{header}3 3 3\n2 2 500\n3 2 -500\n3 3 500\n", encoding="utf-8"
+    )
+    (tmp_path / "m.mtx").write_text(f"{header}3 3 3\n1 1 1\n2 2 1\n3 3 1\n", encoding="utf-8")
+    (tmp_path / "dof").write_text("1.1\n2.1\n3.1\n", encoding="utf-8")
+    file = tmp_path / "chain.toml"
+    file.write_text(CHAIN, encoding="utf-8")
+    full = assemble_structure(file, yielding=True)
+    assert [motion[:2] for motion in full.support_motions] == [("node 1", "x")]
+    made = Yielding(full, None)  # type: ignore[arg-type]
+    stiffness, _, load, _ = made.full_system({0: 1.0 / 250.0}, {"push": 1.0})
+    displacements = np.linalg.solve(stiffness.toarray(), load)
+    assert displacements == pytest.approx([0.005, 0.007, 0.004])
+    assert full.held().unknowns == 2
