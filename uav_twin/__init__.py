@@ -52,6 +52,8 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.network.graphical_model import GraphicalModel as GraphicalModel
     from twin_master.network.inference import filter_sequence as filter_sequence
     from twin_master.network.planner import BeliefPolicy as BeliefPolicy
+    from twin_master.network.planner import Hold as Hold
+    from twin_master.network.planner import RiskPolicy as RiskPolicy
     from twin_master.network.planner import value_iteration as value_iteration
     from twin_master.network.sensor_model import GaussianSensorModel as GaussianSensorModel
     from twin_master.network.twin import Twin as Twin
@@ -111,6 +113,8 @@ _HOMES = {
     "GraphicalModel": "twin_master.network.graphical_model",
     "filter_sequence": "twin_master.network.inference",
     "BeliefPolicy": "twin_master.network.planner",
+    "Hold": "twin_master.network.planner",
+    "RiskPolicy": "twin_master.network.planner",
     "value_iteration": "twin_master.network.planner",
     "GaussianSensorModel": "twin_master.network.sensor_model",
     "Twin": "twin_master.network.twin",

@@ -22,6 +22,7 @@ from uav_twin import (
     discrepancy_import,
     fmu,
     fmu_simulation,
+    init_command,
     schema_command,
     structure,
     structure_from_deck,
@@ -137,6 +138,7 @@ def _add_group_command(
     return group
 
 
+app.command("init", rich_help_panel=MISSIONS)(init_command.init)
 app.command("run", rich_help_panel=MISSIONS)(command.run)
 app.command("plan", rich_help_panel=MISSIONS)(plan_command.plan)
 app.command("design", rich_help_panel=MISSIONS)(plan_command.design)

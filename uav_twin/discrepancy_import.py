@@ -239,7 +239,7 @@ def import_files(
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    imported = _understand_files(files, answers, model)
+    imported = understand_files(files, answers, model)
     _print_laboratory_import(imported)
     # Without a terminal, a question that is still open is an error of `campaign`
     is_interactive = not ask_nothing and sys.stdin.isatty() and sys.stdout.isatty()
@@ -325,7 +325,7 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
     return answers
 
 
-def _understand_files(
+def understand_files(
     files: list[Path], answers: dict[str, dict[str, str]], model: str | None
 ) -> "LaboratoryImport":
     """Read a laboratory's files, and return their import with the answers of the user.

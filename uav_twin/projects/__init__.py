@@ -1,0 +1,1 @@
+"""Projects of `uav-twin init`: folders that run at once, with the files of a user in them."""
