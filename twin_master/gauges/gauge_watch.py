@@ -18,6 +18,7 @@ from twin_master.gauges.fault_kernels import Observations
 from twin_master.gauges.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.gauges.notices import NoticeWriter
 from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
+from twin_master.gauges.telling_control import predicted_by_hypotheses, separation_of_hypotheses
 from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
@@ -108,6 +109,8 @@ class GaugeWatch:
         wording: NoticeWording,
     ) -> None:
         self._sensor_model = sensor_model
+        self._controls = model.controls
+        self._free_gain_deviation = settings.all_gain
         self.faults = FaultFilter(model, sensor_model, draws, settings)
         self._notices = self._notice_writer(wording, settings)
         self._standstill = StandstillTest.of(sensor_model.standard_deviation, settings)
@@ -224,6 +227,7 @@ class GaugeWatch:
             notices = [own_likelihood + of_twin for of_twin in notices]
         self._raise_alarms(state, notices, step)
         self._report_followed_hypothesis(state, notices, step)
+        self._advise_controls(state, notices, model_belief, step)
         state.mixed = hypothesis_weights.mix_beliefs(state.weights, model_belief, state.beliefs)
         return state, notices
 
@@ -284,6 +288,32 @@ class GaugeWatch:
             notices[twin] += self._notices.report_followed_hypothesis(
                 int(hypothesis[twin]), float(probability[twin]), step
             )
+
+    def _advise_controls(
+        self,
+        state: WatchState,
+        notices: Sequence[list[Notice]],
+        model_belief: Float,
+        step: int,
+    ) -> None:
+        """Append to each ambiguous alarm which control tells its hypotheses apart."""
+        for twin, notices_of_twin in enumerate(notices):
+            if not any(notice.kind == "alarm" for notice in notices_of_twin):
+                continue
+            hypotheses = predicted_by_hypotheses(
+                state,
+                twin,
+                model_belief[twin],
+                self._sensor_model,
+                self.faults.gains,
+                self._free_gain_deviation,
+                self._notices.hypothesis_names,
+            )
+            separation = separation_of_hypotheses(hypotheses, self._notices.noise)
+            if separation is not None:
+                notices_of_twin.append(
+                    self._notices.report_separation(separation, self._controls, step)
+                )
 
     def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
         """Return the evidence for the kinds of fault, relative to that for the model.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject, JsonRecord
@@ -100,6 +101,15 @@ class AssetStates:
         damage = np.nan_to_num(self.severity, nan=np.inf)
         # `lexsort` sorts by its last key first; minus signs give descending order.
         return np.lexsort((-damage, -self.leaving_percentage, -self.alarms))
+
+    @property
+    def needs_attention(self) -> NDArray[np.bool_]:
+        """Whether each asset raised an alarm, may soon change its control, or has no estimate (B,).
+
+        An asset whose probability of a change is not known counts as one that may.
+        """
+        may_change = (self.leaving_percentage > 0.0) | np.isnan(self.leaving_probability)
+        return np.asarray((self.alarms > 0) | may_change | np.isnan(self.mean).any(axis=1))
 
     @property
     def severity(self) -> Float:

@@ -332,8 +332,15 @@ def _add_attention_table(
     """Add the table of the assets that need attention first, of a number of known assets."""
     if not urgent.names:
         return
-    table = _attention_table(urgent, has_alarms=has_alarms)
+    urgent = urgent.of_assets(np.flatnonzero(urgent.needs_attention))
     mission = urgent.scenario.mission
+    if not urgent.names:
+        page.add_paragraph(
+            "No asset raised an alarm, and none will probably change its control within "
+            f"{mission.prediction_steps} {mission.step_name}s."
+        )
+        return
+    table = _attention_table(urgent, has_alarms=has_alarms)
     WORDS.add_table(
         page,
         "next",
