@@ -304,7 +304,7 @@ class Camera(NamedTuple):
     picture_axes: Float
 
 
-def _camera() -> Camera:
+def structure_camera() -> Camera:
     """Return the camera of all pictures of structures: azimuth -60°, elevation 28°."""
     azimuth = np.radians(-60.0)
     elevation = np.radians(28.0)
@@ -339,7 +339,7 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     scale = _DRAWN_DISPLACEMENT * diagonal / largest if largest > 0.0 else 0.0
     displaced_points = np.asarray(points + scale * field.displacement)
-    camera = _camera()
+    camera = structure_camera()
     figure, ((axes,),) = style.panels(
         1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9
     )

@@ -28,6 +28,7 @@ from twin_master.report.reading import (
 from twin_master.report.structure import design_of, planform_of
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.viewer.flight import Flight, StepBeliefs, StepRecord
+from twin_master.viewer.part_picture import part_picture
 
 WINDOW_STEPS = 240
 """Number of steps that a page shows at once."""
@@ -94,12 +95,14 @@ class FlightPage:
     def render_html(self) -> str:
         """Return the HTML of the page.
 
-        It contains all that does not change during a flight: names, units, axes and the planform of
-        a wing. The script of the page draws the figures from this and from the answers.
+        It contains all that does not change during a flight: names, units, axes, and the planform
+        of a wing or the faces of another structure. The script of the page draws the figures from
+        this and from the answers.
         """
         flight = self._flight
         mission = flight.scenario.mission
         wing = planform_of(design_of(flight.folder), flight.scenario)
+        part = None if wing is not None else part_picture(flight.folder, flight.scenario)
         lowest, highest = self._sensor_range()
         sensors = asdict(self._sensors)
         sensors |= {"unit": self._sensors.unit, "lowest": lowest, "highest": highest}
@@ -113,6 +116,7 @@ class FlightPage:
                 "rewards": REWARD_NAMES,
                 "sensors": sensors,
                 "planform": None if wing is None else wing._asdict(),
+                "part": None if part is None else part._asdict(),
                 "window": WINDOW_STEPS,
                 "latest": LATEST,
                 "tallest_bar": TALLEST_BAR,

@@ -145,10 +145,11 @@ const bars = (x, bottom, top, width, colour, opacity) => (plot) => {
   return `<path d="${drawn.join("")}" fill="${colour}" fill-opacity="${opacity}"/>`;
 };
 
-// A wing from above with its two scales of colours; regions and gauges have their places in `planform`.
-class Wing {
-  constructor(parent, title, planform, sensors, factors) {
-    Object.assign(this, { planform, sensors, factors });
+// A wing from above, or the faces of another structure, with two scales of colours. `drawing` has the places of
+// regions and gauges: those of `scene.planform` or `scene.part`.
+class Structure {
+  constructor(parent, title, drawing, sensors, factors) {
+    Object.assign(this, { drawing, sensors, factors });
     this.el = document.createElement("figure");
     this.el.innerHTML = `<figcaption>${escaped(title)}</figcaption><div class="plot"></div>`;
     parent.append(this.el);
@@ -163,42 +164,67 @@ class Wing {
 
   paint() {
     if (this.loss === undefined) return;
-    const { planform, sensors, factors } = this, width = this.place.clientWidth, height = 230;
+    const { drawing, sensors, factors } = this, width = this.place.clientWidth;
     if (width < LEAST_WIDTH) return;
-    const spans = planform.outline.map((point) => point[0]), chords = planform.outline.map((point) => point[1]);
-    const x = (value) => 10 + ((value - Math.min(...spans)) / (Math.max(...spans) - Math.min(...spans))) * (width - 20);
-    const y = (value) => 170 - ((value - Math.min(...chords)) / (Math.max(...chords) - Math.min(...chords))) * 145;
-    const outline = (points) => points.map((point) => `${x(point[0])},${y(point[1])}`).join(" ");
+    const points = drawing.faces ? drawing.faces.flat() : drawing.outline;
+    const across = points.map((point) => point[0]), along = points.map((point) => point[1]);
+    const [left, right, low, high] = [Math.min(...across), Math.max(...across), Math.min(...along), Math.max(...along)];
+    const plot = drawing.faces ? 260 : 145, bottom = 25 + plot; // a wing fills its width, a part keeps its proportions
+    const scaleX = drawing.faces ? Math.min((width - 20) / (right - left), plot / (high - low)) : (width - 20) / (right - left);
+    const scaleY = drawing.faces ? scaleX : plot / (high - low);
+    const margin = (width - scaleX * (right - left)) / 2;
+    const x = (value) => margin + (value - left) * scaleX, y = (value) => bottom - (value - low) * scaleY;
+    const outline = (corners) => corners.map((point) => `${x(point[0])},${y(point[1])}`).join(" ");
     const [least, most] = [Math.min(...factors.map((one) => one.levels[0])), Math.max(...factors.map((one) => one.levels.at(-1)))];
-    const regions = planform.regions.map((region, index) => {
+    const fillOf = (index) => { // no colour where no state is believed
+      const loss = this.loss[index];
+      return loss === null || loss === undefined ? "#f2f4f6" : colourOf(SCALES.damage, least, most, loss);
+    };
+    const body = drawing.faces ? this.faces(outline, fillOf) : this.regions(outline, fillOf, x, y);
+    const [lowest, highest] = [Math.min(sensors.lowest, 0), sensors.highest];
+    const gauges = drawing.gauges.map((place, index) => {
+      const value = this.observed[index], told = `${sensors.titles[index]}: ${shortNumber(value)} ${sensors.unit}`;
+      const [across, top] = [x(place[0]), y(place[1])];
+      return Number.isFinite(value)
+        ? `<circle cx="${across}" cy="${top}" r="5.5" fill="${colourOf(SCALES.magnitude, lowest, highest, value)}" stroke="#000000" stroke-width="0.6"><title>${escaped(told)}</title></circle>`
+        : `<path class="lost" d="${SHAPES.cross(across, top, 4.5)}" stroke="#000000" stroke-width="2"><title>${escaped(sensors.titles[index])}: lost</title></path>`;
+    });
+    this.top = bottom + 20;
+    const keys = [this.key(0, width / 2, "damage", least, most, `expected loss (${factors[0].unit})`),
+      this.key(width / 2, width / 2, "magnitude", lowest, highest, `${sensors.quantity} (${sensors.unit})`)];
+    const hasRegions = drawing.faces ? drawing.region.some((index) => index >= 0) : drawing.regions.length > 0;
+    const height = this.top + 40;
+    this.place.innerHTML = `<svg viewBox="0 0 ${width} ${height}" width="${width}" height="${height}" role="img">` +
+      `${body}${gauges.join("")}${(hasRegions ? keys : keys.slice(1)).join("")}</svg>`;
+  }
+
+  // The regions of a wing, each with what is believed of it above.
+  regions(outline, fillOf, x, y) {
+    const regions = this.drawing.regions.map((region, index) => {
       const middle = region.reduce((sum, point) => sum + point[0], 0) / region.length;
       const top = Math.max(...region.map((point) => point[1]));
-      const loss = this.loss[index]; // null where no state is believed
-      const fill = loss === null ? "none" : colourOf(SCALES.damage, least, most, loss);
-      return `<polygon points="${outline(region)}" fill="${fill}" stroke="#000000"/>` +
+      return `<polygon points="${outline(region)}" fill="${fillOf(index)}" stroke="#000000"/>` +
         `<text x="${x(middle)}" y="${y(top) - 4}" text-anchor="middle">${escaped(this.said[index])}</text>`;
     });
-    const [low, high] = [Math.min(sensors.lowest, 0), sensors.highest];
-    const gauges = planform.gauges.map((place, index) => {
-      const value = this.observed[index], told = `${sensors.titles[index]}: ${shortNumber(value)} ${sensors.unit}`;
-      const [left, top] = [x(place[0]), y(place[1])];
-      return Number.isFinite(value)
-        ? `<circle cx="${left}" cy="${top}" r="5.5" fill="${colourOf(SCALES.magnitude, low, high, value)}" stroke="#000000" stroke-width="0.6"><title>${escaped(told)}</title></circle>`
-        : `<path class="lost" d="${SHAPES.cross(left, top, 4.5)}" stroke="#000000" stroke-width="2"><title>${escaped(sensors.titles[index])}: lost</title></path>`;
-    });
-    const keys = [this.key(0, width / 2, "damage", least, most, `expected loss (${factors[0].unit})`),
-      this.key(width / 2, width / 2, "magnitude", low, high, `${sensors.quantity} (${sensors.unit})`)];
-    this.place.innerHTML = `<svg viewBox="0 0 ${width} ${height}" width="${width}" height="${height}" role="img">` +
-      `<polygon points="${outline(planform.outline)}" fill="#f2f4f6" stroke="${COLOURS.reference}"/>` +
-      `${regions.join("")}${gauges.join("")}${(planform.regions.length ? keys : keys.slice(1)).join("")}</svg>`;
+    return `<polygon points="${outline(this.drawing.outline)}" fill="#f2f4f6" stroke="${COLOURS.reference}"/>${regions.join("")}`;
+  }
+
+  // The faces of a part, those of regions with black edges; what is believed of a region shows at its faces.
+  faces(outline, fillOf) {
+    return this.drawing.faces.map((face, number) => {
+      const index = this.drawing.region[number];
+      if (index < 0) return `<polygon points="${outline(face)}" fill="#f2f4f6" stroke="${COLOURS.reference}" stroke-width="0.5"/>`;
+      const told = `${this.factors[index].title}: ${this.said[index]}`;
+      return `<polygon points="${outline(face)}" fill="${fillOf(index)}" stroke="#000000" stroke-width="0.5"><title>${escaped(told)}</title></polygon>`;
+    }).join("");
   }
 
   key(left, width, scale, low, high, title) {
     const count = 40, step = (width - 24) / count;
     const cells = Array.from({ length: count }, (_, cell) =>
-      `<rect x="${left + 12 + cell * step}" y="190" width="${step + 0.5}" height="8" fill="${colourOf(SCALES[scale], 0, count - 1, cell)}"/>`);
-    return `${cells.join("")}<text x="${left + 12}" y="212">${shortNumber(low)}</text>` +
-      `<text x="${left + width / 2}" y="212" text-anchor="middle">${escaped(title)}</text>` +
-      `<text x="${left + width - 12}" y="212" text-anchor="end">${shortNumber(high)}</text>`;
+      `<rect x="${left + 12 + cell * step}" y="${this.top}" width="${step + 0.5}" height="8" fill="${colourOf(SCALES[scale], 0, count - 1, cell)}"/>`);
+    return `${cells.join("")}<text x="${left + 12}" y="${this.top + 22}">${shortNumber(low)}</text>` +
+      `<text x="${left + width / 2}" y="${this.top + 22}" text-anchor="middle">${escaped(title)}</text>` +
+      `<text x="${left + width - 12}" y="${this.top + 22}" text-anchor="end">${shortNumber(high)}</text>`;
   }
 }

@@ -195,9 +195,9 @@ function drawSensors(now) {
     return [scene.sensors.titles[index], `observed ${shortNumber(observed[index])}`,
       `expected ${shortNumber(mean[index])} (${shortNumber(lower[index])} to ${shortNumber(upper[index])})`];
   });
-  if (views.wing) {
+  if (views.structure) {
     const said = scene.factors.map((factor, index) => estimate(factor, index, now));
-    views.wing.draw(now.state, said, observed);
+    views.structure.draw(now.state, said, observed);
   }
 }
 
@@ -311,9 +311,11 @@ function listen() {
 
 function build() {
   const { sensors, step_name: step } = scene, capital = (text) => text[0].toUpperCase() + text.slice(1);
+  const measured = `damage of the regions, measured ${sensors.quantity} of the ${sensors.word}s`;
   if (scene.planform !== null) {
-    const title = "The wing from above: damage of the regions, measured strain of the gauges";
-    views.wing = new Wing(element("wing"), title, scene.planform, sensors, scene.factors);
+    views.structure = new Structure(element("structure"), `The wing from above: ${measured}`, scene.planform, sensors, scene.factors);
+  } else if (scene.part !== null) {
+    views.structure = new Structure(element("structure"), `The part: ${measured}`, scene.part, sensors, scene.factors);
   }
   scene.factors.forEach((factor, index) => {
     const [low, high] = [factor.levels[0], factor.levels.at(-1)], margin = 0.06 * (high - low) || 1;

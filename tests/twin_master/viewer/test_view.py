@@ -326,7 +326,9 @@ def go_back_by_keyboard(tab: Any) -> None:
 def check_drawing_of_step_10(tab: Any) -> None:
     assert tab.value("drawn.past.length") == 11
     assert tab.value("drawn.ahead") == list(range(11, 21))
-    gauges = [tab.value(f"document.querySelectorAll('#wing {kind}').length") for kind in ("circle", ".lost")]
+    gauges = [
+        tab.value(f"document.querySelectorAll('#structure {kind}').length") for kind in ("circle", ".lost")
+    ]
     assert gauges == [24, 0]
 
 
