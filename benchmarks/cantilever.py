@@ -31,6 +31,7 @@ from fe.runtime.patch import (
     LocalStiffnessLoss,
     ModelPatch,
     ModulusTemperature,
+    PlaceMass,
     PointMass,
     Primitive,
     RegionStiffnessLoss,
@@ -98,6 +99,8 @@ SHARES = np.array([displacement_row(y) for y in POINTS])  # (P, n)
 SPAN = SHARES.mean(axis=0)
 ROOT = np.eye(SIZE)[0]
 TIP = displacement_row(LENGTH)
+MASS_PLACES = {"tip": LENGTH, "middle": 0.5 * LENGTH}
+"""Distance of places of masses from the root [m]."""
 PORTS = {"root": ROOT, "tip": TIP, "span": SPAN}
 
 
@@ -120,6 +123,9 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
             loss += primitive.loss * inner / STEP
         elif isinstance(primitive, PointMass):
             row = displacement_row(primitive.station)
+            extra += primitive.mass * np.outer(row, row)
+        elif isinstance(primitive, PlaceMass):
+            row = displacement_row(MASS_PLACES[primitive.place])
             extra += primitive.mass * np.outer(row, row)
         elif isinstance(primitive, SupportCompliance):
             compliance += primitive.compliance
@@ -170,6 +176,7 @@ class Cantilever(Model):
     shows_ports = False
     stations: tuple[float, float] | None = (0.0, LENGTH)
     support_motions = (("root", "rx"),)
+    mass_places = tuple(MASS_PLACES)
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -256,7 +263,7 @@ def _motion(
     trial: Trial, rows: FloatArray, patch: ModelPatch, conditions: Conditions
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
-    structural = patch.of(PointMass, SupportCompliance, LocalStiffnessLoss)
+    structural = patch.of(PointMass, PlaceMass, SupportCompliance, LocalStiffnessLoss)
     softening = sum(
         primitive.coefficient for primitive in patch if isinstance(primitive, ModulusTemperature)
     )

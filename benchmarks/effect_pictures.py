@@ -287,6 +287,7 @@ PICTURES: dict[str, Picture] = {
     "point_mass": Picture(
         {"mass_ratio": 0.1, "station_ratio": 1.0}, (ringdown(end=1.2), load_line())
     ),
+    "added_mass": Picture({"mass_ratio": 0.1}, (ringdown(end=1.2), load_line())),
     "support_compliance": Picture({"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))),
     "local_stiffness_loss": Picture(
         {"loss": 0.3, "start_ratio": 0.4, "length_ratio": 0.15}, (ratios("up"), load_line("g1"))

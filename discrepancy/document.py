@@ -64,6 +64,7 @@ _MEANING_OF_VALUE = {
     "order": "Order of the law or filter.",
     "phase": "Phase of the sine.",
     "port": "Name of the port.",
+    "place": "Name of the place: a set of nodes, a point or a node.",
     "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
     "rate": "Relative change in each unit of time.",
     "region": "Name of the damage region.",

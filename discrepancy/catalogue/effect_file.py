@@ -23,14 +23,14 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
     mass = "mass_ratio * modal_mass"
     station = "0.5 * length"
 
-Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such
-as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_needs` (words of
-`NEEDS`), `spectral` and `at_several_places` (see `Effect`), `[[shape]]` (as a parameter, with
-`canonical` in place of `unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are
-the parameters and `SCALES`. Text values of a primitive (port, channel, run) are taken as they are;
-"place" stands for the place, "quantity of the place" for what it measures, "motion of the place"
-for the motion of a support. A primitive with `if` is
-left out where that is zero.
+Keys that may be left out: `confusable` (identifiers), `counterpart` (see `Effect`), `places`
+(names, or a word of `PLACES` such as "ports"), `preferred` (ports of a wing that stand for its
+others), `campaign_needs` (words of `NEEDS`), `spectral` and `at_several_places` (see `Effect`),
+`[[shape]]` (as a parameter, with `canonical` in place of `unit` and `magnitude`), `levels` of a
+parameter. Names in arithmetic are the parameters and `SCALES`. Text values of a primitive (port,
+channel, run) are taken as they are; "place" stands for the place, "quantity of the place" for what
+it measures, "motion of the place" for the motion of a support. A primitive with `if` is left out
+where that is zero.
 
 Time and events of the campaign (`docs/explanation/when.md`)::
 

@@ -232,6 +232,9 @@ class EffectKeys:
         Numbers that the shape gate frees.
     confusable : tuple of str
         Identifiers of effects that some campaigns cannot distinguish from it.
+    counterpart : str
+        Identifier of the effect that stands for it in other kinds of models, such as that of a mesh
+        for an effect of a wing. Empty if there is none.
     spectral : str
         Name of a parameter that is a frequency over the first natural frequency; fits of it begin
         at peaks of the residuals' spectrum at the place, a channel. Empty if there is none.
@@ -253,6 +256,7 @@ class EffectKeys:
     parameters: tuple[EffectParameter, ...] = ()
     shape: tuple[ShapeParameter, ...] = ()
     confusable: tuple[str, ...] = ()
+    counterpart: str = ""
     spectral: str = ""
     at_several_places: Annotated[bool, Strict()] = False
     relative_frequency: Number | None = None

@@ -57,7 +57,7 @@ def _held_ports(effect: EffectInSetting) -> Names:
 
 
 def _damage_regions(effect: EffectInSetting) -> Names:
-    """Return the damage regions whose loss of stiffness is a hypothesis of its own.
+    """Return the damage regions and patches whose loss of stiffness is a hypothesis of its own.
 
     There is none in a model that can lose stiffness anywhere along its length, as a wing can: that
     loss includes those of the regions.
@@ -65,7 +65,7 @@ def _damage_regions(effect: EffectInSetting) -> Names:
     model = effect.setting.model
     if model.supports(LocalStiffnessLoss) or not model.supports(RegionStiffnessLoss):
         return ()
-    return model.regions
+    return (*model.regions, *model.loss_places)
 
 
 def _supports(effect: EffectInSetting) -> Names:
@@ -204,6 +204,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
     "supports": _supports,
+    "places of masses": lambda effect: effect.setting.model.mass_places,
     "calibrated channels": _calibrated_channels,
     "timed gauges": _gauges_read_repeatedly,
     "zeroed runs": _zeroed_runs,
@@ -239,6 +240,7 @@ NO_PLACES = {
     "ports of states": _NO_STATE,
     "ports of states, or all": _NO_STATE,
     "supports": "The model names no support that could yield.",
+    "places of masses": "The model names no place where a mass could be added or lost.",
     "calibrated channels": (
         "The campaign has no channel whose gain is known, so no gain can be wrong."
     ),

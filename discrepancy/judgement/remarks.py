@@ -127,7 +127,8 @@ def verdict_with_untested_effects(
     """Return the verdict with a sentence on effects that may be the cause, but cannot be tested.
 
     They are easily mistaken for an effect of the verdict, and act on trials of these kinds. But
-    they need another trial, port or place, so that none of them could be compared.
+    they need another trial, port or place, so that none of them could be compared. An effect whose
+    counterpart in this kind of model was compared is not among them.
 
     Parameters
     ----------
@@ -143,12 +144,13 @@ def verdict_with_untested_effects(
     kinds = {trial.kind for trial in setting.campaign.trials}
     identifiers = {named_effect.identifier for named_effect in verdict.effects}
     members = [effect for effect in effects if effect.identifier in identifiers]
+    tested = {effect.identifier for effect in effects if effect.unavailable(setting) is None}
     names = []
     for effect in effects:
         looks_alike = any(are_related(effect, member) for member in members)
         if effect.identifier in identifiers or not looks_alike or not effect.acts_on & kinds:
             continue
-        if effect.unavailable(setting) is not None:
+        if not {effect.identifier, effect.counterpart} & tested:
             names.append(effect.name)
     if not names:
         return verdict

@@ -21,7 +21,7 @@ from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS
+from fe.runtime.patch import SENSORS, STRUCTURE, RegionStiffnessLoss
 
 T = TypeVar("T")
 OnProgress = Callable[[str], None]
@@ -77,6 +77,18 @@ def changes_structure(effect: Effect, setting: Setting) -> bool:
     return not all(isinstance(primitive, SENSORS) for primitive in patch)
 
 
+def _moves_frequencies(effect: Effect, setting: Setting) -> bool:
+    """Return whether an effect changes mass or linear stiffness, so that phases drift."""
+    places = effect.places(setting)
+    if not places:
+        return False
+    term = EffectTerm(effect, places[0])
+    with suppress(DiscrepancyError):
+        patch = term.patch(setting, term.start_values())
+        return any(isinstance(item, (*STRUCTURE, RegionStiffnessLoss)) for item in patch)
+    return False
+
+
 def free_places(effect: Effect, candidate: Candidate, setting: Setting) -> tuple[str, ...]:
     """Return the places of an effect at which a set of effects does not have it yet."""
     taken_places = {
@@ -115,6 +127,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     setting = screen.problem.setting
     places = free_places(effect, screen.fit.candidate, setting)
     has_few_places = len(places) <= SEARCH.few_places
+    moves_frequencies = _moves_frequencies(effect, setting)
     other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
     start_count = (
         SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
@@ -130,7 +143,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
                 effect, setting
             )
             # a large change that is not linear in its magnitude is tried at a small one too
-            if has_few_places and is_nonlinear:
+            if is_nonlinear and (has_few_places or moves_frequencies):
                 with suppress(DiscrepancyError):
                     small_change, _ = screen.shrink_change(change)
                     tried_changes.append(small_change)

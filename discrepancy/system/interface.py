@@ -73,6 +73,10 @@ class Model(ABC):
         The kinds of trials that it can simulate.
     support_motions : tuple of (str, str)
         The supports that may yield, each with a motion, such as "rx".
+    mass_places : tuple of str
+        Places where a mass may be added or lost.
+    loss_places : tuple of str
+        Patches that are no damage regions and may lose stiffness.
     load_places : tuple of str, optional
         The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
@@ -98,6 +102,8 @@ class Model(ABC):
     largest_losses: Mapping[str, float] = MappingProxyType({})
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
     support_motions: tuple[tuple[str, str], ...] = ()
+    mass_places: tuple[str, ...] = ()
+    loss_places: tuple[str, ...] = ()
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False

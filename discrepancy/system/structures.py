@@ -13,7 +13,7 @@ from calibration.errors import CalibrationError
 from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
@@ -21,7 +21,7 @@ from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
 from discrepancy.system.output_equation import OutputEquation
-from discrepancy.system.response import MOVES, TURNS, Outputs, Place
+from discrepancy.system.response import MOVES, TURNS, Conditions, Outputs, Place
 from discrepancy.system.scales import ForceShare, PortScale, Scales
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
@@ -42,7 +42,7 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.port_laws import PLANFORM, STATION_PORTS
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import wing_input_names
+from fe.runtime.state import Losses, wing_input_names
 from fe.runtime.wing_rows import PORTS, STATIC_TEST_LOAD, strain_gauge
 from fe.structure.affine import PORT_PREFIX
 from fe.wing.design import WingDesign, load_design
@@ -54,6 +54,8 @@ DEVIATION = 0.25
 """Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
 ROUNDING = 1e-9
 """Differences of two rows below this fraction of the largest entry are rounding errors."""
+LARGEST_LOSS = 0.7
+"""Largest loss of stiffness of a patch that is compared."""
 ROTATING_PORT = "root"
 """Port of the wing at which a force is a moment and a motion an angle."""
 Prior = Mapping[str, tuple[float, float]]
@@ -129,6 +131,9 @@ class StructureModel(SystemModel):
         names = (*model.gauges, *model.displacements, *model.accelerations)
         if isinstance(model, ChangeableModel):
             self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
+            self.mass_places = model.mass_places
+            self.loss_places = model.loss_places
+            self.largest_losses |= dict.fromkeys(model.loss_places, LARGEST_LOSS)
             rows, self._unit_loads = model.whole_output, model.whole_load.T
         else:
             rows = np.concatenate((model.output_rows, model.acceleration_rows))
@@ -213,13 +218,15 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, losses of its damage regions, supports that yield,
-        and errors of its forces.
+        It carries sensors, laws at its ports, losses of its damage regions and patches, masses at
+        places, supports that yield, and errors of its forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
         if primitive is changes.RegionStiffnessLoss:
-            return bool(self.regions)
+            return bool(self.regions) or bool(self.loss_places)
+        if primitive is changes.PlaceMass:
+            return bool(self.mass_places)
         if primitive is changes.LoadGain:
             return bool(self.forces)
         if primitive is changes.SupportCompliance:
@@ -254,6 +261,26 @@ class StructureModel(SystemModel):
             return excitation
         always = RecordedHistory(excitation.time, np.ones(len(excitation.time)))
         return replace(excitation, loads=(*excitation.loads, Load(constant_load, always)))
+
+    def region_losses(
+        self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
+    ) -> list[Losses]:
+        """Return the losses of damage regions in each row; patches change the structure."""
+        in_regions = [primitive for primitive in patch if not self._is_loss_of_patch(primitive)]
+        return super().region_losses(trial, health, ModelPatch(tuple(in_regions)))
+
+    def _is_loss_of_patch(self, primitive: Primitive) -> bool:
+        """Return whether a primitive is a loss of stiffness of a patch, and of no damage region."""
+        is_loss = isinstance(primitive, changes.RegionStiffnessLoss)
+        return is_loss and getattr(primitive, "region", "") in self.loss_places
+
+    def patched_trial(
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
+    ) -> PatchedTrial:
+        """Return a trial with its patch and conditions, with losses of patches in its structure."""
+        case = super().patched_trial(trial, conditions, patch)
+        losses = ModelPatch(tuple(filter(self._is_loss_of_patch, patch)))
+        return case._replace(state=case.state._replace(structure=case.state.structure + losses))
 
     def build_system(self, state: SystemState) -> LinearSystem:
         """Return the linear system in a state, in the coordinates of `ReducedStructure`.
@@ -471,8 +498,12 @@ class WingModel(SystemModel):
         )
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the wing can carry a primitive: all but forces by a formula in time."""
-        return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
+        """Return whether the wing can carry a primitive.
+
+        It can carry all but forces by a formula in time and masses at named places.
+        """
+        not_carried = (changes.PortLoad, changes.PlaceMass)
+        return primitive in PRIMITIVES.values() and primitive not in not_carried
 
     def port_units(self, port: str) -> tuple[str, str]:
         """Return the units of force and motion at a port: the root turns, others move."""

@@ -1,25 +1,31 @@
-"""From a structure and its reduced model to one whose supports may yield.
+"""From a structure and its reduced model to one whose supports, mass and stiffness may change.
 
 A support that yields moves the structure by the unit responses to its motions: the displacements of
 the structure when one motion of a support is prescribed and all else is held. They are added to the
 basis of the reduced model (the constraint modes of Craig and Bampton 1968, AIAA Journal 6 (7),
 1313-1319), with the static responses to their inertia. A change of the stiffness of the structure
 changes them, so that they are computed at several states.
+
+A mass at a place needs the static responses to forces there, and a loss of stiffness of a patch
+what it changes of the solutions under loads, under outputs as loads, and of the modes.
 """
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import eigh
 
 from fe.full.subspace import OrthonormalBasis, affine_product, solve_near
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
-from fe.runtime.patch import ModelPatch, SupportCompliance
+from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, SupportCompliance
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, SupportMotion
+from fe.structure.candidates import LossPlace, MassPlace, loss_places, mass_places
 
 from .reduced_basis import Reduction
 from .terms import ReductionTerms, cube_corners
@@ -28,19 +34,27 @@ LEAST_REMAINDER = 1e-4
 """Length outside the basis, relative to that of the vector, below which a direction is left out."""
 SAME_DIRECTION = 1e-7
 """Directions of the structure's own bases below this relative length are left out."""
-SOLUTION_TOLERANCE = 1e-8
-"""Relative residual of unit responses at other states."""
+SOLUTION_TOLERANCE = 1e-7
+"""Relative residual of solutions at other states and with losses."""
 MOST_STATES = 8
 """Number of states at which unit responses are computed, beside the middle one."""
 INERTIA_RESPONSES = 1
 """Static responses to inertia: to that of the unit response, to that of this response, and on."""
+LARGE_LOSSES = (0.45, 0.7)
+"""Losses of stiffness of patches at which solutions are computed."""
+LEAST_LOSS_REMAINDER = 1e-3
+"""The same for changes of solutions by a loss of stiffness, relative to the solutions."""
+MASS_RANGE = (0.01, 0.5)
+"""Range of masses in which the errors are measured: the largest relative gain of a modal mass."""
+LOSS_RANGE = (0.05, 0.7)
+"""Range of losses of stiffness in which the errors are measured."""
 GAIN_RANGE = (0.01, 1.0)
 """Range of compliance in which the errors are measured: the largest relative gain of compliance
 under a load or in a mode."""
 
 
 def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableModel:
-    """Return the reduced model with the columns that changes of its supports need.
+    """Return the reduced model with the columns that its changes need.
 
     Parameters
     ----------
@@ -55,16 +69,19 @@ def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableM
         If the full model cannot be solved.
     """
     columns = _Columns(yielding, reduction)
-    numbers = range(len(yielding.support_motions))
     for motion in yielding.support_motions:
         columns.add_motion(motion)
+    for place in columns.mass_places:
+        columns.add_mass(place)
+    for patch in columns.loss_places:
+        columns.add_loss(patch)
     model = columns.model()
-    for number in numbers:
+    for number in range(len(model.change_errors)):
         columns.refine(model, number)
     model = columns.model()
-    errors = [columns.error(model, number) for number in numbers]
+    errors = [columns.error(model, number) for number in range(len(model.change_errors))]
     values = {field.name: getattr(model, field.name) for field in fields(ChangeableModel)}
-    return ChangeableModel(**values | {"support_errors": np.array(errors, dtype=np.float64)})
+    return ChangeableModel(**values | {"change_errors": np.array(errors, dtype=np.float64)})
 
 
 class _Columns:
@@ -95,6 +112,8 @@ class _Columns:
         self.owners = [np.zeros(base.shape[1], dtype=np.int64)]
         self.base = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
         self.base.extend(self._whitened(base))
+        self.mass_places = mass_places(yielding)
+        self.loss_places = loss_places(yielding)
 
     def _nominal_masses(self) -> FloatArray:
         """Return the coefficients (1 + P,) of the mass terms at nominal masses."""
@@ -131,26 +150,31 @@ class _Columns:
         self._add_remainders(number, block)
 
     def refine(self, model: ChangeableModel, number: int) -> None:
-        """Add the modes of the full model, by a step of inverse iteration, when one support yields.
+        """Add the modes of the full model under one change, by a step of inverse iteration.
 
         Parameters
         ----------
         model : ChangeableModel
             The model on the present columns.
         number : int
-            Number of the motion of the support.
+            Number of the change, counted from zero.
         """
-        motion = self.structure.support_motions[number]
-        for gain in GAIN_RANGE:
-            case = self._yielding_case(model, number, gain)
-            modes = case.full_solution(self.mass @ self._shapes(case.structure))
-            if motion.spring == 0.0:
-                modes = modes - modes[[motion.unknown]] * case.direction
+        for case in self._cases(model, number):
+            modes = case.full_solution(case.mass @ self._shapes(case.structure))
+            if len(case.direction):
+                modes = modes - modes[[self.structure.support_motions[number].unknown]] * (
+                    case.direction
+                )
             block = self._whitened(modes[: self.free])
             self._add_remainders(1 + number, block / np.linalg.norm(block, axis=0))
 
-    def _add_remainders(self, number: int, block: FloatArray) -> None:
-        """Add to the columns of a change what whitened vectors (n, k) have outside its columns."""
+    def _add_remainders(
+        self, number: int, block: FloatArray, least: float = LEAST_REMAINDER
+    ) -> None:
+        """Add to the columns of a change what whitened vectors (n, k) have outside its columns.
+
+        Directions shorter than `least` are left out.
+        """
         known = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
         known.vectors = self.base.vectors
         for owned, owner in zip(self.blocks, self.owners, strict=True):
@@ -160,8 +184,11 @@ class _Columns:
                 known.extend(self._whitened(free_part))
         for _ in range(2):
             block = block - known.vectors @ (known.vectors.T @ block)
-        directions, lengths, _ = np.linalg.svd(block, full_matrices=False)
-        kept = self.factors.unwhitened(directions[:, lengths > LEAST_REMAINDER])
+        # singular directions by the method of snapshots
+        squares, vectors = np.linalg.eigh(block.T @ block)
+        is_kept = squares > least**2
+        directions = block @ (vectors[:, is_kept] / np.sqrt(squares[is_kept]))
+        kept = self.factors.unwhitened(directions)
         self.blocks.append(np.pad(kept, ((0, self.structure.unknowns - self.free), (0, 0))))
         self.owners.append(np.full(kept.shape[1], number, dtype=np.int64))
 
@@ -216,6 +243,12 @@ class _Columns:
         )
         motions = self.structure.support_motions
         rows = np.array([columns[motion.unknown] for motion in motions])
+        lower = np.tril_indices(columns.shape[1])
+        parts = []
+        for number, patch in enumerate(self.loss_places):
+            for term, matrix in patch.terms.items():
+                (projected,) = _projected((matrix,), columns)
+                parts.append((number, term, projected))
         model = self.reduction.model
         return ChangeableModel(
             **{field.name: getattr(model, field.name) for field in fields(ReducedModel)},
@@ -228,10 +261,96 @@ class _Columns:
             motions=tuple(motion.motion for motion in motions),
             support_rows=rows.reshape(len(motions), columns.shape[1]),
             support_springs=np.array([motion.spring for motion in motions], dtype=np.float64),
-            support_errors=np.zeros(len(motions)),
+            mass_places=tuple(place.name for place in self.mass_places),
+            mass_rows=np.array([place.rows @ columns for place in self.mass_places]).reshape(
+                len(self.mass_places), 3, columns.shape[1]
+            ),
+            loss_places=tuple(patch.name for patch in self.loss_places),
+            loss_patch=np.array([patch for patch, _, _ in parts], dtype=np.int64),
+            loss_term=np.array([term for _, term, _ in parts], dtype=np.int64),
+            loss_stiffness=np.array([matrix[lower] for _, _, matrix in parts]).reshape(
+                len(parts), len(lower[0])
+            ),
+            change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
         )
 
-    def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "_YieldingCase":
+    def add_mass(self, place: MassPlace) -> None:
+        """Add the columns of a mass at a place: the static responses to forces there."""
+        number = self._first_mass + self.mass_places.index(place)
+        forces = place.rows[:, : self.free].toarray().T
+        block = self.factors.whitened(forces)
+        lengths = np.linalg.norm(block, axis=0)
+        block = block[:, lengths > SAME_DIRECTION * lengths.max()]
+        self._add_remainders(number, block / np.linalg.norm(block, axis=0))
+
+    def add_loss(self, patch: LossPlace) -> None:
+        """Add the columns of a loss of stiffness: what it changes of solutions and modes."""
+        number = self._first_loss + self.loss_places.index(patch)
+        forces = self._forces_of_snapshots
+        snapshots = self.factors.riesz(forces)
+        held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
+        lost_forces = np.zeros_like(snapshots)
+        for term, matrix in held.items():
+            lost_forces += self.held_terms.reference[term] * (matrix @ snapshots)
+        of_small_loss = self.factors.riesz(lost_forces)
+        of_large_losses = [
+            self._solution_with_loss(held, loss, forces) - snapshots for loss in LARGE_LOSSES
+        ]
+        block = np.concatenate((of_small_loss, *of_large_losses), axis=1)
+        self._add_remainders(number, self._whitened(block), LEAST_LOSS_REMAINDER)
+
+    @cached_property
+    def _forces_of_snapshots(self) -> FloatArray:
+        """Loads, outputs as loads and inertia of modes (n, k); their solutions have unit energy."""
+        terms = self.held_terms
+        modes = self.reduction.modal_basis
+        stiffness = terms.structure.stiffness()
+        mass = self.mass[: self.free, : self.free]
+        _, shapes = eigh(
+            modes.T @ (stiffness @ modes),
+            modes.T @ (mass @ modes),
+            subset_by_index=[0, self.reduction.model.mode_count - 1],
+        )
+        forces = np.concatenate((terms.loads, terms.outputs, mass @ (modes @ shapes)), axis=1)
+        return np.asarray(forces / np.linalg.norm(self.factors.whitened(forces), axis=0))
+
+    def _solution_with_loss(
+        self, lost: dict[int, sparse.csr_array], loss: float, forces: FloatArray
+    ) -> FloatArray:
+        """Return the solutions (n, k) of the structure, supports held, with a loss of a patch."""
+        reference = self.held_terms.reference
+        matrices = (*self.held_terms.stiffness_terms, *lost.values())
+        lost_coefficients = [-loss * reference[term] for term in lost]
+        coefficients = np.concatenate((reference, lost_coefficients))
+        whitened = self.factors.whitened(forces)
+        solutions = solve_near(
+            self.factors,
+            matrices,
+            np.tile(coefficients[:, np.newaxis], forces.shape[1]),
+            whitened,
+            start=whitened,
+            tolerance=SOLUTION_TOLERANCE,
+        )
+        return self.factors.unwhitened(solutions)
+
+    @property
+    def _first_mass(self) -> int:
+        """Number of the first change that is a mass, counted from one."""
+        return 1 + len(self.structure.support_motions)
+
+    @property
+    def _first_loss(self) -> int:
+        """Number of the first change that is a loss of stiffness, counted from one."""
+        return self._first_mass + len(self.mass_places)
+
+    def _middle_vector(self, model: ChangeableModel) -> FloatArray:
+        """Return the values of a model's inputs in the middle of all ranges."""
+        vector = model.nominal.copy()
+        (middle_losses,) = self.held_terms.losses_at(0.5)
+        vector[: self.held_terms.varied] = (*self.held_terms.middle, *middle_losses)
+        return vector
+
+    def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "_ChangedCase":
         """Return the reduced and the full structure whose support yields, mid-range.
 
         Parameters
@@ -244,43 +363,82 @@ class _Columns:
             The largest relative gain of compliance under a load or in a mode.
         """
         motion = self.structure.support_motions[number]
-        terms = self.held_terms
-        vector = model.nominal.copy()
-        (middle_losses,) = terms.losses_at(0.5)
-        vector[: terms.varied] = (*terms.middle, *middle_losses)
+        reference = self.held_terms.reference
+        vector = self._middle_vector(model)
         compliance = gain / float(model.compliance_gains(vector)[number].max())
         primitive = SupportCompliance(motion.support, motion.motion, compliance)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
         # the full model by Sherman and Morrison: the held structure, and its unit response
         direction = np.zeros((self.structure.unknowns, 1))
-        response = self._unit_responses(motion, terms.reference[np.newaxis])
+        response = self._unit_responses(motion, reference[np.newaxis])
         direction[: self.free] = response
         if motion.spring == 0.0:
             direction[motion.unknown] = 1.0
-            image = affine_product(self.terms.stiffness_terms, terms.reference, direction)
+            image = affine_product(self.terms.stiffness_terms, reference, direction)
             factor = 1.0 / (1.0 / compliance + float((direction.T @ image).item()))
         else:
             change = 1.0 / (1.0 / motion.spring + compliance) - motion.spring
             factor = -change / (1.0 + change * float(response[motion.unknown, 0]))
 
         def full_solution(loads: FloatArray) -> FloatArray:
-            held = np.zeros_like(loads)
-            held[: self.free] = self.factors.solve(loads[: self.free])
-            return np.asarray(held + factor * direction @ (direction.T @ loads))
+            return self._held_solution(loads) + factor * direction @ (direction.T @ loads)
 
-        return _YieldingCase(structure, full_solution, direction)
+        no_direction = np.zeros((0, 1))
+        released_direction = direction if motion.spring == 0.0 else no_direction
+        return _ChangedCase(structure, full_solution, self.mass, released_direction)
+
+    def _held_solution(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements (n', k) of the full model, supports held, under loads."""
+        solution = np.zeros_like(loads)
+        solution[: self.free] = self.factors.solve(loads[: self.free])
+        return solution
+
+    def _case_with_mass(self, model: ChangeableModel, number: int, gain: float) -> "_ChangedCase":
+        """Return the structure with a mass; `gain` is the largest relative gain of a modal mass."""
+        place = self.mass_places[number]
+        vector = self._middle_vector(model)
+        shapes = ChangedStructure(model, vector, ModelPatch()).modes.shapes
+        largest = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
+        primitive = PlaceMass(place.name, gain / largest)
+        structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
+        mass = (self.mass + primitive.mass * (place.rows.T @ place.rows)).tocsr()
+        return _ChangedCase(structure, self._held_solution, mass)
+
+    def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "_ChangedCase":
+        """Return the structure with a loss of stiffness."""
+        patch = self.loss_places[number]
+        held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
+        primitive = RegionStiffnessLoss(patch.name, loss)
+        vector = self._middle_vector(model)
+        structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
+
+        def full_solution(loads: FloatArray) -> FloatArray:
+            solution = np.zeros_like(loads)
+            solution[: self.free] = self._solution_with_loss(held, loss, loads[: self.free])
+            return solution
+
+        return _ChangedCase(structure, full_solution, self.mass)
 
     def error(self, model: ChangeableModel, number: int) -> float:
-        """Return the largest relative error of a model when one support yields.
+        """Return the largest relative error of a model under one change, at both ends of its range.
 
         Outputs at rest are compared with those of the full model, in the middle of all ranges. The
         error of a frequency is its change by one step of inverse iteration with the full model.
         """
-        return max(
-            self._error_of(model, self._yielding_case(model, number, gain)) for gain in GAIN_RANGE
-        )
+        return max(self._error_of(model, case) for case in self._cases(model, number))
 
-    def _error_of(self, model: ChangeableModel, case: "_YieldingCase") -> float:
+    def _cases(self, model: ChangeableModel, number: int) -> "list[_ChangedCase]":
+        """Return the structure under one change, counted from zero, at both ends of its range."""
+        change = 1 + number
+        if change < self._first_mass:
+            return [self._yielding_case(model, number, gain) for gain in GAIN_RANGE]
+        if change < self._first_loss:
+            place = change - self._first_mass
+            return [self._case_with_mass(model, place, gain) for gain in MASS_RANGE]
+        patch = change - self._first_loss
+        return [self._case_with_loss(model, patch, loss) for loss in LOSS_RANGE]
+
+    def _error_of(self, model: ChangeableModel, case: "_ChangedCase") -> float:
         """Return the largest relative error in one case; see `error`."""
         structure = case.structure
         # statics
@@ -295,17 +453,17 @@ class _Columns:
             is_seen = largest > 0.0
             worst = max(worst, float((difference[is_seen] / largest[is_seen]).max(initial=0.0)))
         # frequencies by the Rayleigh quotient of the improved modes
-        inertia = self.mass @ self._shapes(structure)
+        inertia = case.mass @ self._shapes(structure)
         improved = case.full_solution(inertia)
         stiffness = np.sum(improved * inertia, axis=0)
-        mass = np.sum(improved * (self.mass @ improved), axis=0)
+        mass = np.sum(improved * (case.mass @ improved), axis=0)
         frequency = np.sqrt(stiffness / mass) / (2.0 * np.pi)
         frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
         return max(worst, float(frequency_errors.max()))
 
 
-class _YieldingCase(NamedTuple):
-    """A structure whose support yields.
+class _ChangedCase(NamedTuple):
+    """A structure with a change.
 
     Attributes
     ----------
@@ -313,13 +471,16 @@ class _YieldingCase(NamedTuple):
         The reduced structure.
     full_solution : callable
         Returns the displacements (n', k) of the full model under loads (n', k).
+    mass : csr (n', n')
+        The mass of the full model.
     direction : (n', 1) array
-        The unit response of the motion.
+        The unit response of the motion of a support that is held otherwise; empty without one.
     """
 
     structure: ChangedStructure
     full_solution: Callable[[FloatArray], FloatArray]
-    direction: FloatArray
+    mass: sparse.csr_array
+    direction: FloatArray = np.zeros((0, 1))
 
 
 def _projected(terms: tuple[sparse.csr_array, ...], columns: FloatArray) -> FloatArray:

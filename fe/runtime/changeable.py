@@ -15,13 +15,36 @@ import numpy as np
 from .arrays import FloatArray, IntArray
 from .dense_matrices import dense_sum, lowest_modes
 from .errors import InvalidPatchError
-from .patch import ModelPatch, Primitive, SupportCompliance
+from .patch import ModelPatch, PlaceMass, Primitive, RegionStiffnessLoss, SupportCompliance
 from .reduced import ReducedModel
 
 LEAST_DIRECTION = 1e-11
 """Squared length, relative to the largest, of a direction of the columns that is not used."""
 KEPT_SUBSPACES = 32
 """Number of sets of changes whose matrices are kept."""
+
+
+class StructuralChanges(NamedTuple):
+    """The changes of a structure that a patch makes, each by its number from one.
+
+    Attributes
+    ----------
+    compliances : dict of int to float
+        Added compliance of motions of supports [m/N or rad/(N m)].
+    masses : dict of int to float
+        Added masses [kg].
+    losses : dict of int to float
+        Lost fractions of the stiffness of patches [1].
+    """
+
+    compliances: dict[int, float]
+    masses: dict[int, float]
+    losses: dict[int, float]
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of the changes."""
+        return (*self.compliances, *self.masses, *self.losses)
 
 
 class Subspace(NamedTuple):
@@ -73,9 +96,19 @@ class ChangeableModel(ReducedModel):
         of its own, and zeros.
     support_springs : (S,) array
         Spring that resists each motion [N/m or N m/rad], zero if it is held.
-    support_errors : (S,) array
-        Largest relative error of outputs and frequencies when the support yields, against the full
-        model, at both ends of the range of its compliance.
+    mass_places : tuple of str
+        Names of the C places where a mass may be added or lost, the next changes.
+    mass_rows : (C, 3, n) array
+        Rows that give the displacement of a mass at each place.
+    loss_places : tuple of str
+        Names of the R patches that may lose stiffness, the last changes.
+    loss_patch, loss_term : (Q,) array of int64
+        Patch, and stiffness term, of each part of the stiffness that patches hold.
+    loss_stiffness : (Q, n (n + 1) / 2) array
+        Lower triangle, row by row, of each part.
+    change_errors : (S + C + R,) array
+        Largest relative error of outputs and frequencies under each change, against the full model,
+        at both ends of its range.
     """
 
     record_name = "a reduced model with changes"
@@ -89,7 +122,90 @@ class ChangeableModel(ReducedModel):
     motions: tuple[str, ...]
     support_rows: Annotated[FloatArray, "supports", "whole"]
     support_springs: Annotated[FloatArray, "supports"]
-    support_errors: Annotated[FloatArray, "supports"]
+    mass_places: tuple[str, ...]
+    mass_rows: Annotated[FloatArray, "masses added", 3, "whole"]
+    loss_places: tuple[str, ...]
+    loss_patch: Annotated[IntArray, "parts"]
+    loss_term: Annotated[IntArray, "parts"]
+    loss_stiffness: Annotated[FloatArray, "parts", "triangle"]
+    change_errors: Annotated[FloatArray, "changes"]
+
+    def _axis_lengths(self) -> dict[str, int]:
+        size = len(self.column_owner)
+        places = len(self.supports) + len(self.mass_places) + len(self.loss_places)
+        return super()._axis_lengths() | {
+            "masses added": len(self.mass_places),
+            "triangle": size * (size + 1) // 2,
+            "changes": places,
+        }
+
+    def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
+        """Return the changes of a patch, by their numbers from one.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the structure has no such place, or a value is not possible.
+        """
+        compliances: dict[int, float] = {}
+        masses: dict[int, float] = {}
+        remaining: dict[int, float] = {}
+        for primitive in patch:
+            if isinstance(primitive, SupportCompliance):
+                if primitive.compliance < 0.0:
+                    raise InvalidPatchError(
+                        f"The compliance of the support {primitive.support!r} must not be "
+                        f"negative, but is {primitive.compliance:g}."
+                    )
+                number = 1 + self.support_number(primitive.support, primitive.motion)
+                compliances[number] = compliances.get(number, 0.0) + primitive.compliance
+            elif isinstance(primitive, PlaceMass):
+                first = 1 + len(self.supports)
+                number = first + self._place_number(self.mass_places, primitive.place, "a mass")
+                masses[number] = masses.get(number, 0.0) + primitive.mass
+            elif isinstance(primitive, RegionStiffnessLoss):
+                if not 0.0 <= primitive.loss < 1.0:
+                    raise InvalidPatchError(
+                        f"The loss of the patch {primitive.region!r} must be at least 0 and below "
+                        f"1, but is {primitive.loss:g}."
+                    )
+                first = 1 + len(self.supports) + len(self.mass_places)
+                number = first + self._place_number(self.loss_places, primitive.region, "a loss")
+                remaining[number] = remaining.get(number, 1.0) * (1.0 - primitive.loss)
+        losses = {number: 1.0 - fraction for number, fraction in remaining.items()}
+        return StructuralChanges(compliances, masses, losses)
+
+    def _place_number(self, places: tuple[str, ...], place: str, what: str) -> int:
+        """Return the number of a place; raise `InvalidPatchError` without one."""
+        if place not in places:
+            raise InvalidPatchError(
+                f"The structure {self.name} has no place {place!r} for {what}; it has "
+                f"{'; '.join(places) or 'none'}."
+            )
+        return places.index(place)
+
+    @cached_property
+    def _triangle(self) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the lower triangle of a matrix (n, n)."""
+        rows, columns = np.tril_indices(len(self.column_owner))
+        return rows, columns
+
+    def lost_stiffness(self, change: int, theta: FloatArray) -> FloatArray:
+        """Return the stiffness (n, n) of a patch, by the number of its change from one.
+
+        Parameters
+        ----------
+        change : int
+            Number of the change.
+        theta : (T,) array
+            Coefficients of the stiffness terms.
+        """
+        patch = change - 1 - len(self.supports) - len(self.mass_places)
+        parts = np.flatnonzero(self.loss_patch == patch)
+        size = len(self.column_owner)
+        lower = np.zeros((size, size))
+        lower[self._triangle] = theta[self.loss_term[parts]] @ self.loss_stiffness[parts]
+        return lower + np.tril(lower, -1).T
 
     def support_number(self, support: str, motion: str) -> int:
         """Return the number of a motion of a support; raise `InvalidPatchError` without one."""
@@ -253,32 +369,40 @@ class ChangedStructure:
         model.check_validity(vector.tolist())
         self.mode_count = model.mode_count
         self._last_output = model.whole_output[-1]
-        compliances = _compliances(model, patch)
-        changes = [1 + number for number in compliances]
-        subspace = model.subspace(changes)
+        changes = model.changes_of(patch)
+        subspace = model.subspace(changes.numbers)
         theta = model.stiffness_coefficients(vector)
         masses = model.mass_coefficients(vector)
         self.mass = dense_sum(masses, model.whole_mass)
         self.stiffness = dense_sum(theta, model.whole_stiffness)
         stiffness = dense_sum(theta, subspace.stiffness)
         mass = dense_sum(masses, subspace.mass)
+        for change, kilograms in changes.masses.items():
+            rows = model.mass_rows[change - 1 - len(model.supports)]
+            rows_in_subspace = rows @ subspace.basis
+            self.mass += kilograms * rows.T @ rows
+            mass += kilograms * rows_in_subspace.T @ rows_in_subspace
+        for change, loss in changes.losses.items():
+            lost = loss * model.lost_stiffness(change, theta)
+            self.stiffness -= lost
+            stiffness -= subspace.basis.T @ lost @ subspace.basis
         # A released motion q = sqrt(c) y against its spring 1 / c has the energy y^2 / 2: the
         # limit c = 0 is regular, and holds the support.
         scale = np.ones(len(stiffness))
         first_released = len(scale) - subspace.released
         released = first_released
-        for number, compliance in sorted(compliances.items()):
-            row = model.support_rows[number]
-            spring = model.support_springs[number]
+        for number, compliance in sorted(changes.compliances.items()):
+            row = model.support_rows[number - 1]
+            spring = model.support_springs[number - 1]
             if spring == 0.0:
                 scale[released] = np.sqrt(compliance)
                 released += 1
-                change = 1.0 / compliance if compliance > 0.0 else 0.0
+                added_spring = 1.0 / compliance if compliance > 0.0 else 0.0
             else:
-                change = 1.0 / (1.0 / spring + compliance) - spring
+                added_spring = 1.0 / (1.0 / spring + compliance) - spring
                 row_in_subspace = row @ subspace.basis
-                stiffness += change * np.multiply.outer(row_in_subspace, row_in_subspace)
-            self.stiffness += change * np.multiply.outer(row, row)
+                stiffness += added_spring * np.multiply.outer(row_in_subspace, row_in_subspace)
+            self.stiffness += added_spring * np.multiply.outer(row, row)
         stiffness = scale[:, np.newaxis] * stiffness * scale
         stiffness[np.arange(first_released, len(scale)), np.arange(first_released, len(scale))] += (
             1.0
@@ -303,19 +427,3 @@ class ChangedStructure:
     def mode_shapes(self) -> FloatArray:
         """The mass-normalised shapes (n, M) of the modes."""
         return self.modes.shapes
-
-
-def _compliances(model: ChangeableModel, patch: Iterable[Primitive]) -> dict[int, float]:
-    """Return the added compliance of each motion that a patch releases, by the motion's number."""
-    compliances: dict[int, float] = {}
-    for primitive in patch:
-        if not isinstance(primitive, SupportCompliance):
-            continue
-        if primitive.compliance < 0.0:
-            raise InvalidPatchError(
-                f"The compliance of the support {primitive.support!r} must not be negative, but is "
-                f"{primitive.compliance:g}."
-            )
-        number = model.support_number(primitive.support, primitive.motion)
-        compliances[number] = compliances.get(number, 0.0) + primitive.compliance
-    return compliances

@@ -60,6 +60,13 @@ class PointMass(Primitive):
     station: Annotated[float, "m"]
 
 
+class PlaceMass(Primitive):
+    """A mass is added at a named place of a structure; a negative one is lost."""
+
+    place: str
+    mass: Annotated[float, "kg"]
+
+
 class SupportCompliance(Primitive):
     """A support yields: a motion that it holds is against a spring of this `compliance`.
 
@@ -88,7 +95,10 @@ class ModulusTemperature(Primitive):
 
 
 class RegionStiffnessLoss(Primitive):
-    """A damage region loses `loss` of the stiffness that it has in a trial."""
+    """A damage region loses `loss` of the stiffness that it has in a trial.
+
+    The region may also be a patch of a structure that its file does not declare.
+    """
 
     region: str
     loss: Annotated[float, "1"]
@@ -157,6 +167,7 @@ class PortLoad(Primitive):
 
 STRUCTURE = (
     PointMass,
+    PlaceMass,
     SupportCompliance,
     LocalStiffnessLoss,
     ModulusTemperature,

@@ -20,6 +20,7 @@ from .patch import (
     LoadGain,
     ModelPatch,
     ModulusTemperature,
+    PlaceMass,
     PointMass,
     RegionStiffnessLoss,
     SupportCompliance,
@@ -144,6 +145,10 @@ class PatchedWing(WingRows):
         arrays = self.arrays
         mass = arrays.mass[0] + servo_mass * arrays.mass[1] + pitot_mass * arrays.mass[2]
         for primitive in patch:
+            if isinstance(primitive, PlaceMass):
+                raise InvalidPatchError(
+                    f"The wing has no place {primitive.place!r} for a mass; give a station instead."
+                )
             if isinstance(primitive, PointMass):
                 rows = self._station_weights(primitive.station) @ arrays.line_rows[:3]
                 for row in rows:

@@ -7,6 +7,7 @@ force of 1 N there.
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,9 +43,25 @@ _MOST_FREE_MOTIONS = 7
 """Free motions that are counted at most."""
 
 
+@dataclass(frozen=True)
+class MatrixStructure(AffineStructure):
+    """A structure from matrices.
+
+    Attributes
+    ----------
+    design : MatrixDesign
+        The design, as read from its file.
+    nodes : tuple of int
+        Numbers of the nodes whose displacements `expansion` gives, in their order.
+    """
+
+    design: MatrixDesign
+    nodes: tuple[int, ...]
+
+
 def assemble_matrices(
     design: MatrixDesign, folder: Path, design_hash: str, *, yielding: bool = False
-) -> AffineStructure:
+) -> MatrixStructure:
     """Make the affine operators of a structure from matrices.
 
     Parameters
@@ -82,8 +99,9 @@ def assemble_matrices(
     fields = _fields(design, files, mass, unknowns)
     # The expansion of the model gives displacements of nodes, not the rows of the matrices.
     fields["expansion"] = (_nodal_displacements(files) @ unknowns.expansion).tocsr()
-    return AffineStructure(
+    return MatrixStructure(
         design=design,
+        nodes=tuple(sorted({node for node, _ in files.places})),
         **fields,
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, unknowns)),
         design_hash=design_hash,

@@ -414,7 +414,7 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
 
 # ---------------------------------------------------------------- on lumped models
 
-WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief"}
+WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief", "added_mass"}
 OF_STORES = {"outflow", "overflow"}
 
 

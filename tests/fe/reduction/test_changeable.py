@@ -16,8 +16,15 @@ from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import ModelPatch, SupportCompliance
+from fe.runtime.patch import (
+    ModelPatch,
+    PlaceMass,
+    Primitive,
+    RegionStiffnessLoss,
+    SupportCompliance,
+)
 from fe.structure.affine import AffineStructure
+from fe.structure.candidates import loss_places, mass_places
 from fe.structure.operators import assemble_structure
 
 WriteBeam = Callable[..., Path]
@@ -51,7 +58,7 @@ class Yielding(NamedTuple):
     model: ChangeableModel
 
     def changed(
-        self, *primitives: SupportCompliance, values: dict[str, float] | None = None
+        self, *primitives: Primitive, values: dict[str, float] | None = None
     ) -> ChangedStructure:
         vector = self.model.vector(values or {})
         return ChangedStructure(self.model, vector, ModelPatch(primitives))
@@ -184,7 +191,7 @@ def test_both_ends_of_the_range_are_those_of_the_full_model(
 
 @pytest.mark.parametrize("beam", ["slender", "propped", "flanged"])
 def test_the_stated_errors_are_small(request, beam: str) -> None:
-    assert request.getfixturevalue(beam).model.support_errors.max() < 1e-3
+    assert request.getfixturevalue(beam).model.change_errors.max() < 1e-3
 
 
 def test_two_supports_may_yield_at_once(propped: Yielding) -> None:
@@ -225,10 +232,16 @@ def test_compliances_of_one_motion_add_up(flanged: Yielding) -> None:
             "no support 'flange' with the motion 'rz'; it has root x",
         ),
         (SupportCompliance("root", "ry", -1e-6), "'root' must not be negative, but is -1e-06"),
+        (
+            PlaceMass("nose", 1.0),
+            "no place 'nose' for a mass; it has root|no place 'nose' for a mass; it has end",
+        ),
+        (RegionStiffnessLoss("nose", 0.5), "no place 'nose' for a loss"),
+        (RegionStiffnessLoss("around", 1.0), "'around' must be at least 0 and below 1, but is 1"),
     ],
 )
-def test_what_cannot_yield_is_refused(
-    slender: Yielding, primitive: SupportCompliance, sentence: str
+def test_what_cannot_change_is_refused(
+    slender: Yielding, primitive: Primitive, sentence: str
 ) -> None:
     with pytest.raises(InvalidPatchError, match=sentence):
         slender.changed(primitive)
@@ -269,3 +282,79 @@ def test_a_support_of_matrices_yields_in_series(tmp_path: Path) -> None:
     displacements = np.linalg.solve(stiffness.toarray(), load)
     assert displacements == pytest.approx([0.005, 0.007, 0.004])
     assert full.held().unknowns == 2
+
+
+# ---------------------------------------------------------------- masses and losses of stiffness
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.5])
+def test_a_mass_at_the_tip_has_the_frequency_of_the_closed_form(
+    slender: Yielding, ratio: float
+) -> None:
+    """1 + cos b cosh b + mu b (cos b sinh b - sin b cosh b) = 0, mu: mass over that of the beam."""
+
+    def equation(b: float) -> float:
+        coupling = np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)
+        return float(1.0 + np.cos(b) * np.cosh(b) + ratio * b * coupling)
+
+    heavy = slender.changed(PlaceMass("end", ratio * 2700.0 * LENGTH * 0.02 * 0.01))
+    change = heavy.modes.frequency[0] / slender.changed().modes.frequency[0]
+    assert change == pytest.approx((brentq(equation, 1e-3, 1.8752) / 1.8751) ** 2, rel=5e-3)
+
+
+def test_an_added_mass_has_the_frequencies_of_the_full_model(propped: Yielding) -> None:
+    number = len(propped.model.mass_places) // 2
+    structure = propped.changed(PlaceMass(propped.model.mass_places[number], 0.01))
+    full = propped.full.held()
+    rows = mass_places(propped.full)[number].rows[:, : full.unknowns]
+    mass = (full.mass(full.masses) + 0.01 * (rows.T @ rows)).tocsr()
+    squares, _ = lowest_eigenpairs(full.stiffness(), mass, 4)
+    assert structure.modes.frequency[:4] == pytest.approx(
+        np.sqrt(squares) / (2.0 * np.pi), rel=1e-3
+    )
+
+
+def test_a_mass_that_is_added_and_lost_changes_nothing(propped: Yielding) -> None:
+    place = propped.model.mass_places[0]
+    both = propped.changed(PlaceMass(place, 0.01), PlaceMass(place, -0.01))
+    plain = propped.changed().modes.frequency
+    assert both.modes.frequency == pytest.approx(plain, rel=1e-4)
+
+
+def test_a_mass_moves_nothing_at_rest(slender: Yielding) -> None:
+    heavy = slender.changed(PlaceMass("end", 0.1))
+    plain = slender.outputs(slender.changed(), PUSH)
+    assert slender.outputs(heavy, PUSH) == pytest.approx(plain, rel=1e-4)
+
+
+@pytest.mark.parametrize("loss", [0.05, 0.6])
+@pytest.mark.parametrize("number", [0, -1])
+def test_a_patch_that_loses_stiffness_is_that_of_the_full_model(
+    slender: Yielding, number: int, loss: float
+) -> None:
+    structure = slender.changed(RegionStiffnessLoss(slender.model.loss_places[number], loss))
+    full = slender.full.held()
+    free = slice(0, full.unknowns)
+    system = full.system_at(PUSH)
+    stiffness = system.stiffness - loss * sum(
+        matrix[free, free] for matrix in loss_places(slender.full)[number].terms.values()
+    )
+    displacements = Factorisation(stiffness.tocsr()).solve(system.load)
+    rows = np.concatenate((full.gauge_output.toarray(), full.displacement_output.toarray()))
+    expected, outputs = rows @ displacements, slender.outputs(structure, PUSH)
+    assert np.abs(outputs[:3] - expected[:3]).max() < 1e-3 * np.abs(expected[:3]).max()
+    assert outputs[3] == pytest.approx(expected[3], rel=1e-3)
+    squares, _ = lowest_eigenpairs(stiffness.tocsr(), system.mass, 4)
+    assert structure.modes.frequency[:4] == pytest.approx(
+        np.sqrt(squares) / (2.0 * np.pi), rel=1e-3
+    )
+
+
+def test_patches_do_not_overlap_and_leave_out_damage_regions(slender: Yielding) -> None:
+    """All of them and the damage regions together hold the stiffness of the beam once."""
+    free = slice(0, slender.full.held().unknowns)
+    patches = sum(matrix for patch in loss_places(slender.full) for matrix in patch.terms.values())
+    terms = slender.full.stiffness_terms
+    outside = sum(term.matrix for term in terms if term.region is None)
+    difference = (patches - outside)[free, free]
+    assert abs(difference).max() < 1e-9 * abs(outside).max()
