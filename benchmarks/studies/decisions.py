@@ -41,7 +41,7 @@ MOST_STRAINED = 16
 """Index of gauge 17, whose strain is the largest."""
 TOGETHER = 40
 """Flights that are flown side by side."""
-POLICIES = ("paper", "hold 5", "risk 0.07", "risk 0.07, hold 3", "risk 0.02")
+POLICIES = ("paper", "hold 5", "risk 0.07", "risk 0.1, hold 3", "risk 0.02")
 """Policies of the study: that of the scenario, or names for `--policy` of `uav-twin run`."""
 WITHOUT_NOTICES = "paper, without notices"
 

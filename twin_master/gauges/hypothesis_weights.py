@@ -171,7 +171,8 @@ class HypothesisWeights:
         showing_probability = np.exp(log_showing_before - log_fault)
         self.showing[..., previous_control] = np.clip(showing_probability, LEAST_SHOWING, 1.0)
         self.current[..., FAULTS] = log_fault + np.log(self.showing[..., control])
-        self.hidden = log_fault + np.log1p(-self.showing[..., control])
+        with np.errstate(divide="ignore"):  # a fault that certainly shows is not hidden
+            self.hidden = log_fault + np.log1p(-self.showing[..., control])
         return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
 
     def advance(self, log_hazard: float | Float, log_begin: Float) -> Float:

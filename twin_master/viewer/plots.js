@@ -42,7 +42,8 @@ function colourOf(scale, low, high, value) {
   return `rgb(${parts.join(",")})`;
 }
 
-// A figure with axes. `options`: unit, height, and range or names of the vertical axis; `reading` says what
+// A figure with axes. `options`: unit, height, range or names of the vertical axis, and titles of the places 1, 2, ...
+// of the horizontal one, which are shown if they fit; `reading` says what
 // stands at a place of the horizontal axis, in lines of text.
 class Plot {
   constructor(parent, title, options) {
@@ -83,8 +84,11 @@ class Plot {
       return `<path class="grid" d="M${MARGIN.left} ${line}H${right}"/>` +
         `<text x="${MARGIN.left - 6}" y="${this.y(at) + 4}" text-anchor="end">${escaped(names ? name : shortNumber(name))}</text>`;
     });
-    const below = ticksOf(first, last, this.width / 80).filter((value) => Number.isInteger(value)).map((value) =>
-      `<text x="${this.x(value)}" y="${height - 6}" text-anchor="middle">${value}</text>`);
+    const titles = this.options.titles ?? [];
+    const fit = titles.length > 0 && titles.length * (7 * Math.max(...titles.map((title) => title.length)) + 6) < right - MARGIN.left;
+    const steps = fit ? titles.map((_, index) => index + 1) : ticksOf(first, last, this.width / 80).filter((value) => Number.isInteger(value));
+    const below = steps.map((value) =>
+      `<text x="${this.x(value)}" y="${height - 6}" text-anchor="middle">${escaped(fit ? titles[value - 1] : String(value))}</text>`);
     const side = unit ? `<text transform="translate(11 ${(floor + MARGIN.top) / 2}) rotate(-90)" text-anchor="middle">${escaped(unit)}</text>` : "";
     this.place.innerHTML = `<svg viewBox="0 0 ${this.width} ${height}" width="${this.width}" height="${height}" role="img">` +
       `${grid.join("")}${below.join("")}${side}${this.marks.map((mark) => mark(this)).join("")}</svg>`;

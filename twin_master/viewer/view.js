@@ -326,7 +326,7 @@ function build() {
   views.control = new Plot(element("states"), "Control: flown (line), probability of the choice (bars)", control);
   const unit = `${sensors.quantity} (${sensors.unit})`;
   const title = `All ${sensors.word}s at this ${step}: expected, 95 %, observed; square: outside its interval`;
-  views.sensors = new Plot(element("plots"), title, { unit, height: 215 });
+  views.sensors = new Plot(element("plots"), title, { unit, height: 215, titles: sensors.named ? sensors.titles : [] });
   views.chosen = new Plot(element("plots"), `One ${sensors.word} over the ${step}s`, { unit, height: 210 });
   scene.rewards.forEach((name, index) => {
     views[`reward${index}`] = new Plot(element("rows"), `${capital(name)} reward`, { unit: "reward", height: 140 });

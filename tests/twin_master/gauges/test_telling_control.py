@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from twin_master.gauges.hypothesis_weights import HypothesisWeights
 from twin_master.gauges.telling_control import PredictedReadings, separation_of_hypotheses
 from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator
 
@@ -58,3 +59,13 @@ def test_the_control_with_the_larger_readings_tells_a_wrong_gain():
     (sentence,) = advice_of(np.stack([soft, 3.0 * soft], axis=1), 1.15)
     assert "a step at hard tells" in sentence
     assert "apart best, if it is safe" in sentence
+
+
+def test_a_fault_that_certainly_shows_is_not_hidden_after_a_change_of_control():
+    """Pytest makes an error of a warning."""
+    log_begin = np.log(np.array([1.0, 1.0, 0.5, 0.5]))
+    weights = HypothesisWeights.initial(0.1, log_begin, control_index=0, control_count=2)
+    weights.showing[:, 1] = 1.0
+    newly_hidden = weights.change_control(0, 1)
+    assert np.array_equal(weights.hidden, [-np.inf, -np.inf])
+    assert np.array_equal(newly_hidden, [0.0, 0.0])

@@ -133,13 +133,13 @@ def _add_flown_fleet(
     for overview in overviews:
         _add_flown_group(page, overview)
     page.add_section("Results of the twins")
+    returns = {name: returns_of_group(group) for name, group in groups.items()}
+    if any(len(values) for values in returns.values()):
+        page.add_report_figure(WORDS.figure("returns", returns_figure(returns)))
     figures = {name: group_figures(group) for name, group in groups.items()}
     WORDS.add_table(
         page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
     )
-    returns = {name: returns_of_group(group) for name, group in groups.items()}
-    if any(len(values) for values in returns.values()):
-        page.add_report_figure(WORDS.figure("returns", returns_figure(returns)))
     _add_lessons(page, folder)
 
 
