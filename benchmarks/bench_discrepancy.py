@@ -16,7 +16,7 @@ from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
 from discrepancy.sources.examples import example_campaign, wing_plan
 from discrepancy.system.sensing import observe
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from fe.runtime.patch import ModelPatch, PowerDamping, SupportCompliance
 
 SEED = 20210527

@@ -25,7 +25,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.system.interface import Model
 from discrepancy.system.lumped_model import LumpedModel
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness

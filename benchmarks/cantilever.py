@@ -27,7 +27,9 @@ from fe.runtime.patch import (
     INTERNAL_FORCES,
     InertiaRelief,
     LoadGain,
+    LoadOffset,
     LoadPlace,
+    LoadTilt,
     LocalStiffnessLoss,
     ModelPatch,
     ModulusTemperature,
@@ -177,6 +179,7 @@ class Cantilever(Model):
     stations: tuple[float, float] | None = (0.0, LENGTH)
     support_motions = (("root", "rx"),)
     mass_places = tuple(MASS_PLACES)
+    load_changes = (("tip_load", "offset", "y"), ("tip_load", "tilt", "y"))
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -277,6 +280,10 @@ def _motion(
     for primitive in patch:
         if isinstance(primitive, LoadPlace):
             place, chord_offset = place + primitive.along_span, chord_offset + primitive.along_chord
+        elif isinstance(primitive, LoadOffset):
+            place = place + primitive.distance
+        elif isinstance(primitive, LoadTilt):
+            gain = gain * (np.cos(primitive.angle) + np.sin(primitive.angle))
         elif isinstance(primitive, LoadGain):
             gain, tare = gain * (1.0 + primitive.gain), tare + primitive.tare
         elif isinstance(primitive, Washout):

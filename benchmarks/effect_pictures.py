@@ -287,6 +287,8 @@ PICTURES: dict[str, Picture] = {
     "point_mass": Picture(
         {"mass_ratio": 0.1, "station_ratio": 1.0}, (ringdown(end=1.2), load_line())
     ),
+    "load_offset": Picture({"offset_ratio": 0.05}, (load_line("tip"), load_line("g0"))),
+    "load_direction": Picture({"angle": 0.1}, (load_line("tip"), load_line("g0"))),
     "added_mass": Picture({"mass_ratio": 0.1}, (ringdown(end=1.2), load_line())),
     "support_compliance": Picture({"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))),
     "local_stiffness_loss": Picture(

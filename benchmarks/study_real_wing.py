@@ -20,7 +20,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.sources.measured_rigs import write_rig_campaign
 from discrepancy.sources.real_wing import SIGNAL
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from discrepancy.workflow import Investigation, investigate
 
 BEGINS = (0.8, 1.0, 1.25)

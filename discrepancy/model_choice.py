@@ -13,7 +13,8 @@ from discrepancy.sources.from_run import run_model
 from discrepancy.system.interface import Model
 from discrepancy.system.lumped_file import SHIPPED_MODELS
 from discrepancy.system.lumped_model import LumpedModel
-from discrepancy.system.structures import StructureModel, WingModel
+from discrepancy.system.structures import StructureModel
+from discrepancy.system.wing_model import WingModel
 from fe.reduction.model_cache import changeable_model
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure, load_structure, structure_hash

@@ -28,6 +28,8 @@ MOTION_WORDS = {
 """Words for each motion of a support in the names of places."""
 MOTION_OF_WORDS = {words: motion for motion, words in MOTION_WORDS.items()}
 """The motion of a support by these words."""
+PREPOSITIONS = {"offsets of loads": "along", "tilts of loads": "towards"}
+"""Words before the axis in the names of places, such as "pull, along x"."""
 EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states."""
 ALL = "all "
@@ -205,6 +207,9 @@ class EffectInSetting:
                 return (Target(support, motion=motion),)
             support, _, words = place.rpartition(", ")
             return (Target(support, motion=MOTION_OF_WORDS[words]),)
+        if self.section.places in PREPOSITIONS:
+            control, _, axis = place.rpartition(f", {PREPOSITIONS[self.section.places]} ")
+            return (Target(control, motion=axis),)
         if self.section.places == "mains lines":
             line, _, channels = place.partition(", ")
             frequency = float(line.split()[0])
@@ -236,7 +241,7 @@ class Target:
     number : float
         Number in the place's name: the side of a skin, or the frequency of a line [Hz].
     motion : str
-        Motion of a support, such as "rx".
+        Motion of a support, such as "rx", or the axis of a change of a load.
     """
 
     name: str

@@ -12,6 +12,7 @@ from discrepancy.catalogue.effect_in_setting import (
     CHANNELS_OR_ALL_OF_A_QUANTITY,
     EVERY_PORT,
     MOTION_WORDS,
+    PREPOSITIONS,
     EffectInSetting,
     Names,
 )
@@ -77,6 +78,19 @@ def _supports(effect: EffectInSetting) -> Names:
     if support_motions == (ROOT_TURN,):
         return ("",)
     return tuple(f"{support}, {MOTION_WORDS[motion]}" for support, motion in support_motions)
+
+
+def _changes_of_loads(effect: EffectInSetting, change: str, places: str) -> Names:
+    """Return the changes of forces that act in fitted trials, such as "pull, along x"."""
+    setting = effect.setting
+    used_controls = {str(trial.load_place) for trial in effect.trials}
+    controls = [control for control, _, _ in setting.model.load_changes]
+    is_only_control = len(set(controls)) == 1
+    return tuple(
+        f"{control}, {PREPOSITIONS[places]} {axis}"
+        for control, kind, axis in setting.model.load_changes
+        if kind == change and (is_only_control or control in used_controls)
+    )
 
 
 def _calibrated_channels(effect: EffectInSetting) -> Names:
@@ -204,6 +218,8 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
     "supports": _supports,
+    "offsets of loads": lambda effect: _changes_of_loads(effect, "offset", "offsets of loads"),
+    "tilts of loads": lambda effect: _changes_of_loads(effect, "tilt", "tilts of loads"),
     "places of masses": lambda effect: effect.setting.model.mass_places,
     "calibrated channels": _calibrated_channels,
     "timed gauges": _gauges_read_repeatedly,
@@ -240,6 +256,8 @@ NO_PLACES = {
     "ports of states": _NO_STATE,
     "ports of states, or all": _NO_STATE,
     "supports": "The model names no support that could yield.",
+    "offsets of loads": "The model says no place of a load that could be wrong.",
+    "tilts of loads": "The model says no direction of a load that could be wrong.",
     "places of masses": "The model names no place where a mass could be added or lost.",
     "calibrated channels": (
         "The campaign has no channel whose gain is known, so no gain can be wrong."

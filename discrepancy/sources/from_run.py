@@ -16,7 +16,7 @@ from calibration.result.file import load_calibration
 from discrepancy.campaign import records
 from discrepancy.campaign.records import BoolArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from fmu_asset.client.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch

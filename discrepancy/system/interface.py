@@ -77,6 +77,8 @@ class Model(ABC):
         Places where a mass may be added or lost.
     loss_places : tuple of str
         Patches that are no damage regions and may lose stiffness.
+    load_changes : tuple of (str, str, str)
+        Changes of forces: the control, "offset" of its place or "tilt", and the axis.
     load_places : tuple of str, optional
         The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
@@ -104,6 +106,7 @@ class Model(ABC):
     support_motions: tuple[tuple[str, str], ...] = ()
     mass_places: tuple[str, ...] = ()
     loss_places: tuple[str, ...] = ()
+    load_changes: tuple[tuple[str, str, str], ...] = ()
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False

@@ -1,52 +1,35 @@
-"""A structure as a model: any from a mesh or matrices, and the wing with its patches."""
+"""A structure from a mesh or matrices as a model."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import cache, cached_property, partial
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from calibration.errors import CalibrationError
-from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
-from calibration.result.file import load_calibration
-from calibration.result.record import STATE, ParameterPrior
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import quantity_with_unit
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
 from discrepancy.system.output_equation import OutputEquation
-from discrepancy.system.response import MOVES, TURNS, Conditions, Outputs, Place
-from discrepancy.system.scales import ForceShare, PortScale, Scales
+from discrepancy.system.response import ACROSS, Conditions, Outputs, Place
+from discrepancy.system.scales import Scales
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
-from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
-from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import (
     INTERNAL_FORCES,
-    PRIMITIVES,
-    ROOT_TURN,
     SENSORS,
     ModelPatch,
     Primitive,
 )
-from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.port_laws import PLANFORM, STATION_PORTS
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import Losses, wing_input_names
-from fe.runtime.wing_rows import PORTS, STATIC_TEST_LOAD, strain_gauge
+from fe.runtime.state import Losses
 from fe.structure.affine import PORT_PREFIX
-from fe.wing.design import WingDesign, load_design
-from reporting.progress import Progress
 
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
@@ -56,10 +39,6 @@ ROUNDING = 1e-9
 """Differences of two rows below this fraction of the largest entry are rounding errors."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
-ROTATING_PORT = "root"
-"""Port of the wing at which a force is a moment and a motion an angle."""
-Prior = Mapping[str, tuple[float, float]]
-"""Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 
 
 class StructureWithMatrices(SolvedStructure, Protocol):
@@ -134,11 +113,25 @@ class StructureModel(SystemModel):
             self.mass_places = model.mass_places
             self.loss_places = model.loss_places
             self.largest_losses |= dict.fromkeys(model.loss_places, LARGEST_LOSS)
+            self.length = model.size
+            self.load_changes = tuple(
+                zip(
+                    model.load_controls,
+                    model.load_change_kinds,
+                    model.load_change_axes,
+                    strict=True,
+                )
+            )
             rows, self._unit_loads = model.whole_output, model.whole_load.T
         else:
             rows = np.concatenate((model.output_rows, model.acceleration_rows))
             self._unit_loads = model.unit_loads
         self._rows = dict(zip(names, rows, strict=True))
+        if isinstance(model, ChangeableModel):
+            for ending, strain_rows in zip(ACROSS, model.across_output, strict=True):
+                gauges = model.gauges[: len(strain_rows)]
+                for gauge, row in zip(gauges, strain_rows, strict=True):
+                    self._rows[gauge + ending] = row
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -229,6 +222,8 @@ class StructureModel(SystemModel):
             return bool(self.mass_places)
         if primitive is changes.LoadGain:
             return bool(self.forces)
+        if primitive in (changes.LoadOffset, changes.LoadTilt):
+            return bool(self.load_changes)
         if primitive is changes.SupportCompliance:
             return bool(self.support_motions)
         return primitive in SENSORS
@@ -244,7 +239,16 @@ class StructureModel(SystemModel):
             If there is no such force, or none is named of several.
         """
         places = self.forces or (LOAD_FACTOR,)
-        return self._unit_load(state, choose_load_place(places, place, self.quoted_name))
+        control = choose_load_place(places, place, self.quoted_name)
+        load = self._unit_load(state, control)
+        if not isinstance(self.model, ChangeableModel):
+            return load
+        return self.model.changed_load(load, control, change)
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return the quantity of an output; strains across gauges and shear are not listed."""
+        is_across = output.endswith(ACROSS) and output in self._rows
+        return Quantity.STRAIN if is_across else super().output_quantity(output)
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
@@ -295,7 +299,7 @@ class StructureModel(SystemModel):
             structure: StructureWithMatrices = self.model.structure_at(vector)
         else:
             structure = ChangedStructure(self.model, vector, state.structure)
-        return _linear_system(structure, self.model.damping, self.port_rows)
+        return linear_system(structure, self.model.damping, self.port_rows)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, with those of supports that may yield."""
@@ -342,7 +346,7 @@ def _acts_along(push: FloatArray, row: FloatArray) -> bool:
     )
 
 
-def _linear_system(
+def linear_system(
     structure: StructureWithMatrices,
     rayleigh: Iterable[float],
     ports: Mapping[str, FloatArray],
@@ -369,173 +373,3 @@ def _linear_system(
         on_modes=structure.rigid_ports,
         solved=structure,
     )
-
-
-def _cholesky_solver(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the function that solves K x = b by a Cholesky factor of K."""
-    return partial(cho_solve, cho_factor(stiffness, check_finite=False), check_finite=False)
-
-
-class WingModel(SystemModel):
-    """The model of a wing; its system in each state and under each patch is computed once.
-
-    Parameters
-    ----------
-    arrays : PatchArrays
-        The arrays of the wing from which patches are computed.
-    name : str
-        The name of the model in messages and reports.
-    prior : mapping of str to (float, float)
-        The mean and standard deviation of the calibrated parameters, by the names of
-        `calibration.result.record.STATE`.
-    design : WingDesign, optional
-        The design from which the arrays were made.
-
-    Notes
-    -----
-    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k],
-    strain[k].transverse and strain[k].shear across it, tip_displacement, load_point_displacement
-    and displacement[y, x].
-    """
-
-    reference = STATIC_TEST_LOAD
-
-    def __init__(
-        self,
-        arrays: PatchArrays,
-        name: str = "wing",
-        prior: Prior = SHIPPED_PRIOR,
-        design: WingDesign | None = None,
-    ) -> None:
-        self.name = name
-        self.design = design
-        self.wing = PatchedWing(arrays)
-        self.wing.solver = _cholesky_solver
-        names = wing_input_names(arrays.regions)
-        validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
-        self.parameters = wing_priors(validity, **prior)
-        self.regions = arrays.regions
-        self.largest_losses = {region: validity[region][1] for region in arrays.regions}
-        self.length = self.wing.span
-        self.stations = (0.0, self.wing.span)
-        self.support_motions = (ROOT_TURN,)
-        self.port_rows = self.wing.port_rows
-        self.ports = tuple(PORTS)
-
-    @cached_property
-    def _output_row(self) -> Callable[[str], FloatArray | None]:
-        """The function that returns the row (n,) of an output, with a cache."""
-        return cache(self.wing.output_row)
-
-    @classmethod
-    def of_design(
-        cls, path: Path | str | None = None, progress: Progress | None = None
-    ) -> "WingModel":
-        """Return the wing of a design file, or the shipped wing, with the shipped calibration.
-
-        Raises
-        ------
-        ModelError
-            If it cannot be read, modelled or reduced.
-        """
-        with ModelError.instead_of(FiniteElementError):
-            design = load_design(path)
-            return cls(patch_arrays(design, progress), design.name, design=design)
-
-    @classmethod
-    def of_calibration(cls, path: Path | str, progress: Progress | None = None) -> "WingModel":
-        """Return the wing of a calibration, its posterior as prior.
-
-        Raises
-        ------
-        ModelError
-            If the calibration cannot be read, or its wing not be modelled.
-        """
-        unusable = f"The calibration {path} cannot be used: "
-        with ModelError.instead_of(FiniteElementError, CalibrationError, OSError, before=unusable):
-            calibration = load_calibration(path)
-            prior = {}
-            for name in STATE:
-                deviation = float(np.std(calibration.draws_of(name)))
-                prior[name] = (calibration.mean(name), deviation)
-            design = calibration.wing_design
-            return cls(patch_arrays(design, progress), calibration.asset, prior, design)
-
-    # ------------------------------------------------------------ outputs, ports and loads
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return the quantity of an output, or None if there is no such output."""
-        if self._output_row(output) is None:
-            return None
-        return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
-
-    def output_equations(
-        self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
-    ) -> list[OutputEquation]:
-        """Return the equations of outputs, with the strain factors of the patch applied."""
-        rows = np.array([self._output_row(output) for output, _ in outputs])
-        factors = self.wing.strain_factors(case.patch)
-        if factors is not None:
-            gauges = np.array([strain_gauge(output) for output, _ in outputs])
-            is_strain = gauges >= 0
-            rows = rows * np.where(is_strain, factors[gauges], 1.0)[:, None]
-        equations = []
-        for row, (_, quantity) in zip(rows, outputs, strict=True):
-            equations.append(OutputEquation.from_row(row, quantity.order))
-        return equations
-
-    @property
-    def outputs_with_quantities(self) -> tuple[str, ...]:
-        """The outputs with quantity and SI unit, as they are listed in a sentence."""
-        strain = quantity_with_unit(Quantity.STRAIN)
-        displacement = quantity_with_unit(Quantity.DISPLACEMENT)
-        return (
-            f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}] ({strain})",
-            f"tip_displacement ({displacement})",
-            f"load_point_displacement ({displacement})",
-            f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction "
-            f"({displacement})",
-        )
-
-    def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the wing can carry a primitive.
-
-        It can carry all but forces by a formula in time and masses at named places.
-        """
-        not_carried = (changes.PortLoad, changes.PlaceMass)
-        return primitive in PRIMITIVES.values() and primitive not in not_carried
-
-    def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of force and motion at a port: the root turns, others move."""
-        return TURNS if port == ROTATING_PORT else MOVES
-
-    def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at ports of `port_rows`."""
-        return self.wing.internal_forces(forces)
-
-    def force_row(
-        self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
-    ) -> FloatArray:
-        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` off the wing."""
-        return self.wing.force_row(place, change)
-
-    def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of the load factor and of its square."""
-        return self.wing.manoeuvre_loads(change)
-
-    def distributed_scales(
-        self, ports: Mapping[str, PortScale], shape: FloatArray
-    ) -> dict[str, PortScale]:
-        """Return the scales of a force over the planform, given the shape of the first mode."""
-        weights = self.wing.planform_stations.area_fraction
-        motions = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
-        relative_motions = motions / float(weights @ motions)
-        distribution = tuple(map(ForceShare, weights.tolist(), relative_motions.tolist()))
-        return {PLANFORM: replace(ports["span"], distribution=distribution)}
-
-    def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the linear system of the wing in a state."""
-        stiffness_factor, servo_mass, pitot_mass, alpha, beta = state.parameters
-        values = np.array((stiffness_factor, *state.losses, servo_mass, pitot_mass, 0.0, 0.0))
-        structure = self.wing.structure_at(values, state.structure, state.temperature_rise)
-        return _linear_system(structure, (alpha, beta), self.port_rows)

@@ -25,7 +25,15 @@ from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, SupportCompliance
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, SupportMotion
-from fe.structure.candidates import LossPlace, MassPlace, loss_places, mass_places
+from fe.structure.candidates import (
+    LossPlace,
+    MassPlace,
+    load_changes,
+    loss_places,
+    mass_places,
+    strains_across,
+)
+from fe.structure.operators import Structure
 
 from .reduced_basis import Reduction
 from .terms import ReductionTerms, cube_corners
@@ -102,7 +110,7 @@ class _Columns:
         self.factors = reduction.terms.factors
         self.terms = ReductionTerms(yielding)
         self.free = reduction.terms.structure.unknowns
-        masses = self._nominal_masses()
+        masses = (1.0, *yielding.masses.values())
         self.mass = sum(
             (value * term for value, term in zip(masses, yielding.mass_terms, strict=True)),
             sparse.csr_array(yielding.mass_terms[0].shape),
@@ -114,10 +122,11 @@ class _Columns:
         self.base.extend(self._whitened(base))
         self.mass_places = mass_places(yielding)
         self.loss_places = loss_places(yielding)
-
-    def _nominal_masses(self) -> FloatArray:
-        """Return the coefficients (1 + P,) of the mass terms at nominal masses."""
-        return np.array([1.0, *self.structure.masses.values()])
+        self.load_changes = load_changes(yielding)
+        # the responses to forces beside their place, or in another direction
+        forces = np.array([change.vector[: self.free] for change in self.load_changes])
+        responses = self.factors.whitened(forces.reshape(-1, self.free).T)
+        self._add_remainders(0, responses / np.linalg.norm(responses, axis=0))
 
     def _whitened(self, displacements: FloatArray) -> FloatArray:
         """Return displacements (n, k) in whitened coordinates, in which energy is length."""
@@ -271,6 +280,14 @@ class _Columns:
             loss_stiffness=np.array([matrix[lower] for _, _, matrix in parts]).reshape(
                 len(parts), len(lower[0])
             ),
+            size=self.structure.mesh.size if isinstance(self.structure, Structure) else 1.0,
+            load_controls=tuple(change.control for change in self.load_changes),
+            load_change_kinds=tuple(change.change for change in self.load_changes),
+            load_change_axes=tuple(change.axis for change in self.load_changes),
+            load_changes=np.array(
+                [change.vector @ columns for change in self.load_changes]
+            ).reshape(len(self.load_changes), columns.shape[1]),
+            across_output=np.array([rows @ columns for rows in strains_across(self.structure)]),
             change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
         )
 
@@ -383,8 +400,7 @@ class _Columns:
         def full_solution(loads: FloatArray) -> FloatArray:
             return self._held_solution(loads) + factor * direction @ (direction.T @ loads)
 
-        no_direction = np.zeros((0, 1))
-        released_direction = direction if motion.spring == 0.0 else no_direction
+        released_direction = direction if motion.spring == 0.0 else direction[:0]
         return _ChangedCase(structure, full_solution, self.mass, released_direction)
 
     def _held_solution(self, loads: FloatArray) -> FloatArray:
@@ -455,9 +471,9 @@ class _Columns:
         # frequencies by the Rayleigh quotient of the improved modes
         inertia = case.mass @ self._shapes(structure)
         improved = case.full_solution(inertia)
-        stiffness = np.sum(improved * inertia, axis=0)
-        mass = np.sum(improved * (case.mass @ improved), axis=0)
-        frequency = np.sqrt(stiffness / mass) / (2.0 * np.pi)
+        squares = np.sum(improved * inertia, axis=0)
+        squares = squares / np.sum(improved * (case.mass @ improved), axis=0)
+        frequency = np.sqrt(squares) / (2.0 * np.pi)
         frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
         return max(worst, float(frequency_errors.max()))
 

@@ -8,6 +8,8 @@ own columns alone. NumPy and relative imports only.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from math import inf
+from sys import float_info
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -15,7 +17,15 @@ import numpy as np
 from .arrays import FloatArray, IntArray
 from .dense_matrices import dense_sum, lowest_modes
 from .errors import InvalidPatchError
-from .patch import ModelPatch, PlaceMass, Primitive, RegionStiffnessLoss, SupportCompliance
+from .patch import (
+    LoadOffset,
+    LoadTilt,
+    ModelPatch,
+    PlaceMass,
+    Primitive,
+    RegionStiffnessLoss,
+    SupportCompliance,
+)
 from .reduced import ReducedModel
 
 LEAST_DIRECTION = 1e-11
@@ -106,6 +116,14 @@ class ChangeableModel(ReducedModel):
         Patch, and stiffness term, of each part of the stiffness that patches hold.
     loss_stiffness : (Q, n (n + 1) / 2) array
         Lower triangle, row by row, of each part.
+    size : float
+        Diagonal of the box around the structure, or 1 if that is not known [m].
+    load_controls, load_change_kinds, load_change_axes : tuple of str
+        Control of a force, "offset" or "tilt", and axis, of D changes of loads.
+    load_changes : (D, n) array
+        Change of the load per unit of its control, and per metre or radian.
+    across_output : (2, G, n) array
+        Strains across the gauges, and shear strains; without gauges if they are not known.
     change_errors : (S + C + R,) array
         Largest relative error of outputs and frequencies under each change, against the full model,
         at both ends of its range.
@@ -128,6 +146,12 @@ class ChangeableModel(ReducedModel):
     loss_patch: Annotated[IntArray, "parts"]
     loss_term: Annotated[IntArray, "parts"]
     loss_stiffness: Annotated[FloatArray, "parts", "triangle"]
+    size: Annotated[float, float_info.min, inf]
+    load_controls: tuple[str, ...]
+    load_change_kinds: tuple[str, ...]
+    load_change_axes: tuple[str, ...]
+    load_changes: Annotated[FloatArray, "changed loads", "whole"]
+    across_output: Annotated[FloatArray, 2, "gauges across", "whole"]
     change_errors: Annotated[FloatArray, "changes"]
 
     def _axis_lengths(self) -> dict[str, int]:
@@ -135,6 +159,7 @@ class ChangeableModel(ReducedModel):
         places = len(self.supports) + len(self.mass_places) + len(self.loss_places)
         return super()._axis_lengths() | {
             "masses added": len(self.mass_places),
+            "changed loads": len(self.load_controls),
             "triangle": size * (size + 1) // 2,
             "changes": places,
         }
@@ -174,6 +199,33 @@ class ChangeableModel(ReducedModel):
                 remaining[number] = remaining.get(number, 1.0) * (1.0 - primitive.loss)
         losses = {number: 1.0 - fraction for number, fraction in remaining.items()}
         return StructuralChanges(compliances, masses, losses)
+
+    def changed_load(
+        self, load: FloatArray, control: str, patch: Iterable[Primitive]
+    ) -> FloatArray:
+        """Return the load (n,) of a control as a patch moves and turns its force.
+
+        Parameters
+        ----------
+        load : (n,) array
+            The load per unit of the control.
+        control : str
+            The control.
+        patch : iterable of Primitive
+            The patch, whose `LoadOffset` and `LoadTilt` of this control act.
+        """
+        names = list(
+            zip(self.load_controls, self.load_change_kinds, self.load_change_axes, strict=True)
+        )
+        for primitive in patch:
+            if isinstance(primitive, LoadOffset) and primitive.control == control:
+                number = names.index((control, "offset", primitive.axis))
+                load = load + primitive.distance * self.load_changes[number]
+            elif isinstance(primitive, LoadTilt) and primitive.control == control:
+                number = names.index((control, "tilt", primitive.axis))
+                across = self.load_changes[number]
+                load = np.cos(primitive.angle) * load + np.sin(primitive.angle) * across
+        return load
 
     def _place_number(self, places: tuple[str, ...], place: str, what: str) -> int:
         """Return the number of a place; raise `InvalidPatchError` without one."""

@@ -130,6 +130,22 @@ class LoadPlace(Primitive):
     along_chord: Annotated[float, "m"]
 
 
+class LoadOffset(Primitive):
+    """The force of a `control` of a structure acts by `distance` along an axis from its place."""
+
+    control: str
+    axis: str
+    distance: Annotated[float, "m"]
+
+
+class LoadTilt(Primitive):
+    """The force of a `control` of a structure is turned by `angle` towards an axis."""
+
+    control: str
+    axis: str
+    angle: Annotated[float, "rad"]
+
+
 class LoadGain(Primitive):
     """While a force is applied, (1 + `gain`) times the recorded force plus `tare` [N] acts."""
 
@@ -175,7 +191,7 @@ STRUCTURE = (
 """Primitives that change the linear structure, which must be solved anew."""
 INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
-LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
+LOADS = (LoadPlace, LoadOffset, LoadTilt, LoadGain, Washout, InertiaRelief)
 """Primitives that change the known loads."""
 SENSORS = (
     SensorGain,

@@ -1,10 +1,11 @@
-"""Places of a structure where a mass may be added or lost, and patches that may lose stiffness.
+"""What may differ from a structure file: masses, stiffness of patches, loads, and gauges.
 
-They are hypotheses, and no part of the structure file: the sets that the mesh names, and a grid
-that is fine enough to say where an engineer has to look.
+They are hypotheses, and no part of the structure file. Places are the sets that the mesh names, and
+a grid that is fine enough to say where an engineer has to look.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,15 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.errors import InvalidDesignError
 
 from .affine import AffineStructure
+from .design import MeshLoad
+from .gauges import gauge_rows
 from .matrices import MatrixStructure
 from .matrix_design import MatrixLoad, MatrixMass, NodeOutput
 from .mesh import StructureMesh
-from .nodal_loads import set_weights
+from .nodal_loads import force_weights, point_weights, set_weights
 from .operators import Structure
 
 GRID_POINTS = 12
@@ -28,6 +32,12 @@ LEAST_DISTANCE = 0.1
 """Least distance of points of a grid, and of middles of its patches, over the size of the mesh."""
 LARGEST_RADIUS = 0.12
 """Radius of a named set of cells, over the size of the mesh, up to which it is a patch."""
+AXES = ("x", "y", "z")
+"""Names of the axes."""
+LEAST_SINE = 0.1
+"""Sine of the angle between a force and an axis below which it is not tilted towards the axis."""
+OFFSET_STEP = 0.01
+"""Step of the place of a force over the size of the mesh, for its derivative."""
 SETS_OF_THE_MESHER = "gmsh:"
 """Begin of the names of sets that a mesher makes, and no engineer."""
 
@@ -168,3 +178,90 @@ def loss_places(structure: AffineStructure) -> list[LossPlace]:
                 terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
         places.append(LossPlace(name, terms))
     return places
+
+
+class LoadChange(NamedTuple):
+    """How a force changes with its place or its direction.
+
+    Attributes
+    ----------
+    control : str
+        The control of the force.
+    change : str
+        "offset" of its place or "tilt" of its direction.
+    axis : str
+        The axis along which it is offset, or towards which it is tilted.
+    vector : (n,) array
+        Change of the load per unit of the control, and per metre or radian.
+    """
+
+    control: str
+    change: str
+    axis: str
+    vector: FloatArray
+
+
+def load_changes(structure: AffineStructure) -> list[LoadChange]:
+    """Return the changes of the forces of a mesh that controls in newtons set.
+
+    A force at a point may act beside it, on the surface and inside; each force may have another
+    direction.
+    """
+    if not isinstance(structure, Structure):
+        return []
+    mesh = structure.mesh
+    found = []
+    for label, load in structure.design.numbered("load"):
+        if load.force is None or structure.control_units.get(load.control or "") != "N":
+            continue
+        force = np.asarray(load.force)
+        weights = force_weights(mesh, load, label)
+        for axis, direction in zip(AXES, np.eye(3), strict=True):
+            across = direction - force * (force @ direction) / (force @ force)
+            length = float(np.linalg.norm(across))
+            if length > LEAST_SINE:
+                tilted = np.linalg.norm(force) * across / length
+                vector = structure.expansion.T @ np.outer(weights, tilted).ravel()
+                found.append(LoadChange(load.control, "tilt", axis, vector))
+            gradient = _gradient_of_weights(mesh, load, direction, label)
+            if gradient is not None:
+                vector = structure.expansion.T @ np.outer(gradient, force).ravel()
+                found.append(LoadChange(load.control, "offset", axis, vector))
+    return [change for change in found if np.any(change.vector)]
+
+
+def _gradient_of_weights(
+    mesh: StructureMesh, load: MeshLoad, direction: FloatArray, label: str
+) -> FloatArray | None:
+    """Return the change (nodes,) of the weights of a load per metre; None off the structure."""
+    if load.point is None:
+        return None
+    step = OFFSET_STEP * mesh.size
+    sides = []
+    for sign in (1.0, -1.0):
+        point = np.asarray(load.point) + sign * step / mesh.unit * direction
+        with suppress(InvalidDesignError):
+            sides.append((sign, point_weights(mesh, tuple(point.tolist()), label)))
+    if not sides:
+        return None
+    if len(sides) == 1:
+        sides.append((0.0, point_weights(mesh, load.point, label)))
+    (first_sign, first), (second_sign, second) = sides
+    return np.asarray((first - second) / (step * (first_sign - second_sign)))
+
+
+def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
+    """Return rows (G, n) of the strains across the gauges of a mesh, and of the shear strains.
+
+    With the strain e45 halfway between both directions the shear is 2 e45 - e - e_across.
+    """
+    if not isinstance(structure, Structure):
+        no_rows = sparse.csr_array((0, structure.unknowns))
+        return [no_rows, no_rows]
+    along = structure.gauge_output
+    rows = []
+    for turn in (0.5 * np.pi, 0.25 * np.pi):
+        turned, _ = gauge_rows(structure.mesh, structure.design.gauge, turn)
+        rows.append((turned @ structure.expansion).tocsr())
+    across, halfway = rows
+    return [across, (2.0 * halfway - along - across).tocsr()]

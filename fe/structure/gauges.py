@@ -48,7 +48,7 @@ class _GaugeStrain(NamedTuple):
 
 
 def gauge_rows(
-    mesh: StructureMesh, gauges: tuple[Gauge, ...]
+    mesh: StructureMesh, gauges: tuple[Gauge, ...], turn: float = 0.0
 ) -> tuple[sparse.csr_array, FloatArray]:
     """Return the strains of gauges as rows on the displacements.
 
@@ -62,6 +62,9 @@ def gauge_rows(
         The mesh, with its nodes in metres.
     gauges : tuple of Gauge
         The strain gauges, with point, direction, length and width.
+    turn : float
+        Angle in the surface from the direction of each gauge to that of the strain, about the
+        outward normal [rad].
 
     Returns
     -------
@@ -88,7 +91,9 @@ def gauge_rows(
         if gauge.length or gauge.width:
             surface_points = _averaging_points(mesh, gauge, point, direction, middle.normal, where)
         for surface_point in surface_points:
-            local_direction = _projected_direction(direction, surface_point.normal, where)
+            along = _projected_direction(direction, surface_point.normal, where)
+            across = np.cross(surface_point.normal, along)
+            local_direction = np.cos(turn) * along + np.sin(turn) * across
             # the mean of the points, and of the cells that meet at each of them
             cell_count = len(surface_point.cell)
             weight = 1.0 / (len(surface_points) * cell_count)

@@ -101,7 +101,7 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
         surface = mesh.faces_of(str(load.set), where)
         area_vectors = face_areas(mesh, surface).vectors
         return -load.pressure * area_vectors  # area vectors point outwards
-    weights = _force_weights(mesh, load, where)
+    weights = force_weights(mesh, load, where)
     return np.outer(weights, np.asarray(load.force))
 
 
@@ -126,10 +126,10 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     InvalidDesignError
         If the point of the port lies outside.
     """
-    return np.outer(_force_weights(mesh, port, where), unit_vector(port.direction))
+    return np.outer(force_weights(mesh, port, where), unit_vector(port.direction))
 
 
-def _force_weights(mesh: StructureMesh, part: MeshLoad | MeshPort, where: str) -> FloatArray:
+def force_weights(mesh: StructureMesh, part: MeshLoad | MeshPort, where: str) -> FloatArray:
     """Return the weights (nodes,) of nodes in a force at a point or on a set; their sum is one."""
     if part.point is not None:
         return point_weights(mesh, part.point, where)

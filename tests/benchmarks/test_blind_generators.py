@@ -27,7 +27,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from fe.full.factorisation import lowest_eigenpairs
 from fe.runtime.patch import ModelPatch
 from fe.wing.operators import point_masses, section_displacement

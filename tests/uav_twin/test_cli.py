@@ -475,7 +475,7 @@ def test_records_show_what_tells_them_apart(shown_records):
 def test_models_of_wings_and_fmus_show_themselves_as_all_models_do():
     from discrepancy.fmu_models.model import FmuModel
     from discrepancy.system.interface import Model
-    from discrepancy.system.structures import WingModel
+    from discrepancy.system.wing_model import WingModel
 
     assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 

@@ -415,6 +415,7 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
 # ---------------------------------------------------------------- on lumped models
 
 WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief", "added_mass"}
+OF_OTHERS = WITHOUT_STATION | {"load_offset", "load_direction"}
 OF_STORES = {"outflow", "overflow"}
 
 
@@ -424,7 +425,11 @@ def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
     reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
     absent = {name for name, reason in reasons.items() if reason is not None}
-    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock", "sensor_lag", *REGION_LOSSES}
+    assert absent == OF_OTHERS | OF_STORES | WARM | {
+        "logger_clock",
+        "sensor_lag",
+        *REGION_LOSSES,
+    }
     assert (
         reasons["region_stiffness_loss"] == "The model 'Three-mass chain with a joint' has no damage region."
     )

@@ -44,7 +44,7 @@ from discrepancy.report.sizes import si_sizes
 from discrepancy.report.tables import detectable_sizes_table, parameter_rows
 from discrepancy.report.text import formula, number
 from discrepancy.report.verdict_sentences import error_sentence, headline, proof_scores, remainders_sentence
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from discrepancy.verdict import NotFitted, RemainderEstimate, Verdict, VerdictKind
 from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
 from fe.runtime import patch as patches

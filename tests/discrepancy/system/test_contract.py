@@ -19,9 +19,10 @@ from discrepancy.system.interface import Model
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.scales import Scales
-from discrepancy.system.structures import StructureModel, WingModel
+from discrepancy.system.structures import StructureModel
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import SystemState
+from discrepancy.system.wing_model import WingModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import PRIMITIVES, FreePlay, LoadPlace, PointMass, PowerDamping, PowerStiffness

@@ -16,7 +16,7 @@ from discrepancy.model_choice import choose_model
 from discrepancy.sources.examples import example_campaign, usual_plan
 from discrepancy.system.load_change import DEFAULT_PLACE
 from discrepancy.system.names_of_model import campaign_in_names_of
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_model

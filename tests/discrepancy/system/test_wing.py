@@ -17,9 +17,10 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.model import FmuModel
-from discrepancy.system.structures import StructureModel, WingModel
+from discrepancy.system.structures import StructureModel
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import SystemState
+from discrepancy.system.wing_model import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import cache_file
 from fe.reduction.reduced_basis import reduce_structure

@@ -17,6 +17,8 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
+    LoadOffset,
+    LoadTilt,
     ModelPatch,
     PlaceMass,
     Primitive,
@@ -358,3 +360,60 @@ def test_patches_do_not_overlap_and_leave_out_damage_regions(slender: Yielding) 
     outside = sum(term.matrix for term in terms if term.region is None)
     difference = (patches - outside)[free, free]
     assert abs(difference).max() < 1e-9 * abs(outside).max()
+
+
+# ---------------------------------------------------------------- loads and gauges
+
+
+def pushed_outputs(made: Yielding, *primitives: Primitive) -> FloatArray:
+    """Return strains and displacements under 50 N of the control "push", as a patch changes it."""
+    model = made.model
+    of_push = model.load_factors[:, 0] == 1 + model.controls.index("push")
+    load = 50.0 * model.changed_load(model.whole_load[of_push].sum(axis=0), "push", primitives)
+    static_count = len(model.gauges) + len(model.displacements)
+    return np.asarray(model.whole_output[:static_count] @ made.changed().static(load))
+
+
+@pytest.mark.parametrize(
+    ("primitive", "point", "force"),
+    [
+        (LoadOffset("push", "x", 5e-4), [60.5, 10.0, 10.0], [0.0, 0.0, 1.0]),
+        (LoadTilt("push", "y", 0.1), [60.0, 10.0, 10.0], [0.0, np.sin(0.1), np.cos(0.1)]),
+    ],
+)
+def test_a_load_that_is_moved_or_turned_is_that_of_another_file(
+    write_beam: WriteBeam,
+    tmp_path: Path,
+    propped: Yielding,
+    primitive: Primitive,
+    point: list[float],
+    force: list[float],
+) -> None:
+    moved = f"point = {point}, force = {[float(part) for part in force]}"
+    changes = {
+        CLAMP_AT_ROOT: PROPPED,
+        'set = "end", force = [0, 0, 1]': moved,
+        "point = [100, 10, 5]": "point = [70, 10, 5]",
+    }
+    other = assemble_structure(write_beam(tmp_path, changes))
+    load = other.load("pushed", 1.0)
+    displacements = Factorisation(other.stiffness()).solve(50.0 * load)
+    rows = np.concatenate((other.gauge_output.toarray(), other.displacement_output.toarray()))
+    expected = rows @ displacements
+    plain, changed = pushed_outputs(propped), pushed_outputs(propped, primitive)
+    assert np.abs(changed - expected)[:3].max() < 0.02 * np.abs(plain[:3]).max()
+    assert changed[3] == pytest.approx(expected[3], rel=5e-3)
+    change = np.abs(expected - plain).max()
+    assert np.abs(changed - expected).max() < 0.35 * change  # the first derivative on a coarse mesh
+
+
+def test_a_strain_across_a_gauge_is_that_of_poisson(flanged: Yielding) -> None:
+    """Of a beam in bending it is minus 0.33 times the strain along it, without shear."""
+    model = flanged.model
+    displacements = flanged.changed().static(
+        model.whole_load.T @ model.load_coefficients(model.vector(PUSH))
+    )
+    along = model.whole_output[:1] @ displacements
+    across, shear = model.across_output[:, 0] @ displacements
+    assert across == pytest.approx(-0.33 * along[0], rel=0.1)
+    assert abs(shear) < 0.02 * abs(along[0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.system.response import ACROSS, Conditions
-from discrepancy.system.structures import WingModel
+from discrepancy.system.wing_model import WingModel
 from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
