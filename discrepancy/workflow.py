@@ -70,6 +70,8 @@ if TYPE_CHECKING:  # it takes long to import
 DRAWS = 400
 CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
 """Verdicts after which no experiment is proposed."""
+KINDS_OF_NOISE_ALONE = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Verdicts on effects whose simulation leaves only noise."""
 
 
 @dataclass(frozen=True)
@@ -287,17 +289,20 @@ def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
 
 
 def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) -> bool:
-    """Return whether the effects of a verdict are laws that act throughout and leave no force.
+    """Return whether the effects of a verdict act throughout and leave no force at the ports.
 
-    The simulation of an effect that is named leaves only noise. Otherwise, the estimate with the
-    missing force tells.
+    One of them is a law at a port. The simulation of effects that are named, or that are a member
+    of a group, leaves only noise. Otherwise, the estimate with the missing force tells.
     """
-    for term in fit.candidate.terms:
-        if term.place not in search.problem.model.ports or term.effect.variant_of:
-            return False
+    terms = fit.candidate.terms
+    has_law = any(term.place in search.problem.model.ports for term in terms)
+    acts_throughout = not any(term.effect.variant_of for term in terms)
+    if not has_law or not acts_throughout:
+        return False
+    if verdict.kind in KINDS_OF_NOISE_ALONE:
+        return True
     estimate = search.estimate_of(fit.candidate)
-    is_estimate_complete = estimate is not None and estimate.leaves_no_force
-    return verdict.kind is VerdictKind.NAMED or is_estimate_complete
+    return estimate is not None and estimate.leaves_no_force
 
 
 def _remarks(

@@ -392,7 +392,9 @@ def effects_text(effects: Iterable[NamedEffect]) -> str:
     for effect in effects:
         text = effect.name
         if effect.shape:
-            shape = ", ".join(f"{item.name} {item.value:.2g}" for item in effect.shape)
+            shape = ", ".join(
+                f"{item.name.replace('_', ' ')} {item.value:.2g}" for item in effect.shape
+            )
             text = f"a law of the family {effect.family} ({shape})"
         texts.append(f"{text} at {effect.place}" if effect.place else text)
     return listing(dict.fromkeys(texts))
