@@ -10,7 +10,7 @@ limit, which were needless, the changes of control, and the flights with an alar
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,12 +21,17 @@ from benchmarks.studies.learning import SOFTENING, third_region
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from reporting.arrays import Index
-from twin_master.assets.asset_source import Asset
+from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.mission.loop import operate
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import AssetsSideBySide, Flights, TwinsSideBySide
+from twin_master.mission.side_by_side import (
+    AssetsSideBySide,
+    Flights,
+    TwinsSideBySide,
+    fly_one_by_one,
+)
 from twin_master.mission.steps import Reading, Source
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
@@ -37,6 +42,7 @@ Float = NDArray[np.float64]
 SCENARIO = "level_turns"
 BEGINS = 10
 """First step with a fault, of those that do not exist from the start."""
+LOAD_FACTOR_OF_SHARP_TURN = 3.0
 MOST_STRAINED = 16
 """Index of gauge 17, whose strain is the largest."""
 TOGETHER = 40
@@ -165,6 +171,34 @@ def faults(gauges: int) -> dict[str, Fault]:
     }
 
 
+class FaultyAsset(Asset):
+    """An asset of a single flight, whose gauges have a fault.
+
+    Parameters
+    ----------
+    asset : Asset
+        The asset without the fault.
+    gauge_fault : callable
+        The fault, see `GaugeFault`.
+    seed : int
+        The seed of the flight.
+    """
+
+    def __init__(self, asset: Asset, gauge_fault: GaugeFault, seed: int) -> None:
+        self._asset = asset
+        self._gauge_fault = gauge_fault
+        self._seeds = np.array([seed])
+        self._step = 0
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Return the reading under control and health, as the gauges indicate it."""
+        reading = self._asset.step(control, health)
+        is_sharp = np.array([control["load_factor"] == LOAD_FACTOR_OF_SHARP_TURN])
+        flown_step = FlownStep(self._seeds, self._step, is_sharp, reading.values[None])
+        self._step += 1
+        return replace(reading, values=self._gauge_fault(flown_step)[0])
+
+
 class FaultyGauges(Source[TwinsSideBySide]):
     """The source of the readings of gauges with a fault."""
 
@@ -232,6 +266,13 @@ def fly_with_fault(
 ) -> Flights:
     """Return the flights of all seeds with a fault of the gauges."""
     scenario = knowledge.scenario
+    if scenario.learning is not None:  # twins that learn fly one by one
+        truths = [knowledge.truth(seed) for seed in seeds.tolist()]
+        return fly_one_by_one(
+            knowledge,
+            truths,
+            lambda number, _previous: FaultyAsset(asset, gauge_fault, int(seeds[number])),
+        )
     sharp = scenario.control_names.index("3g")
     formations = []
     for first in range(0, len(seeds), TOGETHER):
@@ -279,9 +320,9 @@ def errors_of(knowledge: Knowledge, flights: Flights) -> FlightErrors:
     )
 
 
-def scenario_of(policy: str) -> Scenario:
-    """Return the scenario of the study with a policy."""
-    scenario = load_scenario(SCENARIO).scenario
+def scenario_of(name: str, policy: str) -> Scenario:
+    """Return a scenario of the study with a policy."""
+    scenario = load_scenario(name).scenario
     if policy == WITHOUT_NOTICES:
         return scenario.model_copy(update={"notice": None})
     return scenario if policy == "paper" else scenario.with_policy(policy)
@@ -292,6 +333,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=80)
     parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--scenario", default=SCENARIO, help="level_turns_learning: twins learn")
     parser.add_argument("--only", help="numbers of faults from 0, with commas")
     parser.add_argument("--policies", help='with semicolons, such as "paper; risk 0.02, hold 3"')
     arguments = parser.parse_args()
@@ -309,7 +351,7 @@ def main() -> int:
     )
     for name, fault in named_faults:
         for policy in policies:
-            scenario = scenario_of(policy)
+            scenario = scenario_of(arguments.scenario, policy)
             scenario = scenario.with_changes("truth", sensor_faults=fault.sensor_faults)
             source = ReducedModelSource(scenario, wing)
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
