@@ -210,7 +210,7 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
     if not isinstance(structure, Structure):
         return []
     mesh = structure.mesh
-    found = []
+    changes = []
     for label, load in structure.design.numbered("load"):
         if load.force is None or structure.control_units.get(load.control or "") != "N":
             continue
@@ -222,12 +222,12 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
             if length > LEAST_SINE:
                 tilted = np.linalg.norm(force) * across / length
                 vector = structure.expansion.T @ np.outer(weights, tilted).ravel()
-                found.append(LoadChange(load.control, "tilt", axis, vector))
+                changes.append(LoadChange(load.control, "tilt", axis, vector))
             gradient = _gradient_of_weights(mesh, load, direction, label)
             if gradient is not None:
                 vector = structure.expansion.T @ np.outer(gradient, force).ravel()
-                found.append(LoadChange(load.control, "offset", axis, vector))
-    return [change for change in found if np.any(change.vector)]
+                changes.append(LoadChange(load.control, "offset", axis, vector))
+    return [change for change in changes if np.any(change.vector)]
 
 
 def _gradient_of_weights(
