@@ -619,10 +619,10 @@ STATIC_SETTING = kit.chain_bench(amplitudes=()).setting
 @pytest.mark.parametrize("kind", [VerdictKind.NAMED, VerdictKind.GROUP])
 def test_a_verdict_says_last_which_look_alikes_cannot_be_tested(kind):
     verdict = replace(verdict_on("gauge_gain", kind=kind), sentence="A gain is wrong.")
+    untested = kit.chosen("local_stiffness_loss", "region_stiffness_loss", "gauge_misalignment")
+    first, second, third = [effect.name for effect in untested]
     assert verdict_with_untested_effects(verdict, STATIC_SETTING, kit.CATALOGUE).sentence == (
-        "A gain is wrong. Not excluded, because they cannot be tested here: stiffness loss "
-        "outside the modelled regions, stiffness loss of a damage region and misalignment of a "
-        "gauge."
+        f"A gain is wrong. Not excluded, because they cannot be tested here: {first}, {second} and {third}."
     )
 
 
