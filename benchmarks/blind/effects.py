@@ -136,7 +136,7 @@ def point_mass(generator: np.random.Generator, bench: Bench) -> Hidden:
     )
 
 
-def root_compliance(generator: np.random.Generator, bench: Bench) -> Hidden:
+def support_compliance(generator: np.random.Generator, bench: Bench) -> Hidden:
     arm = bench.length - 0.05
     compliance = log_uniform(generator, 0.02, 0.3) * bench.compliance / arm**2
     return Hidden(
@@ -499,7 +499,7 @@ DRAWS: dict[str, Draw] = {
     draw.__name__: draw
     for draw in (
         point_mass,
-        root_compliance,
+        support_compliance,
         local_stiffness_loss,
         temperature_dependent_modulus,
         stiffness_drift,

@@ -257,7 +257,8 @@ def write_short_report(folder: Path) -> Path:
 
 
 def test_a_run_has_all_groups_and_the_time_of_its_steps(finished):
-    groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
+    beliefs = {"filtered", "smoothed", "predicted"}
+    groups = beliefs | {"observed", "policy", "calibration", "truth", "notice", "earned"}
     timing = json.loads((finished / "timing.json").read_text(encoding="utf-8"))
     assert {*open_run(finished).children} == groups
     assert timing["steps"] == 50

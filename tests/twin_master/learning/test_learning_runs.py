@@ -455,7 +455,8 @@ def test_the_console_says_that_a_gauge_shows_what_no_state_can_show(noticed):
 
 def test_the_summary_has_the_notices_of_both_gauges(noticed):
     of_gauges = {(notice["kind"], *notice["sensors"]) for notice in noticed.notices}
-    assert {notice["kind"] for notice in noticed.notices} == {"gauge_left_out", "alarm", "hypothesis"}
+    kinds = {notice["kind"] for notice in noticed.notices}
+    assert kinds == {"gauge_left_out", "alarm", "hypothesis", "advice"}
     assert of_gauges >= {("gauge_left_out", 12), ("alarm", 5)}
 
 
