@@ -192,9 +192,8 @@ class MotionEstimator:
             The estimate; None if the laws are not possible.
         """
         best_estimate: Estimate | None = None
-        speed_window = WINDOW_AT_REST if laws.hold_at_rest else USUAL_WINDOW
         for _ in range(MOST_FOLLOWED_FORCES):
-            estimate = self.gauss_newton.iterate_along_laws(laws, start, speed_window)
+            estimate = self.estimate_along_laws(laws, start)
             if estimate is None or _more_probable(best_estimate, estimate) is best_estimate:
                 break
             best_estimate = estimate
@@ -205,6 +204,14 @@ class MotionEstimator:
                 break
             start = replace(start_from_estimate(estimate), processes=processes)
         return best_estimate
+
+    def estimate_along_laws(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
+        """Return an estimate along the motion of the laws alone, with given missing forces.
+
+        The result is None if the laws are not possible.
+        """
+        speed_window = WINDOW_AT_REST if laws.hold_at_rest else USUAL_WINDOW
+        return self.gauss_newton.iterate_along_laws(laws, start, speed_window)
 
     def polish(
         self,

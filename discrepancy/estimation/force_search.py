@@ -461,13 +461,18 @@ class ForceSearch:
         """
         base = self.estimate_without_effects
         trials = self.trial_set.trials_about(point)
+        estimator = self.estimator(trials)
         start = replace(
-            start_in_other_trials(base, trials), effect=point.effect, shared=point.shared
+            start_in_other_trials(base, trials),
+            effect=point.effect,
+            shared=point.shared,
+            local=tuple(point.local[number] for number in self.trial_indices),
+            processes=estimator.small_processes,
         )
-        explained = self._estimate_that_leaves_no_force(
-            self.estimator(trials), self.laws(candidate, trials), start
-        )
-        return explained or self.estimate_effects(base, candidate, point.effect)
+        explained = estimator.estimate_along_laws(self.laws(candidate, trials), start)
+        if explained is not None and explained.leaves_no_force:
+            return explained
+        return self.estimate_effects(base, candidate, point.effect)
 
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
