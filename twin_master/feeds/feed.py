@@ -53,4 +53,4 @@ class Feed:
         """Close the file of the feed, if it has one, until the next message is asked for."""
 
     def close(self) -> None:
-        """Release the connection to the publisher of the messages."""
+        """Release the connection to the publisher of the messages, or close the file."""

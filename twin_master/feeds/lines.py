@@ -292,6 +292,10 @@ class GrowingFile(Lines):
             self._note_beginning(piece)
             yield piece or None
 
+    def close(self) -> None:
+        """Close the file; nothing is read any more."""
+        self._file.close()
+
     def release(self) -> None:
         """Close a file that is followed until its next piece is asked for.
 

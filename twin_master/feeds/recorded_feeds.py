@@ -125,6 +125,11 @@ class RecordedFeed(Feed):
         if self.follow and self._lines_of_file is not None:
             self._lines_of_file.release()
 
+    def close(self) -> None:
+        """Close the file, of which no further message is read."""
+        if self._lines_of_file is not None:
+            self._lines_of_file.close()
+
     def read_content(self, content: MessageContent) -> Sequence[Message | Refused]:
         """Return the messages in a line, or the reasons why there are none."""
         return [self.reader.read(content)]

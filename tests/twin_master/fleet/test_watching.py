@@ -1,6 +1,7 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -112,6 +113,16 @@ def test_after_a_kill_each_asset_tells_its_last_decision_again(watched_fleet, tm
 
     FleetWatch(load_fleet(file), out, tell, print).run()
     assert sorted(told) == [(name, True) for name in WINGS]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are those of /proc")
+def test_a_watch_that_ends_before_its_files_closes_them(watched_fleet, tmp_path):
+    file, _ = watched_fleet
+    watch = FleetWatch(load_fleet(file), tmp_path / "out", lambda *_: None, print, steps=1)
+    watch.run()
+    open_files = {os.path.realpath(entry) for entry in Path("/proc/self/fd").iterdir()}
+    assert len(watch.assets) == len(WINGS)
+    assert not [name for name in open_files if name.startswith(str(file.parent / "logs"))]
 
 
 def test_the_folder_of_another_fleet_is_refused(watched_fleet):

@@ -317,6 +317,7 @@ class FleetWatch:
                 fleet_is_locked=True,
             )
         with ExitStack() as closing:
+            closing.callback(feed.close)
             watch = closing.enter_context(watch_context)
             closing.enter_context(watch.begin(feed))
             if isinstance(feed, Topic):
