@@ -35,8 +35,6 @@ LEAST_PROBABILITY = 1e-3
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
-SECOND_SENSOR = "second sensor"
-"""Name of a sensor that is mounted beside another one."""
 COST_OF_SENSOR = 2.0
 """Cost of a trial with one more sensor, which has to be mounted first."""
 LEAST_SINGULAR_VALUE = 1e-6
@@ -139,7 +137,9 @@ def mutual_information(
     trial = proposal.trial
     if proposal.doubled_channel:
         number = problem.channel_names.index(proposal.doubled_channel)
-        problem = problem.with_second_sensor(proposal.doubled_channel, SECOND_SENSOR)
+        problem = problem.with_second_sensor(
+            proposal.doubled_channel, _name_of_second_sensor(proposal.doubled_channel)
+        )
         trial = _with_second_sensor(trial, proposal.doubled_channel)
         recorded_over_actual_noise = np.append(
             recorded_over_actual_noise, recorded_over_actual_noise[number]
@@ -383,9 +383,9 @@ def second_sensor_proposals(problem: Problem, fits: Sequence[CandidateFit]) -> I
         patch = fit.candidate.patch(problem.setting, fit.effect)
         doubtful_channels.update(getattr(item, "channel", "") for item in patch.of(*SENSORS))
     for name in problem.channel_names:
-        if name not in doubtful_channels:
-            continue
         trials = [trial for trial in problem.campaign.trials if name in trial.channels]
+        if name not in doubtful_channels or not trials:
+            continue
         trial = max(trials, key=lambda trial: trial.level)
         yield Proposal(
             trial,
@@ -396,12 +396,17 @@ def second_sensor_proposals(problem: Problem, fits: Sequence[CandidateFit]) -> I
         )
 
 
+def _name_of_second_sensor(channel_name: str) -> str:
+    """Return the name of a sensor that is mounted beside that of a channel."""
+    return f"second sensor beside {channel_name}"
+
+
 def _with_second_sensor(trial: Trial, channel_name: str) -> Trial:
     """Return a trial with a further channel, which has the readings of a channel."""
     column = trial.channels.index(channel_name)
     return replace(
         trial,
-        channels=(*trial.channels, SECOND_SENSOR),
+        channels=(*trial.channels, _name_of_second_sensor(channel_name)),
         values=np.column_stack((trial.values, trial.values[:, column])),
         used=np.column_stack((trial.used, trial.used[:, column])),
     )

@@ -20,6 +20,7 @@ from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.quantity import RewardModel
 from twin_master.network.simulated_missions import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import POLICY_NAMES
 from twin_master.seeds import generator
 
 MISSIONS = 400
@@ -171,6 +172,11 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         if isinstance(content, np.ndarray):  # NPY: a policy by states (S, U)
             return model.policy(content)  # refuses another shape
         stored_policy = _read_belief_policy(content)  # NPZ
+    except FileNotFoundError:
+        raise PlanningError(
+            f"there is no file {path} with a policy: give a file of `uav-twin plan --out`, or a "
+            f"name, which is {POLICY_NAMES}; if it is the copy in a run folder, fly the run again"
+        ) from None
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         # AttributeError: the archive holds a member that is not an array.
         reason = str(error)

@@ -351,6 +351,8 @@ _POLICY_NAME = re.compile(
     r"(?P<policy>mode|qmdp|belief|risk (?P<risk>[0-9.]+))?(?:(?:^|, )hold (?P<hold>[0-9]+))?"
 )
 """The name of a policy, such as "qmdp" or "risk 0.05, hold 3"."""
+POLICY_NAMES = "'mode', 'qmdp', 'belief' or 'risk 0.05', each also with ', hold 3'"
+"""These names, for messages."""
 
 
 def is_policy_name(text: str) -> bool:

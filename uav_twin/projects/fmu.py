@@ -18,7 +18,14 @@ from fmu_asset.packing.script import script_fmu
 from reporting.errors import FileNotWrittenError
 from reporting.words import comma_list
 from scenarios.assets import gear_pump
-from uav_twin.projects.project import Project, filled_in, rounded_to
+from uav_twin.projects.project import (
+    CHECK_MISSION,
+    FLY_MISSION,
+    VIEW_FLIGHT,
+    Project,
+    filled_in,
+    rounded_to,
+)
 
 BINDING_NAME = "binding.toml"
 OBSERVATION = "sensors"
@@ -258,18 +265,9 @@ def fmu_project(name: str, fmu_file: Path | None) -> Project:
                 f"uav-twin fmu check {fmu_file.name} --binding {BINDING_NAME} --cycles 0",
                 "Check the FMU and its binding.",
             ),
-            (
-                "uav-twin scenario check mission.toml",
-                "Check the mission: what flies, and what the twin knows.",
-            ),
-            (
-                "uav-twin run mission.toml --out runs/first",
-                "Fly the mission; the report is runs/first/report.html.",
-            ),
-            (
-                "uav-twin view runs/first",
-                "Look at the flight step by step in the browser; Ctrl-C ends it.",
-            ),
+            CHECK_MISSION,
+            FLY_MISSION,
+            VIEW_FLIGHT,
             (
                 "uav-twin run mission.toml --seeds 0:5 --out runs/many",
                 "Fly it under five seeds, and see what the policy earns.",

@@ -17,7 +17,14 @@ from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import assemble_structure
 from fe.structure.tables import UNITS
 from scenarios import structure_files
-from uav_twin.projects.project import Project, filled_in, rounded_to
+from uav_twin.projects.project import (
+    CHECK_MISSION,
+    FLY_MISSION,
+    VIEW_FLIGHT,
+    Project,
+    filled_in,
+    rounded_to,
+)
 
 STRUCTURE_NAME = "part.toml"
 """The file of the structure."""
@@ -293,18 +300,9 @@ def mesh_project(name: str, mesh_file: Path | None) -> Project:
                 "uav-twin structure info part.toml",
                 "Check the part: mass, frequencies, strains under its loads.",
             ),
-            (
-                "uav-twin scenario check mission.toml",
-                "Check the mission: what flies, and what the twin knows.",
-            ),
-            (
-                "uav-twin run mission.toml --out runs/first",
-                "Fly the mission; the report is runs/first/report.html.",
-            ),
-            (
-                "uav-twin view runs/first",
-                "Look at the flight step by step in the browser; Ctrl-C ends it.",
-            ),
+            CHECK_MISSION,
+            FLY_MISSION,
+            VIEW_FLIGHT,
             (
                 "uav-twin run mission.toml --seeds 0:20 --out runs/many",
                 "Fly it under twenty seeds, and see what the policy earns.",

@@ -10,6 +10,20 @@ from reporting.files import refuse_filled, write_members
 from reporting.folders import whole_folder
 from uav_twin.formats import schema_line
 
+CHECK_MISSION = (
+    "uav-twin scenario check mission.toml",
+    "Check the mission: what flies, and what the twin knows.",
+)
+FLY_MISSION = (
+    "uav-twin run mission.toml --out runs/first",
+    "Fly the mission; the report is runs/first/report.html.",
+)
+VIEW_FLIGHT = (
+    "uav-twin view runs/first",
+    "Look at the flight step by step in the browser; Ctrl-C ends it.",
+)
+"""Commands of every project with a mission, each with what it does."""
+
 
 @dataclass(frozen=True)
 class Project:

@@ -185,6 +185,12 @@ def test_a_file_that_is_no_policy_is_refused(learning_scenario, tmp_path, conten
     assert "pickle" not in sentence
 
 
+def test_a_policy_that_is_neither_file_nor_name_is_refused_with_the_names(learning_scenario, tmp_path):
+    sentence = refused("run", learning_scenario, "--policy", "fast", "--out", tmp_path / "run")
+    assert "there is no file fast with a policy" in sentence
+    assert "'risk 0.05'" in sentence
+
+
 def test_a_run_keeps_the_policy_of_the_file(inspecting_run, inspecting_policy):
     kept = load_knowledge(inspecting_run, read_scenario(inspecting_run)).plan.on_belief
     assert np.array_equal(kept.vectors, inspecting_policy.vectors)
