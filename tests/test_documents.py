@@ -44,6 +44,18 @@ def test_links_lead_somewhere(page):
     assert lost == []
 
 
+def test_each_page_stands_in_a_table_of_contents_of_the_site():
+    docs = ROOT / "docs"
+    listed = {docs / "index.md", FRONT}
+    for page in docs.rglob("*.md"):
+        for contents in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+            for entry in re.findall(r"^[^:\s].*$", contents, re.MULTILINE):
+                folder = docs if entry.startswith("/") or page == FRONT else page.parent
+                target = (folder / entry.lstrip("/")).resolve()
+                listed.update(target.parent.glob(f"{target.name}.*"))
+    assert set(docs.rglob("*.md")) - listed == set()
+
+
 PLAIN = re.compile(rf"{CODE.pattern}|\]\([^)]*\)", CODE.flags)
 TURNED = ("one sees", "the house", "that we know", "believes ours", "gone on with", "elements, please")
 """Turns of other languages that were found once."""
