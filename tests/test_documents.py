@@ -48,7 +48,8 @@ def test_each_page_stands_in_a_table_of_contents_of_the_site():
     docs = ROOT / "docs"
     listed = {docs / "index.md", FRONT}
     for page in docs.rglob("*.md"):
-        for contents in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        text = page.read_text(encoding="utf-8")
+        for contents in re.findall(r"^```{toctree}\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
             for entry in re.findall(r"^[^:\s].*$", contents, re.MULTILINE):
                 folder = docs if entry.startswith("/") or page == FRONT else page.parent
                 target = (folder / entry.lstrip("/")).resolve()
