@@ -334,6 +334,12 @@ def main() -> int:
     parser.add_argument("--flights", type=int, default=80)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--scenario", default=SCENARIO, help="level_turns_learning: twins learn")
+    parser.add_argument(
+        "--saturation",
+        type=float,
+        default=0.0,
+        help="prior probability that gauges saturate, which twins of level_turns_learning learn",
+    )
     parser.add_argument("--only", help="numbers of faults from 0, with commas")
     parser.add_argument("--policies", help='with semicolons, such as "paper; risk 0.02, hold 3"')
     arguments = parser.parse_args()
@@ -353,6 +359,8 @@ def main() -> int:
         for policy in policies:
             scenario = scenario_of(arguments.scenario, policy)
             scenario = scenario.with_changes("truth", sensor_faults=fault.sensor_faults)
+            if arguments.saturation:
+                scenario = scenario.with_changes("learning", saturation=arguments.saturation)
             source = ReducedModelSource(scenario, wing)
             knowledge = prepare_knowledge(scenario, source, scenario.mission.seed)
             flights = fly_with_fault(knowledge, source.open(), fault.gauge_fault, seeds)

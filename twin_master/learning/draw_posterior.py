@@ -42,11 +42,11 @@ def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -
     largest = np.max(log_evidence[np.isfinite(log_evidence)])
     considered = np.flatnonzero(log_evidence >= largest - _LARGEST_LOG_RATIO)
     if len(distinct) < _FEWEST_FOR_SPLINE or len(considered) < 2:
-        return _posterior_of_points(distinct, posterior_weight)
+        return posterior_of_points(distinct, posterior_weight)
     return _interpolated_posterior(distinct, prior_weight, log_evidence, considered)
 
 
-def _posterior_of_points(values: Float, weight: Float) -> Learnt:
+def posterior_of_points(values: Float, weight: Float) -> Learnt:
     """Return mean, standard deviation and quantiles of increasing values (E,) with weights (E,)."""
     mean = float(weight @ values)
     cumulative = np.cumsum(weight)

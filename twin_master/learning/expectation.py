@@ -10,9 +10,11 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from twin_master.learning.learning_filter import LearningFilter, StaticHypotheses
+from twin_master.learning.saturation import LOST_SHARES
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -220,20 +222,18 @@ class LearntExpectation:
         return self._expect(hypotheses, np.ascontiguousarray(weight), controls, observation)
 
     def _draw_weight(self, learnt: Mapping[str, Learnt]) -> Float:
-        """Return weights of the E draws with the learnt mean and deviation of the parameter."""
-        prior_weight = self.learning.sensor_model.draw_weight
+        """Return weights of all draws with the learnt mean and deviation of the parameter.
+
+        If saturation is learnt, its lost share is taken likewise, see `with_saturation`.
+        """
         parameter = self.learning.parameter
-        if parameter is None or parameter.name not in learnt:
-            return prior_weight
-        posterior = learnt[parameter.name]
-        draws = np.asarray(parameter.values, dtype=np.float64)
-        order = np.argsort(draws)
-        offsets_from_mean = np.array([-1.0, 1.0]) * posterior.standard_deviation
-        two_values = posterior.mean + offsets_from_mean
-        # In a linear interpolation between draws the weight of a draw is its hat function: one at
-        # the draw, zero at all others. Each of the two values has the probability one half.
-        hat_functions = np.eye(len(draws))[:, order]
-        return np.array([np.interp(two_values, draws[order], hat).mean() for hat in hat_functions])
+        weight = self.learning.parameter_weight
+        if parameter is not None and parameter.name in learnt:
+            weight = _interpolating_weights(parameter.values, learnt[parameter.name])
+        weight_of_share = np.ones(1)
+        if "saturation" in learnt:
+            weight_of_share = _interpolating_weights(LOST_SHARES, learnt["saturation"])
+        return np.outer(weight_of_share, weight).ravel()
 
     def _gauge_moments(
         self, learnt: Mapping[str, Learnt], name: str, default: float
@@ -346,8 +346,10 @@ class LearntExpectation:
         quantiles = _quantiles_by_state(state_weight, first_moment_by_state, second_moment_by_state)
         lower, upper = np.moveaxis(quantiles, 1, 0)
 
+        # The structure is the same whatever share its sensors lose: see `with_saturation`.
+        draw_of_structure = hypotheses.draw % self.rewards.quantity.draw_count
         reward_mean, reward_standard_deviation = self.rewards.expectation_of(
-            weight, hypotheses.draw, controls, value, value_variance, observation
+            weight, draw_of_structure, controls, value, value_variance, observation
         )
         return Expectation(
             mean=mean + center,
@@ -386,6 +388,20 @@ class LearntExpectation:
             squared_noise_scale * deviation**2, (hypothesis_count, states, control_count, sensors)
         )
         return np.asarray(np.sqrt(weight.reshape(belief_count, -1) @ variance.reshape(-1, sensors)))
+
+
+def _interpolating_weights(points: ArrayLike, posterior: Learnt) -> Float:
+    """Return weights of points (n,) with the mean and standard deviation of a posterior.
+
+    Two values, one standard deviation on either side of the mean and each with the probability one
+    half, are interpolated between the points. The weight of a point is then its hat function: one
+    at the point, zero at all others.
+    """
+    values = np.asarray(points, dtype=np.float64)
+    order = np.argsort(values)
+    two_values = posterior.mean + np.array([-1.0, 1.0]) * posterior.standard_deviation
+    hat_functions = np.eye(len(values))[:, order]
+    return np.array([np.interp(two_values, values[order], hat).mean() for hat in hat_functions])
 
 
 def _insert_state_and_control(values: Float) -> Float:

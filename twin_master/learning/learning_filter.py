@@ -1,8 +1,8 @@
 """The filter that learns: static hypotheses as an axis of the belief, gauges by regression.
 
-A static hypothesis k is a draw of the calibrated parameter and a factor on the transition
-probabilities; neither changes in time. Each hypothesis has a filter of its own over the states, and
-its weight is its evidence:
+A static hypothesis k is a draw of the calibrated parameter, the share that the sensors lose to
+soft saturation, and a factor on the transition probabilities; none of them changes in time. Each
+hypothesis has a filter of its own over the states, and its weight is its evidence:
 
     p(D_t, k | o_0..o_t) ~
         p(o_t | D_t, k, o_0..o_t-1) sum over i of T_k[i, D_t] p(D_t-1 = i, k | o_0..o_t-1),
@@ -10,8 +10,8 @@ its weight is its evidence:
 which is exact: D_t is the state in step t, o_t the observation, and T_k the transitions. The
 offset, gain and noise scale of a gauge, given the hypothesis, are learnt by a `GaugeRegression`.
 
-The axes of arrays are n or T steps, K hypotheses, E draws of the parameter, S states, U controls
-and G gauges.
+The axes of arrays are n or T steps, K hypotheses, E draws of the parameter, N lost shares, S
+states, U controls and G gauges.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,9 +23,21 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation
-from twin_master.learning.draw_posterior import INTERVAL, posterior_of_draws
+from twin_master.learning.draw_posterior import (
+    INTERVAL,
+    posterior_of_draws,
+    posterior_of_points,
+)
 from twin_master.learning.regression import SUM_COUNT, GaugeFit, GaugeReadings, GaugeRegression
-from twin_master.network.estimator import Carried, Estimate, Learnt
+from twin_master.learning.saturation import LOST_SHARES, with_saturation
+from twin_master.network.estimator import (
+    BELIEVED,
+    Carried,
+    Estimate,
+    Learnt,
+    Notice,
+    NoticeWording,
+)
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -54,7 +66,8 @@ class StaticHypotheses:
     weight : (K, S) array
         The belief p(D, k | observations).
     draw : (K,) array
-        The index of the draw of each hypothesis.
+        The index of the draw of each hypothesis, n E + e for the lost share n and the draw e of
+        the parameter.
     offset : (K, G) array
         The posterior mean of each offset given the hypothesis, SI.
     gain : (K, G) array
@@ -87,7 +100,8 @@ class LearningFilter:
     model : GraphicalModel
         S states, U controls; the twin predicts and plans with its transitions.
     sensor_model : GaussianSensorModel
-        Predictions (E, S, U, G), weights of the draws, and the assumed noise.
+        Predictions (E, S, U, G), weights of the draws, and the assumed noise. If saturation is
+        learnt, the attribute of that name has N E draws, see `with_saturation`.
     settings : Learning
         The priors of the gauges; the factors on transitions are those of `transitions`.
     draws : (str, (E,) array), optional
@@ -100,6 +114,18 @@ class LearningFilter:
         The name of the twin, for messages.
     sensor_units : sequence of str, optional
         The unit of each sensor; "1" if left out.
+    words : NoticeWording, optional
+        How notices speak of steps and sensors.
+
+    Attributes
+    ----------
+    parameter_weight : (E,) array
+        The prior probability of each draw of the parameter.
+
+    Raises
+    ------
+    InvalidModelError
+        If saturation is to be learnt of sensors whose noise is not Gaussian.
     """
 
     def __init__(
@@ -111,18 +137,27 @@ class LearningFilter:
         transitions: Mapping[float, TransitionModel] | None = None,
         name: str = "twin",
         sensor_units: Sequence[str] = (),
+        words: NoticeWording | None = None,
     ) -> None:
         transitions = transitions or {1.0: model.transition}
+        self._units = sensor_units or ("1",) * sensor_model.sensor_count
+        self.parameter_weight = sensor_model.draw_weight  # (E,)
+        self._lost_shares = LOST_SHARES[:1]
+        if settings.saturation > 0.0:
+            self._lost_shares = LOST_SHARES
+            sensor_model = with_saturation(
+                sensor_model, model.prior, settings.saturation, self._units
+            )
         self.model = model
         self.sensor_model = sensor_model
+        self._words = words or NoticeWording()
         self.parameter = None if draws is None else ParameterDraws(*draws)
         self._name = name
-        self._units = sensor_units or ("1",) * sensor_model.sensor_count
         self._transition_factors = np.array(list(transitions))
 
-        # Hypothesis k is draw k % E with factor k // E. The transitions of all factors stand one
-        # after the other as further controls, so that one loop advances all hypotheses: control u
-        # of a hypothesis is the row u + `_control_offset` of the stacked tables.
+        # Hypothesis k is draw k % (N E) with factor k // (N E). The transitions of all factors
+        # stand one after the other as further controls, so that one loop advances all hypotheses:
+        # control u of a hypothesis is the row u + `_control_offset` of the stacked tables.
         factor_count = len(transitions)
         blocks_by_factor = [transition.blocks for transition in transitions.values()]
         stacked_blocks = tuple(
@@ -157,7 +192,7 @@ class LearningFilter:
         """Advance the joint belief to step t, and correct it by an observation.
 
         Parameters and errors are those of `Estimator.step`. `learnt` of the estimate holds by name
-        the parameter, `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]` and
+        the parameter, `saturation`, `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]` and
         `gauge_offset[g]` for the sensors g from 1.
         """
         sensor_values, other_log_density = self.sensor_model.split_observation(observation)
@@ -202,7 +237,40 @@ class LearningFilter:
             log_evidence=log_evidence,
             carried=Carried(control_index, arrays),
             learnt=self._learnt_quantities(joint_belief.sum(axis=1), regression_sums, count),
+            notices=self._saturation_notices(np.exp(forecast), joint_belief, step),
         )
+
+    def _saturation_notices(
+        self, forecast: Float, joint_belief: Float, step: int
+    ) -> tuple[Notice, ...]:
+        """Return the notice that saturation is believed since this step, or is not any more.
+
+        Parameters
+        ----------
+        forecast, joint_belief : (K, S) array
+            The belief before and after the observation of the step.
+        step : int
+            The number of the step.
+        """
+        before, after = (
+            float(self._weight_of_shares(belief.sum(axis=1))[1:].sum())
+            for belief in (forecast, joint_belief)
+        )
+        if (before > BELIEVED) == (after > BELIEVED):
+            return ()
+        if after > BELIEVED:
+            finding = (
+                f"large readings of all {self._words.sensor}s are too small, as if they saturated "
+                f"softly (probability {after:.3g}): the belief corrects them"
+            )
+        else:
+            finding = f"the {self._words.sensor}s do not saturate (probability {1.0 - after:.3g})"
+        return (Notice("hypothesis", f"{self._words.step.capitalize()} {step}: {finding}."),)
+
+    def _weight_of_shares(self, weight: Float) -> Float:
+        """Return the probability of each lost share (N,), given that of each hypothesis (K,)."""
+        by_share = weight.reshape(len(self._transition_factors), len(self._lost_shares), -1)
+        return np.asarray(by_share.sum(axis=(0, 2)))
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
         """Return belief, regression sums and counts before the observation of a step.
@@ -319,18 +387,17 @@ class LearningFilter:
     def _with_prior_draw_weights(self, log_belief: Float) -> Float:
         """Return a log belief (K, S) in which the draws have their prior weights again.
 
-        This averages over the draws anew. The belief over states given a transition factor becomes
-        the same for all draws; the weights of the transition factors stay as they are.
+        This averages over the draws anew. The belief over states given a transition factor and a
+        lost share becomes the same for all draws of the parameter; the weights of the transition
+        factors and of the lost shares stay as they are.
         """
-        factor_count = len(self._transition_factors)
-        by_factor = log_belief.reshape(factor_count, -1, log_belief.shape[1])  # (factors, E, S)
-        draw_count = by_factor.shape[1]
-        log_belief_of_factor = np.logaddexp.reduce(by_factor, axis=1)
-        log_factor_belief = np.repeat(log_belief_of_factor, draw_count, axis=0)  # (K, S)
-        # The prior weight of a hypothesis is p(draw) / (number of factors).
-        return np.asarray(
-            log_factor_belief + self._log_prior_weight[:, None] + np.log(factor_count)
-        )
+        draw_count = len(self.parameter_weight)
+        by_draw = log_belief.reshape(-1, draw_count, log_belief.shape[1])
+        log_belief_of_others = np.logaddexp.reduce(by_draw, axis=1)
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(self.parameter_weight)
+        averaged = log_belief_of_others[:, None] + log_weight[:, None]
+        return np.asarray(averaged.reshape(log_belief.shape))
 
     def _learnt_quantities(
         self, weight: Float, regression_sums: Float, count: Float
@@ -347,16 +414,20 @@ class LearningFilter:
             The number of observations of each sensor.
         """
         factor_count = len(self._transition_factors)
-        by_factor = weight.reshape(factor_count, -1)  # (factors, E)
+        share_count = len(self._lost_shares)
+        by_hypothesis = weight.reshape(factor_count, share_count, -1)  # (factors, N, E)
         result: dict[str, Learnt] = {}
         if self.parameter is not None:
             result[self.parameter.name] = posterior_of_draws(
-                self.parameter.values, self.sensor_model.draw_weight, by_factor.sum(axis=0)
+                self.parameter.values, self.parameter_weight, by_hypothesis.sum(axis=(0, 1))
             )
+        if share_count > 1:
+            weight_of_shares = self._weight_of_shares(weight)
+            result["saturation"] = posterior_of_points(self._lost_shares, weight_of_shares)
         if factor_count > 1:
             prior = np.full(factor_count, 1.0 / factor_count)
             result["transition_factor"] = posterior_of_draws(
-                self._transition_factors, prior, by_factor.sum(axis=1)
+                self._transition_factors, prior, by_hypothesis.sum(axis=(1, 2))
             )
         if self._gauges.learns:
             fit = self._gauges.fit(regression_sums)

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from reporting.arrays import Float, Index, product_of_each
+from reporting.words import between, rounded
 from twin_master.mission.planning import ComparedPolicy, discounts, simulate_decisions
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.planner import BeliefPolicy, RiskPolicy
+from twin_master.scenario.mission import Reference
 from twin_master.scenario.schema import Scenario
 
 
@@ -123,6 +125,23 @@ def promised_return(knowledge: Knowledge) -> ComparedPolicy:
         knowledge.scenario, knowledge.problem, _SimulatedDecisions(knowledge).decide
     )
     return ComparedPolicy(knowledge.scenario.planner.policy_name, returns)
+
+
+def promise_of_return(knowledge: Knowledge) -> tuple[Reference, ...]:
+    """Return what is promised of the return of a mission, to stand beside it in the summary.
+
+    The result is empty unless the policy was planned on the belief, goes by risk or was given. One
+    mission differs from the expected return by chance, so that the range of 95 % of the simulated
+    missions stands with it.
+    """
+    if knowledge.plan.on_belief is None and knowledge.policy is None:
+        return ()
+    promised = promised_return(knowledge)
+    low, high = np.quantile(promised.returns, [0.025, 0.975]).tolist()
+    spread = float(promised.returns.std())
+    value = f"{rounded(promised.mean, spread)} on average, {between(low, high, spread)} in 95 %"
+    source = f"{len(promised.returns)} missions under this policy, simulated by the twin's model"
+    return (Reference(figure="return", value=value, source=source),)
 
 
 class _SimulatedDecisions:

@@ -256,7 +256,8 @@ class Knowledge:
         Raises
         ------
         InvalidModelError
-            If a transition factor makes a probability larger than one.
+            If a transition factor makes a probability larger than one, or saturation is to be
+            learnt of sensors whose noise is not Gaussian.
         """
         scenario = self.scenario
         section = scenario.learning
@@ -276,6 +277,7 @@ class Knowledge:
             transitions,
             scenario.mission.name,
             scenario.observation.sensor_units,
+            NoticeWording.of(scenario),
         )
 
     @cached_property

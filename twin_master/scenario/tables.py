@@ -501,6 +501,9 @@ class Learning(Section):
     gauge_offset: NotNegative | tuple[NotNegative, ...] = 0.0
     """Prior standard deviation of the offset of each sensor; 0 is not learnt [unit of the
     sensors]."""
+    saturation: Annotated[Probability, Field(lt=1.0)] = 0.0
+    """Prior probability that all sensors saturate softly, each with L tanh(x / L) of x; the limit L
+    is learnt. 0 is not learnt [1]."""
     transition_factors: tuple[Positive, ...] = ()
     """Factors on the probabilities to leave a state, equally probable at first; by default they are
     not learnt [1]."""
@@ -522,6 +525,8 @@ class Learning(Section):
     def figure_groups(self) -> list[FigureGroup]:
         """Return the groups of figures on all learnt quantities except the parameter."""
         groups = []
+        if self.saturation > 0.0:
+            groups.append(FigureGroup("learnt", {"quantity": "saturation"}))
         if self.transition_factors:
             groups.append(FigureGroup("learnt", {"quantity": "transition_factor"}))
         if self.noise:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject
 from reporting.words import counted, parameter_title
+from twin_master.mission.earnings import promise_of_return
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
@@ -268,6 +269,9 @@ def summarise(
     groups += _error_bound_figures(result)
     groups += _suspicion_figures(result)
     references = {reference.figure: reference for reference in result.scenario.reference}
+    if result.flight.simulated:
+        promise = promise_of_return(result.knowledge)
+        references = {entry.figure: entry for entry in promise} | references
     for group in groups:
         for (key, title, unit), value in zip(_schema_of(group), group.values, strict=True):
             reference = references.get(key)

@@ -11,9 +11,11 @@ from scipy.stats import foldnorm, invgamma, multivariate_normal, multivariate_t,
 from tests.costs import once
 from tests.twin_master.network.decision_oracles import trajectories
 from tests.twin_master.runs import estimates_of
+from twin_master.errors import InvalidModelError
 from twin_master.learning.draw_posterior import posterior_of_draws
 from twin_master.learning.expectation import LearntExpectation, mixture_quantiles
 from twin_master.learning.learning_filter import LearningFilter
+from twin_master.learning.saturation import LOST_SHARES
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
@@ -364,3 +366,67 @@ def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     deviation = np.sqrt(weights @ (values - mean) ** 2)
     np.testing.assert_allclose(expected.mean[0], mean, rtol=1e-12)
     np.testing.assert_allclose(expected.standard_deviation[0], deviation, rtol=1e-9)
+
+
+LARGEST = 3.0
+
+
+def saturating_learner(*, draws_are_learnt: bool) -> tuple[LearningFilter, Float, Float]:
+    """Return a filter that learns saturation, what its draws show (N, E, G), and readings (T, G)."""
+    value = np.array([0.9, 1.0, 1.1])[:, None] * [1.0, 2.0, LARGEST]  # (E, G)
+    largest = LARGEST * (0.2 * 0.9 + 0.5 + 0.3 * 1.1)  # the mean over the draws
+    limit = largest / np.sqrt(3.0 * LOST_SHARES[1:, None, None])
+    shown = np.concatenate([value[None], limit * np.tanh(value / limit)])
+    seen = shown[4, 1] + np.random.default_rng(5).normal(0.0, 0.1, size=(6, 3))
+    sensor = GaussianSensorModel(value[:, None, None].repeat(2, axis=2), 0.1, [0.2, 0.5, 0.3])
+    settings = Learning(noise=False, saturation=0.4)
+    parameter = ("e", [0.9, 1.0, 1.1]) if draws_are_learnt else None
+    return LearningFilter(model(levels=1), sensor, settings, parameter), shown, seen
+
+
+@pytest.mark.parametrize("draws_are_learnt", [True, False])
+def test_saturation_is_weighed_as_further_draws_of_all_gauges(draws_are_learnt):
+    learner, shown, seen = saturating_learner(draws_are_learnt=draws_are_learnt)
+    estimates = estimates_of(learner, seen, [0, 1] * 3)
+    density = norm.logpdf(seen[:, None, None], shown, 0.1).sum(axis=-1)  # (T, N, E)
+    log_draw = np.log([0.2, 0.5, 0.3])
+    if draws_are_learnt:
+        of_share = np.logaddexp.reduce(density.sum(axis=0) + log_draw, axis=-1)
+    else:  # they are averaged anew in each step
+        of_share = np.logaddexp.reduce(density + log_draw, axis=-1).sum(axis=0)
+    of_share += np.log([0.6, *[0.4 / 6] * 6])
+    weight = np.exp(of_share - np.logaddexp.reduce(of_share))
+    learnt = estimates[-1].learnt["saturation"]
+    assert sum(estimate.log_evidence for estimate in estimates) == pytest.approx(
+        np.logaddexp.reduce(of_share)
+    )
+    assert learnt.mean == pytest.approx(weight @ LOST_SHARES)
+    assert learner.prior["saturation"].mean == pytest.approx(0.4 * LOST_SHARES[1:].mean())
+
+
+def test_saturation_that_is_believed_is_told_and_expected():
+    learner, shown, seen = saturating_learner(draws_are_learnt=True)
+    estimates = estimates_of(learner, np.tile(seen, (4, 1)), [0] * 24)
+    (notice,) = [notice for estimate in estimates for notice in estimate.notices]
+    assert "large readings of all gauges are too small" in notice.sentence
+    rewards = RewardModel(
+        GaussianSensorModel(shown[0][:, None, None].repeat(2, axis=2), 0.1),
+        limit=1.0,
+        control_reward=(0, 0),
+        error_scale=1.0,
+    )
+    expected = LearntExpectation(learner, rewards, np.eye(2)[:1])
+    of_filter = expected.filtered([estimates[-1].carried], np.ones((1, 1)), seen[:1])
+    np.testing.assert_allclose(of_filter.mean[0], shown[4, 1], rtol=0.03)
+    of_moments = expected.from_marginals(estimates[-1].learnt, np.ones((1, 1, 1)), slice(0, 1), seen[0])
+    np.testing.assert_allclose(of_moments.mean[0], of_filter.mean[0], rtol=0.01)
+    assert of_filter.reward_mean[0, 0] == pytest.approx(of_moments.reward_mean[0, 0], rel=0.02)
+
+
+def test_saturation_needs_sensors_with_gaussian_noise():
+    class Mine(GaussianSensorModel):
+        pass
+
+    sensor = Mine(np.ones((1, 1, 2, 1)), 0.1)
+    with pytest.raises(InvalidModelError, match=r"needs sensors with Gaussian noise, and got a Mine"):
+        LearningFilter(model(levels=1), sensor, Learning(saturation=0.01))

@@ -1,6 +1,7 @@
 """The run store: bytes that depend on nothing but the mission, tables and figures, whole files or none."""
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import xarray as xr
 from tests.twin_master.runs import flight_of, loaded_from, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
 from twin_master.fleet.storage.store import in_credible_set
+from twin_master.mission.earnings import promised_return
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.mission import Reference
 from twin_master.scenario.reading import load_scenario
@@ -258,6 +260,19 @@ def test_a_reference_stands_beside_its_figure(monitored):
         "fallback_delay": ("1 or 2", "somewhere"),
         "mean_reward_error": (-0.4, "elsewhere"),
     }
+
+
+def test_what_was_promised_of_a_given_policy_stands_beside_what_it_earned(monitored):
+    given = replace(monitored.knowledge, policy=monitored.knowledge.plan.policy)
+    (figure,) = [
+        figure for figure in summarise(replace(monitored, knowledge=given), SECONDS) if figure.key == "return"
+    ]
+    assert figure.value == pytest.approx(monitored.discounted_return)
+    numbers = re.findall(r"−?[0-9]+[.][0-9]+", str(figure.reference))
+    mean, low, high = (float(number.replace("−", "-")) for number in numbers)
+    returns = promised_return(given).returns
+    assert mean == pytest.approx(returns.mean(), abs=0.1 * returns.std())
+    assert np.mean((low <= returns) & (returns <= high)) == pytest.approx(0.95, abs=0.02)
 
 
 def test_an_asset_that_shows_nothing_has_no_misfit(monitored):
