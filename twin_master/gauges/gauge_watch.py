@@ -18,7 +18,7 @@ from twin_master.gauges.fault_kernels import Observations
 from twin_master.gauges.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.gauges.notices import NoticeWriter
 from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
-from twin_master.gauges.telling_control import predicted_by_hypotheses, separation_of_hypotheses
+from twin_master.gauges.telling_control import gauge_hypotheses, telling_controls
 from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
@@ -300,20 +300,17 @@ class GaugeWatch:
         for twin, notices_of_twin in enumerate(notices):
             if not any(notice.kind == "alarm" for notice in notices_of_twin):
                 continue
-            hypotheses = predicted_by_hypotheses(
+            hypotheses = gauge_hypotheses(
                 state,
                 twin,
                 model_belief[twin],
-                self._sensor_model,
                 self.faults.gains,
                 self._free_gain_deviation,
                 self._notices.hypothesis_names,
             )
-            separation = separation_of_hypotheses(hypotheses, self._notices.noise)
-            if separation is not None:
-                notices_of_twin.append(
-                    self._notices.report_separation(separation, self._controls, step)
-                )
+            telling = telling_controls(hypotheses, self._sensor_model)
+            if telling is not None:
+                notices_of_twin.append(self._notices.advise_control(telling, self._controls, step))
 
     def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
         """Return the evidence for the kinds of fault, relative to that for the model.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from reporting.words import listing
-from twin_master.gauges.telling_control import Separation
+from twin_master.gauges.telling_control import TellingControls
 from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -22,8 +22,8 @@ _LEAST_NAMED_DEVIATIONS = 2.0
 """A gain that is fewer prior standard deviations from zero is not named in an alarm."""
 _MOST_NAMED = 6
 """Gauges that an alarm names at most."""
-_LEAST_SEPARATION = 1.0
-"""Standard deviations of the noise by which readings must differ to tell two hypotheses apart."""
+_LEAST_PROBABILITY_TO_TELL = 0.1
+"""A control that tells two hypotheses apart less probably is not advised."""
 _LARGEST_LOG = 700.0
 """Logarithms up to this have an exponential that is a finite number."""
 
@@ -190,33 +190,31 @@ class NoticeWriter:
         sentence = f"{self._step_text(step)}: {sentence}"
         return [Notice("hypothesis", sentence, numbers, probability)]
 
-    def report_separation(
-        self, separation: Separation, controls: tuple[str, ...], step: int
+    def advise_control(
+        self, telling: TellingControls, controls: tuple[str, ...], step: int
     ) -> Notice:
         """Return the advice which control tells two hypotheses of an alarm apart."""
         hypotheses = [
             f"{'the model' if name == 'model' else name} ({probability:.2g})"
-            for name, probability in zip(separation.names, separation.probabilities, strict=True)
+            for name, probability in zip(telling.names, telling.probabilities, strict=True)
         ]
-        by_control = dict(zip(controls, separation.by_control.tolist(), strict=True))
-        best = max(by_control, key=by_control.__getitem__)
-        if by_control[best] < _LEAST_SEPARATION:
+        by_control = dict(zip(controls, telling.by_control.tolist(), strict=True))
+        best, *others = sorted(by_control, key=by_control.__getitem__, reverse=True)
+        is_one_step = telling.steps == 1
+        steps = self.wording.step if is_one_step else f"{telling.steps} {self.wording.step}s"
+        if by_control[best] < _LEAST_PROBABILITY_TO_TELL:
             sentence = (
-                f"no control tells {listing(hypotheses)} apart, because their readings differ by "
-                f"less than the noise under each: inspect the {self.wording.sensor}s, or measure "
-                "with another sensor."
+                f"no control tells {listing(hypotheses)} apart within {steps}: inspect the "
+                f"{self.wording.sensor}s, or measure with another sensor."
             )
             return Notice("advice", f"{self._step_text(step)}: {sentence}")
-        others = [
-            f"{separation_of_control:.2g} at {control}"
-            for control, separation_of_control in by_control.items()
-            if control != best
-        ]
-        compared = f", and by {listing(others)}" if others else ""
+        steps_tell = (
+            f"a {steps} under {best} tells" if is_one_step else f"{steps} under {best} tell"
+        )
+        next_best = f", and {by_control[others[0]]:.2f} under {others[0]}" if others else ""
         sentence = (
-            f"a {self.wording.step} at {best} tells {listing(hypotheses)} apart best, if it is "
-            f"safe: their readings differ there by {by_control[best]:.2g} standard deviations of "
-            f"the noise{compared}."
+            f"{steps_tell} {listing(hypotheses)} apart best, if it is safe: with a probability of "
+            f"{by_control[best]:.2f}{next_best}."
         )
         return Notice("advice", f"{self._step_text(step)}: {sentence}", value=by_control[best])
 

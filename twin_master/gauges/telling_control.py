@@ -1,10 +1,12 @@
 """Which control tells two hypotheses about the gauges apart, as advice where an alarm is ambiguous.
 
-Two hypotheses are told apart by the readings that they predict. The separation of a control is the
-distance of their mean readings in one step, in standard deviations of the noise: half its square is
-the log evidence that a step is expected to bring (Lindley 1956, for Gaussian noise).
+What a control shows in the next step is simulated under both hypotheses, with the gauges and, if
+the control asks for an inspection, its readings; if one step seldom suffices, ten steps are
+simulated. The hypotheses are told apart if the true one is
+then almost certain: the expected use of an experiment of Lindley (1956), for that loss.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +17,19 @@ from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEAST_PROBABILITY = 0.1
 """Two hypotheses that are both at least as probable make an alarm ambiguous."""
+_ALMOST_CERTAIN = 0.95
+"""The probability that a hypothesis must reach to be told apart from the other."""
+_LOG_ODDS_OF_ALMOST_CERTAIN = float(np.log(_ALMOST_CERTAIN / (1.0 - _ALMOST_CERTAIN)))
+_SIMULATIONS = 500
+"""Simulations for each control and hypothesis."""
+_STEPS = (1, 10)
+"""Successive steps under one control that are simulated."""
+_PROBABLE = 0.5
+"""The probability to tell from which on no more steps are simulated."""
 
 
-class PredictedReadings(NamedTuple):
-    """A hypothesis, and the readings that it predicts.
+class GaugeHypothesis(NamedTuple):
+    """A hypothesis about the gauges, and what they show under it.
 
     Attributes
     ----------
@@ -26,17 +37,20 @@ class PredictedReadings(NamedTuple):
         Its name.
     probability : float
         Its probability.
-    readings : (U, G) array
-        The mean readings of G gauges under each of U controls, SI.
+    belief : (S,) array
+        The belief about the state, given the hypothesis.
+    factor : (G,) array
+        What each gauge shows, as a factor on the value that the model predicts.
     """
 
     name: str
     probability: float
-    readings: Float
+    belief: Float
+    factor: Float
 
 
-class Separation(NamedTuple):
-    """How well the controls tell the two most probable hypotheses apart.
+class TellingControls(NamedTuple):
+    """How probably each control tells the two most probable hypotheses apart.
 
     Attributes
     ----------
@@ -44,50 +58,106 @@ class Separation(NamedTuple):
         The hypotheses, the more probable one first.
     probabilities : tuple of float
         Their probabilities.
+    steps : int
+        The number of successive steps under a control.
     by_control : (U,) array
-        The separation under each control, in standard deviations.
+        The probability that these steps make the true hypothesis almost certain.
     """
 
     names: tuple[str, str]
     probabilities: tuple[float, float]
+    steps: int
     by_control: Float
 
 
-def separation_of_hypotheses(
-    hypotheses: list[PredictedReadings], noise: Float
-) -> Separation | None:
-    """Return how well controls tell the two most probable hypotheses apart.
+def telling_controls(
+    hypotheses: Sequence[GaugeHypothesis], sensor_model: GaussianSensorModel
+) -> TellingControls | None:
+    """Return how probably controls tell the two most probable hypotheses apart.
 
-    The result is None if only one hypothesis is probable.
-
-    Parameters
-    ----------
-    hypotheses : list of PredictedReadings
-        The hypotheses.
-    noise : (G,) array
-        The standard deviation of the noise of each gauge, SI.
+    The result is None if only one hypothesis is probable. Equal arguments give equal results.
     """
     first, second = sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)[:2]
     if second.probability < _LEAST_PROBABILITY:
         return None
-    distance = (first.readings - second.readings) / noise
-    return Separation(
-        (first.name, second.name),
-        (first.probability, second.probability),
-        np.sqrt(np.sum(distance**2, axis=-1)),
-    )
+    names = (first.name, second.name)
+    probabilities = (first.probability, second.probability)
+    controls = range(sensor_model.control_count)
+    for steps in _STEPS:
+        by_control = np.array(
+            [_probability_to_tell(first, second, sensor_model, u, steps) for u in controls]
+        )
+        if by_control.max() >= _PROBABLE:
+            break
+    return TellingControls(names, probabilities, steps, by_control)
 
 
-def predicted_by_hypotheses(
+def _probability_to_tell(
+    first: GaugeHypothesis,
+    second: GaugeHypothesis,
+    sensor_model: GaussianSensorModel,
+    control: int,
+    steps: int,
+) -> float:
+    """Return the probability that steps under a control make the true hypothesis almost certain.
+
+    The state stays the same in these steps.
+    """
+    log_odds = np.log(first.probability / second.probability)
+    generator = np.random.default_rng(0)
+    told = 0.0
+    for truth, sign in ((first, 1.0), (second, -1.0)):
+        probability_of_state = truth.belief / truth.belief.sum()
+        states = generator.choice(sensor_model.state_count, _SIMULATIONS, p=probability_of_state)
+        error = (truth.factor - 1.0) * sensor_model.mean[states, control]
+        log_density_of_first = np.zeros((_SIMULATIONS, sensor_model.state_count))
+        log_density_of_second = np.zeros_like(log_density_of_first)
+        for _ in range(steps):
+            rows = sensor_model.draw_observations(states, control, generator)
+            rows[:, : sensor_model.sensor_count] += error
+            log_density_of_first += _log_density(first, sensor_model, control, rows)
+            log_density_of_second += _log_density(second, sensor_model, control, rows)
+        log_ratio = _log_mean(log_density_of_first, first) - _log_mean(
+            log_density_of_second, second
+        )
+        is_told = sign * (log_odds + log_ratio) >= _LOG_ODDS_OF_ALMOST_CERTAIN
+        told += truth.probability * float(np.mean(is_told))
+    return told / (first.probability + second.probability)
+
+
+def _log_density(
+    hypothesis: GaugeHypothesis, sensor_model: GaussianSensorModel, control: int, rows: Float
+) -> Float:
+    """Return the log density of observations (N, G + I) in each state under a hypothesis: (N, S).
+
+    Constants that do not depend on the hypothesis are left out.
+    """
+    values, log_density = sensor_model.split_observation(rows)
+    deviation = sensor_model.total_standard_deviation[:, control]  # (S, G)
+    expected = hypothesis.factor * sensor_model.mean[:, control]
+    squares = np.empty((len(rows), len(deviation)))
+    for state in range(len(deviation)):
+        standardized = (values - expected[state]) / deviation[state]
+        squares[:, state] = np.einsum("ng,ng->n", standardized, standardized)
+    return np.asarray(log_density - np.log(deviation).sum(axis=1) - 0.5 * squares)
+
+
+def _log_mean(log_density: Float, hypothesis: GaugeHypothesis) -> Float:
+    """Return the log of densities (N, S), averaged over the belief under a hypothesis: (N,)."""
+    with np.errstate(divide="ignore"):
+        log_belief = np.log(hypothesis.belief / hypothesis.belief.sum())
+    return np.asarray(np.logaddexp.reduce(log_density + log_belief, axis=1))
+
+
+def gauge_hypotheses(
     state: WatchState,
     twin: int,
     model_belief: Float,
-    sensor_model: GaussianSensorModel,
     gains: Float,
     gain_deviation: float,
     gauge_names: tuple[str, ...],
-) -> list[PredictedReadings]:
-    """Return the readings that the hypotheses of a twin predict for a next step.
+) -> list[GaugeHypothesis]:
+    """Return the hypotheses of a twin about its gauges, the faulty gauge being the likeliest one.
 
     Parameters
     ----------
@@ -97,8 +167,6 @@ def predicted_by_hypotheses(
         The twin.
     model_belief : (S,) array
         Its belief about the state under the model.
-    sensor_model : GaussianSensorModel
-        The readings in each state.
     gains : (K,) array
         The gain errors of a single gauge that are compared.
     gain_deviation : float
@@ -110,24 +178,21 @@ def predicted_by_hypotheses(
     gauge_count = len(gauge_names)
     probability = state.weights.gauge_fault_probability[twin].reshape(gauge_count, -1)  # (G, K)
     none_of_these = float(state.weights.free_gains_probability[twin])
-    mean_readings = sensor_model.mean  # (S, U, G)
-    by_model = np.einsum("s,sug->ug", model_belief, mean_readings)
     is_sound = 1.0 - none_of_these - float(probability.sum())
-    hypotheses = [PredictedReadings("model", is_sound, by_model)]
+    hypotheses = [GaugeHypothesis("model", is_sound, model_belief, np.ones(gauge_count))]
 
     gauge = int(np.argmax(probability.sum(axis=1)))
     gauge_probability = float(probability[gauge].sum())
     belief_of_faults = state.beliefs.gauge[twin].reshape(states, -1, gauge_count, len(gains))
     joint = belief_of_faults[:, :, gauge].sum(axis=1) @ probability[gauge]  # (S,)
     if gauge_probability > 0.0 and joint.sum() > 0.0:
-        readings = np.einsum("s,sug->ug", joint / joint.sum(), mean_readings)
-        readings[:, gauge] *= 1.0 + float(probability[gauge] @ gains) / gauge_probability
-        hypotheses.append(PredictedReadings(gauge_names[gauge], gauge_probability, readings))
+        factor = np.ones(gauge_count)
+        factor[gauge] += float(probability[gauge] @ gains) / gauge_probability
+        hypotheses.append(GaugeHypothesis(gauge_names[gauge], gauge_probability, joint, factor))
 
     belief = state.beliefs.free_gains[twin].reshape(states, -1).sum(axis=1)
     statistics = state.free_gain_statistics
     regression = statistics.sum_cx[twin] / (1.0 + statistics.sum_cc[twin])
     gain = gain_deviation * statistics.free_probability[twin] * regression
-    readings = (1.0 + gain) * np.einsum("s,sug->ug", belief / belief.sum(), mean_readings)
-    hypotheses.append(PredictedReadings("none of these", none_of_these, readings))
+    hypotheses.append(GaugeHypothesis("none of these", none_of_these, belief, 1.0 + gain))
     return hypotheses

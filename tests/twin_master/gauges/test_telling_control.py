@@ -4,36 +4,90 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from twin_master.gauges.hypothesis_weights import HypothesisWeights
-from twin_master.gauges.telling_control import PredictedReadings, separation_of_hypotheses
+from twin_master.gauges.telling_control import GaugeHypothesis, telling_controls
+from twin_master.network.identified import InspectedSensorModel
 from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator
 
-NOISE = np.array([2.0, 4.0])
+ONE_STATE = np.ones(1)
 
 
-def predicted(name: str, probability: float, *readings: tuple[float, float]) -> PredictedReadings:
-    return PredictedReadings(name, probability, np.array(readings))
+def under_controls(*values: float) -> GaussianSensorModel:
+    """Return a gauge with noise of one that shows a value under each control, in one state."""
+    return GaussianSensorModel(np.array(values).reshape(1, 1, -1, 1), 1.0)
 
 
-def test_the_separation_is_the_distance_of_the_readings_in_noise():
+@pytest.mark.parametrize("probability", [0.5, 0.7])
+def test_the_probability_to_tell_is_that_of_the_closed_form(probability):
+    """The log ratio of two normal densities at a distance d is N(d^2 / 2, d^2) under the true one."""
+    gain = 0.2
     hypotheses = [
-        predicted("model", 0.6, (10.0, 0.0), (10.0, 0.0)),
-        predicted("gauge 1 off", 0.4, (16.0, 0.0), (16.0, 16.0)),
+        GaugeHypothesis("model", probability, ONE_STATE, np.ones(1)),
+        GaugeHypothesis("gauge 1 off", 1.0 - probability, ONE_STATE, np.array([1.0 + gain])),
     ]
-    separation = separation_of_hypotheses(hypotheses, NOISE)
-    assert separation is not None
-    assert separation.names == ("model", "gauge 1 off")
-    assert separation.by_control == pytest.approx([3.0, 5.0])
+    values = np.array([2.0, 10.0, 18.0])
+    telling = telling_controls(hypotheses, under_controls(*values))
+    assert telling is not None
+    assert telling.names == ("model", "gauge 1 off")
+    distance = gain * values
+    expected = sum(
+        weight * norm.sf((np.log(19.0 * other / weight) - distance**2 / 2) / distance)
+        for weight, other in ((probability, 1.0 - probability), (1.0 - probability, probability))
+    )
+    assert telling.steps == 1
+    assert telling.by_control == pytest.approx(expected, abs=0.05)
+
+
+def test_where_one_step_does_not_tell_ten_steps_are_tried():
+    hypotheses = [
+        GaugeHypothesis("model", 0.5, ONE_STATE, np.ones(1)),
+        GaugeHypothesis("gauge 1 off", 0.5, ONE_STATE, np.array([1.1])),
+    ]
+    telling = telling_controls(hypotheses, under_controls(10.0))
+    assert telling is not None
+    distance = np.sqrt(10.0)
+    assert telling.steps == 10
+    expected = norm.sf((np.log(19.0) - distance**2 / 2) / distance)
+    assert telling.by_control == pytest.approx([expected], abs=0.05)
+
+
+def test_a_state_that_may_explain_the_gauge_makes_it_hard_to_tell():
+    sensors = GaussianSensorModel(np.array([10.0, 12.0]).reshape(1, 2, 1, 1), 0.1)
+    off = GaugeHypothesis("gauge 1 off", 0.5, np.array([1.0, 0.0]), np.array([1.2]))
+    for belief, told in (([1.0, 0.0], 1.0), ([0.0, 1.0], 0.0)):
+        model = GaugeHypothesis("model", 0.5, np.array(belief), np.ones(1))
+        telling = telling_controls([model, off], sensors)
+        assert telling is not None
+        assert telling.by_control == pytest.approx([told])
+
+
+def test_an_inspection_tells_what_no_gauge_can():
+    """The second control asks for a reading of the state, which differs between the hypotheses."""
+    sensors = InspectedSensorModel(
+        np.array([10.0, 12.0]).reshape(1, 2, 1, 1).repeat(2, axis=2),
+        0.1,
+        expected_reading=np.array([[0.0], [0.4]]),
+        reading_deviation=np.full((2, 1), 0.05),
+        asked_by=np.array([1]),
+    )
+    hypotheses = [
+        GaugeHypothesis("model", 0.5, np.array([0.0, 1.0]), np.ones(1)),
+        GaugeHypothesis("gauge 1 off", 0.5, np.array([1.0, 0.0]), np.array([1.2])),
+    ]
+    telling = telling_controls(hypotheses, sensors)
+    assert telling is not None
+    assert telling.by_control == pytest.approx([0.0, 1.0])
 
 
 @given(st.floats(0.0, 0.0999))
 def test_an_alarm_with_one_probable_hypothesis_needs_no_advice(probability):
     hypotheses = [
-        predicted("gauge 1 off", 1.0 - probability, (1.0, 0.0)),
-        predicted("none of these", probability, (2.0, 0.0)),
+        GaugeHypothesis("gauge 1 off", 1.0 - probability, ONE_STATE, np.array([1.2])),
+        GaugeHypothesis("none of these", probability, ONE_STATE, np.array([1.4])),
     ]
-    assert separation_of_hypotheses(hypotheses, NOISE) is None
+    assert telling_controls(hypotheses, under_controls(1.0)) is None
 
 
 def advice_of(shown: np.ndarray, gain: float) -> list[str]:
@@ -57,8 +111,8 @@ def advice_of(shown: np.ndarray, gain: float) -> list[str]:
 def test_the_control_with_the_larger_readings_tells_a_wrong_gain():
     soft = np.array([[1.0, 2.0, 0.5], [1.3, 2.0, 0.8]])  # (S, G)
     (sentence,) = advice_of(np.stack([soft, 3.0 * soft], axis=1), 1.15)
-    assert "a step at hard tells" in sentence
-    assert "apart best, if it is safe" in sentence
+    assert "10 steps under hard tell" in sentence
+    assert "apart best, if it is safe: with a probability of " in sentence
 
 
 def test_a_fault_that_certainly_shows_is_not_hidden_after_a_change_of_control():
