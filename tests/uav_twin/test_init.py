@@ -58,8 +58,24 @@ def test_every_file_names_its_schema_to_editors(project):
         assert path.read_text(encoding="utf-8").startswith("#:schema "), path
 
 
+def keys_without_comment(campaign: Path) -> set[str]:
+    """Return the keys of a campaign, with their tables, that have no comment at their first place."""
+    explained: dict[str, bool] = {}
+    table = previous_line = ""
+    for line in campaign.read_text(encoding="utf-8").splitlines():
+        if line.startswith("["):
+            table = line
+        elif match := re.match(r"(\w+) = ", line):
+            has_comment = "  # " in line or previous_line.startswith("# ")
+            explained.setdefault(table + match[1], has_comment)
+        previous_line = line
+    assert tomllib.loads(campaign.read_text(encoding="utf-8"))
+    return {key for key, has_comment in explained.items() if not has_comment}
+
+
 def test_keys_that_are_guessed_have_a_comment(project):
-    """The campaign of a rig is written by what was measured."""
+    campaign = project[1] / "measured" / "campaign.toml"
+    assert not campaign.exists() or keys_without_comment(campaign) == set()
     for path in project[1].glob("*.toml"):
         text = path.read_text(encoding="utf-8")
         assert text.count("#") > 0.4 * text.count(" = "), path
@@ -115,6 +131,7 @@ def test_a_ring_down_of_a_user_has_a_model_of_its_frequency(tmp_path):
     assert model["stiffness"][0] == pytest.approx((2 * np.pi * 7.0) ** 2, rel=0.01)
     campaign = tomllib.loads((tmp_path / "rig" / "measured" / "campaign.toml").read_text(encoding="utf-8"))
     assert campaign["trial"][0]["kind"] == "ringdown"
+    assert keys_without_comment(tmp_path / "rig" / "measured" / "campaign.toml") == set()
 
 
 def test_a_folder_that_is_not_empty_is_kept(tmp_path):

@@ -24,6 +24,45 @@ _HZ = 5.0
 _FRICTION_RATIO = 0.02
 """Friction that is hidden in the measurements of that rig, as a share of the elastic force."""
 
+_MEANINGS = {
+    "": {
+        "format": "the version of this format",
+        "name": "the title of the campaign",
+        "force_unit": "the unit of the column `force` of all tables",
+        "reference_temperature": "°C, at which the model holds",
+        "remarks": "Sentences for people.",
+        "provenance": "Where the tables come from.",
+    },
+    "noise": {
+        "file": "samples of all channels at rest, before the first trial",
+        "interval": "s between two samples",
+    },
+    "channel": {
+        "name": "what measures; the name of its column in the tables",
+        "quantity": "what it measures",
+        "unit": "of its column",
+        "output": "the output of model.toml that it is compared with",
+        "gain_deviation": "how well its gain is known: standard deviation, as a fraction",
+        "offset_deviation": "how well its zero is known: standard deviation, in its unit",
+    },
+    "channel.noise": {
+        "standard_deviation": "of a reading at rest, in the unit of the channel",
+        "degrees_of_freedom": "how well it is known, as a number of readings",
+        "source": "where it is from",
+    },
+    "trial": {
+        "name": "what was done once",
+        "kind": "released and left to ring down",
+        "file": "its table: time in s, then the channels",
+        "run": "trials of one set-up have one run",
+        "load_place": "the place or input of model.toml at which it was held",
+        "release": "m at the release, and how well it is known as a fraction",
+        "start": "s since the first trial, by the clock of the laboratory",
+        "held_out": "not fitted: it proves what was found",
+    },
+}
+"""What each key of the campaign means, by its table, as a comment where it stands first."""
+
 
 def rig_project(name: str, ring_down: Path | None) -> Project:
     """Return the project of a rig: of a ring-down as CSV, or of a simulated mass with friction.
@@ -61,8 +100,8 @@ def rig_project(name: str, ring_down: Path | None) -> Project:
         texts = {MODEL_NAME: model_text}
         for path in sorted(campaign_folder.iterdir()):
             text = path.read_text(encoding="utf-8")
-            if path.name == "campaign.toml" and not text.startswith("#:schema"):
-                text = schema_line("campaign") + text
+            if path.name == "campaign.toml":
+                text = _with_comments(text)
             texts[f"{CAMPAIGN_FOLDER}/{path.name}"] = text
     return Project(
         title="Measurements of a rig, and the model that is compared with them.",
@@ -95,6 +134,29 @@ def rig_project(name: str, ring_down: Path | None) -> Project:
             ),
         ),
     )
+
+
+def _with_comments(campaign: str) -> str:
+    """Return the text of a campaign with its schema, and each key explained at its first place."""
+    lines = [
+        schema_line("campaign").rstrip("\n"),
+        "# What was measured, and how. Further records stand beside this file, each a [[trial]].",
+    ]
+    unexplained = {table: dict(meanings) for table, meanings in _MEANINGS.items()}
+    table = ""
+    for line in campaign.splitlines():
+        if line.startswith("#:schema"):
+            continue
+        if line.startswith("["):
+            table = line.strip("[]")
+        meaning = unexplained[table].pop(line.partition(" = ")[0], None)
+        if meaning is None:
+            lines.append(line)
+        elif line.endswith("["):  # a list over several lines
+            lines += [f"# {meaning}", line]
+        else:
+            lines.append(f"{line}  # {meaning}")
+    return "\n".join([*lines, ""])
 
 
 def _write_simulated_campaign(model_file: Path, folder: Path) -> None:
