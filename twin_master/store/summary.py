@@ -539,9 +539,7 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
     level = fallback.switch_level
     first_control = scenario.mission.first_control
     if fallback.switch_factor is None or level is None:
-        return FigureGroup(
-            "nowhere", {"first": first_control}, ["none, or it depends on several states"]
-        )
+        return FigureGroup("nowhere", {"first": first_control}, ["no single one"])
     factor = scenario.state[scenario.state_names.index(fallback.switch_factor)]
     scale, unit = printed_state(factor.unit)
     new_control = "another control"

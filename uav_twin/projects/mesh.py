@@ -124,7 +124,7 @@ def draft_part(mesh: StructureMesh) -> PartDraft:
 
 def _unit_of(mesh_file: Path) -> str:
     """Return the unit of length of a mesh: "mm" if its coordinates are large, else "m"."""
-    mesh = read_mesh(mesh_file, UNITS["m"], "m")
+    mesh = read_mesh(mesh_file, 1.0, "units of the file")
     return "mm" if np.ptp(mesh.points, axis=0).max() > _LARGE_IN_METRES else "m"
 
 

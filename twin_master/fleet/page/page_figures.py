@@ -129,6 +129,7 @@ def returns_figure(returns: Mapping[str, Float]) -> Figure:
     groups = {name: values for name, values in returns.items() if len(values)}
     height = 0.75 + _HEIGHT_OF_GROUP * len(groups)
     figure, ((axes,),) = style.panels(1, 1, height, 0.2, 0.45, left=0.3)
+    axes.use_sticky_edges = False  # else the leftmost band would end at the axis
     for row, values in enumerate(groups.values()):
         low, lower_quartile, upper_quartile, high = np.quantile(values, [0.05, 0.25, 0.75, 0.95])
         for begin, end in ((low, high), (lower_quartile, upper_quartile)):
