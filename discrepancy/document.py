@@ -47,9 +47,11 @@ _MEANING_OF_VALUE = {
     "cosine": "Amplitude of the cosine.",
     "damping_ratio": "Fraction of critical damping.",
     "displacement_exponent": "Exponent of the displacement.",
+    "displacements": "Displacements of the table, rising.",
     "element_count": "Number of parallel elements.",
     "exponent": "Exponent of the law.",
     "force": "Formula of the force in the `time` of the trial.",
+    "forces": "Force at each displacement of the table.",
     "fraction": "Additional fraction of the weight.",
     "frequency": "Frequency.",
     "gain": "Relative error of the gain.",
@@ -92,7 +94,12 @@ _MEANING_OF_VALUE = {
 """Meaning of each value of the primitives, by its name; the equation of a primitive says more."""
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
-_JSON_TYPES: dict[type, str] = {float: "number", int: "integer", str: "string"}
+_JSON_TYPES: dict[type, JsonObject] = {
+    float: {"type": "number"},
+    int: {"type": "integer"},
+    str: {"type": "string"},
+    tuple: {"type": "array", "items": {"type": "number"}},
+}
 _NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
 _BEGIN = {
     "type": ["number", "null"],
@@ -143,7 +150,7 @@ def _primitive_schema(primitive: type[Primitive]) -> JsonObject:
                 f"The number {name!r} of {primitive.__module__}.{primitive.__name__} has no "
                 "meaning: give one in `_MEANING_OF_VALUE` of discrepancy/document.py."
             )
-        columns[name] = {"type": _JSON_TYPES[kind], "description": _MEANING_OF_VALUE[name]}
+        columns[name] = {**_JSON_TYPES[kind], "description": _MEANING_OF_VALUE[name]}
         if name in units:
             columns[name]["unit"] = units[name]
     return {

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import ConfigDict, Field, Strict
 from scipy.special import ndtr, ndtri
 
-from discrepancy.campaign.records import Campaign, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, TrialKind
 from discrepancy.system.interface import Model
 from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
@@ -262,6 +262,22 @@ class EffectKeys:
     relative_frequency: Number | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class ForceTable:
+    """A force over the displacement of a port, as a sum of functions with free amplitudes.
+
+    Attributes
+    ----------
+    displacements : (P,) ndarray
+        The displacements, rising [m or rad].
+    functions : (P, K) ndarray
+        The force at each displacement for a unit of each of the K amplitudes [N or N m].
+    """
+
+    displacements: FloatArray
+    functions: FloatArray
+
+
 @dataclass(frozen=True, kw_only=True)
 class Effect(EffectKeys):
     """A named effect: the patch that adds it to a model, and where it may act.
@@ -281,6 +297,8 @@ class Effect(EffectKeys):
         is none.
     prior_weight : float
         Prior probability over that of an effect without a stated frequency.
+    table : ForceTable or None
+        The table of a force of free shape, whose amplitudes are the parameters; None for a law.
     """
 
     build: Build
@@ -288,6 +306,7 @@ class Effect(EffectKeys):
     unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
     variant_of: str = ""
     prior_weight: float = 1.0
+    table: ForceTable | None = None
 
     @property
     def kind(self) -> str:

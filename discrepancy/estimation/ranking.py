@@ -13,7 +13,8 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate, CandidateKey
+from discrepancy.catalogue.force_curve import CORRELATION_LENGTHS, force_curve
+from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm
 
 from .estimate import Estimate
 from .force_search import ForceSearch
@@ -36,6 +37,10 @@ LEADING_RANGE = 12.0
 samples the difference is larger by about the factor of the thinning."""
 MOST_LEADING = 3
 """Largest number of hypotheses with effects that are estimated in all samples."""
+
+CURVE_DEVIATION = 2.0
+"""Prior standard deviation of a force of free shape, over that of the missing force: at the ends of
+the motion it is larger than on average."""
 
 OnProgress = Callable[[str], None]
 """Called with a line for the progress display."""
@@ -120,7 +125,17 @@ def rank_hypotheses(
         ranking.estimate_simpler_forms()
         if ranking.best is best_estimate:
             break
+        is_first_effect = not best_estimate.candidate.terms
         best_estimate = ranking.best
+        if is_first_effect:
+            curve = ranking.estimate_curve()
+            # effects are added to a named law, unless the curve leaves nothing to explain
+            if (
+                curve is not None
+                and curve.leaves_no_force
+                and ranking.score(curve) > ranking.score(best_estimate)
+            ):
+                break
     return ranking.in_order()
 
 
@@ -144,6 +159,7 @@ class _Ranking:
         self.by_effects: dict[CandidateKey, Estimate] = {
             without_effects.candidate.key: without_effects
         }
+        self.curve: Estimate | None = None
         self.estimated_in_full: set[CandidateKey] = {without_effects.candidate.key}
 
     def score(self, estimate: Estimate) -> float:
@@ -152,11 +168,14 @@ class _Ranking:
 
     def in_order(self) -> list[Estimate]:
         """Return all estimates, the most probable first."""
-        return sorted(self.by_effects.values(), key=lambda estimate: -self.score(estimate))
+        estimates = [*self.by_effects.values()]
+        if self.curve is not None:
+            estimates.append(self.curve)
+        return sorted(estimates, key=lambda estimate: -self.score(estimate))
 
     @property
     def best(self) -> Estimate:
-        """The most probable estimate."""
+        """The most probable estimate of named laws and errors of sensors."""
         return max(self.by_effects.values(), key=self.score)
 
     def record(self, estimate: Estimate) -> None:
@@ -267,6 +286,40 @@ class _Ranking:
             if self.best is best_estimate:
                 break
             best_estimate = self.best
+
+    def estimate_curve(self) -> Estimate | None:
+        """Estimate a force of free shape over the displacement where no named law is enough.
+
+        A named law is enough if it leaves no force, and no exponent of it had to be fitted. The
+        curve acts at the port that shows most of the missing force.
+        """
+        if self.best.leaves_no_force and not self.best.candidate.has_free_shape:
+            return None
+        base = self.search.estimate_without_effects
+        port = max(base.processes, key=self.search.force_deviation)
+        positions = np.concatenate(
+            [smoothed_trial.trajectory.positions[:, port] for smoothed_trial in base.trials]
+        )
+        port_name = self.search.ports[port]
+        estimates = []
+        for correlation_length in CORRELATION_LENGTHS:
+            curve = force_curve(
+                port_name,
+                (float(positions.min()), float(positions.max())),
+                CURVE_DEVIATION * self.search.force_deviation(port),
+                correlation_length,
+            )
+            candidate = Candidate((EffectTerm(curve, port_name, free_shape=True),))
+            self.on_progress(f"estimating {candidate.description} together with the motion")
+            estimate = self.search.estimate_effects(base, candidate, candidate.start_values())
+            if estimate is not None:
+                estimates.append(estimate)
+                if estimate.leaves_no_force:
+                    break
+        if not estimates:
+            return None
+        self.curve = max(estimates, key=lambda curve: (curve.leaves_no_force, curve.log_evidence))
+        return self.curve
 
     def _named_laws_of_family(self, candidate: Candidate) -> list[_ValuedCandidate]:
         """Return the sets in which named laws stand in place of the laws of free shape of a set.

@@ -24,7 +24,7 @@ from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.proof_record import Proof
 from discrepancy.verdict import CalibratedParameter, NamedEffect, Verdict, VerdictKind
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
@@ -320,22 +320,27 @@ def primitive_intervals(
             )
     intervals = []
     for index, primitive in enumerate(patch):
-        for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
-            values = [float(getattr(draw.primitives[index], name)) for draw in draws]
+        numbers_of_draws = [_numbers_of(draw.primitives[index]) for draw in draws]
+        for parameter, (value, unit) in _numbers_of(primitive).items():
             low = high = nan
-            if values:
+            if draws:
+                values = [numbers[parameter][0] for numbers in numbers_of_draws]
                 low, high = np.quantile(values, _INTERVAL).tolist()
-            intervals.append(
-                PrimitiveInterval(
-                    primitive=index,
-                    parameter=name,
-                    value=float(getattr(primitive, name)),
-                    low=low,
-                    high=high,
-                    unit=unit,
-                )
-            )
+            intervals.append(PrimitiveInterval(index, parameter, value, low, high, unit))
     return tuple(intervals)
+
+
+def _numbers_of(primitive: Primitive) -> dict[str, tuple[float, str]]:
+    """Return the real numbers of a primitive with their units, those of a table as `forces[0]`."""
+    numbers: dict[str, tuple[float, str]] = {}
+    for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
+        value = getattr(primitive, name)
+        if isinstance(value, tuple):
+            for index, item in enumerate(value):
+                numbers[f"{name}[{index}]"] = (item, unit)
+        else:
+            numbers[name] = (float(value), unit)
+    return numbers
 
 
 def _kinds_text(patch: ModelPatch) -> str:

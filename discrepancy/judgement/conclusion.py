@@ -13,7 +13,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE, EffectParameter, ShapeParameter
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
@@ -31,6 +31,11 @@ from discrepancy.verdict import (
 )
 from fe.runtime.patch import Clock, LoadGain, ModelPatch, Primitive, SensorGain
 from reporting.words import listing
+
+from .curve_words import curve_in_words
+
+TOLD_POINT = 6
+"""Every how many points of a table of forces one is told."""
 
 
 class ComparedHypothesis(Protocol):
@@ -234,12 +239,15 @@ class Conclusion:
         """
         fit_with_draws = with_draws(self.search.problem, fit)
         effects = named_effects(self.search.problem, fit_with_draws)
-        family = ", ".join(sorted({effect.family for effect in effects if effect.shape}))
-        other_names = ", ".join(effect.name for effect in effects if not effect.shape)
-        beside_clause = f", beside {other_names}" if other_names else ""
-        sentence = (
-            f"An effect of the family {family} is missing, with a fitted shape{beside_clause}."
-        )
+        free_terms = [term for term in fit.candidate.terms if term.free_shape]
+        family = ", ".join(sorted({term.effect.family for term in free_terms}))
+        sentence = curve_sentence(self.search.problem, fit)
+        if not sentence:
+            other_names = ", ".join(effect.name for effect in effects if not effect.shape)
+            beside_clause = f", beside {other_names}" if other_names else ""
+            sentence = (
+                f"An effect of the family {family} is missing, with a fitted shape{beside_clause}."
+            )
         return self.build_outcome(
             VerdictKind.FAMILY,
             sentence,
@@ -249,6 +257,21 @@ class Conclusion:
             family=family,
             gates=gates,
         )
+
+
+def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis) -> str:
+    """Return the sentence on a force of free shape; empty if the hypothesis is none."""
+    terms = hypothesis.candidate.terms
+    table = terms[0].effect.table if len(terms) == 1 else None
+    if table is None:
+        return ""
+    (term,) = terms
+    force_unit, _ = problem.model.port_units(term.place)
+    shape = curve_in_words(table.displacements, table.functions @ hypothesis.effect, force_unit)
+    return (
+        f"A force that follows the displacement is missing at {term.place}, and no law of the "
+        f"catalogue has its shape: {shape}."
+    )
 
 
 # ---------------------------------------------------------------- records of hypotheses
@@ -291,12 +314,17 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
     first_parameter = 0
     effects = []
     for term, values in hypothesis.candidate.split_by_term(hypothesis.effect):
-        estimates = []
-        for index, parameter in enumerate(term.parameters):
-            bounds = (float(low[first_parameter + index]), float(high[first_parameter + index]))
-            estimates.append(_estimate(parameter, float(values[index]), bounds))
-        first_parameter += len(estimates)
         parameter_count = len(term.effect.parameters)
+        if term.effect.table is not None:
+            numbers = slice(first_parameter, first_parameter + parameter_count)
+            estimates = _forces_of_table(problem, term, hypothesis, numbers)
+            parameter_count = len(estimates)
+        else:
+            estimates = []
+            for number, parameter in enumerate(term.parameters, start=first_parameter):
+                bounds = (float(low[number]), float(high[number]))
+                estimates.append(_estimate(parameter, float(hypothesis.effect[number]), bounds))
+        first_parameter += len(term.parameters)
         effects.append(
             NamedEffect(
                 identifier=term.effect.identifier,
@@ -309,6 +337,52 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
             )
         )
     return tuple(effects)
+
+
+def _forces_of_table(
+    problem: Problem, term: EffectTerm, hypothesis: ComparedHypothesis, numbers: slice
+) -> list[ParameterEstimate]:
+    """Return the forces of a curve of free shape at some displacements, with 90 % intervals.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model.
+    term : EffectTerm
+        The curve at its port.
+    hypothesis : ComparedHypothesis
+        The hypothesis with the posterior of the amplitudes.
+    numbers : slice
+        The numbers of the amplitudes among the effect parameters of the hypothesis.
+    """
+    table = term.effect.table
+    assert table is not None
+    functions = table.functions[::TOLD_POINT]
+    amplitudes = hypothesis.effect[numbers]
+    first_effect = len(hypothesis.shared)
+    covariance = hypothesis.covariance[first_effect:, first_effect:][numbers, numbers]
+    forces = functions @ amplitudes
+    variances = np.sum((functions @ covariance) * functions, axis=1)
+    half_widths = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
+    force_unit, displacement_unit, *_ = problem.model.port_units(term.place)
+    estimates = []
+    for displacement, force, half_width in zip(
+        table.displacements[::TOLD_POINT].tolist(),
+        forces.tolist(),
+        half_widths.tolist(),
+        strict=True,
+    ):
+        estimates.append(
+            ParameterEstimate(
+                name=f"force_at_{displacement:.3g}",
+                value=force,
+                low=force - half_width,
+                high=force + half_width,
+                unit=force_unit,
+                description=f"force at a displacement of {displacement:.3g} {displacement_unit}",
+            )
+        )
+    return estimates
 
 
 def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatArray]:

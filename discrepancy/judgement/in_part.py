@@ -27,6 +27,7 @@ from .conclusion import (
     Conclusion,
     VerdictOutcome,
     WeightedHypothesis,
+    curve_sentence,
     effects_text,
     has_one_driven_channel,
     is_negligible_instrument_error,
@@ -257,10 +258,16 @@ def _named_in_part_outcome(
         phrases.append(f"an effect of the family {family}, with a fitted shape,")
     # what it explains, and what remains
     share_clause = comparison.closed_share_clause(best_hypothesis)
-    sentence = (
-        f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
-        f"{share_clause}."
-    )
+    missing = curve_sentence(comparison.problem, best_hypothesis)
+    if missing:
+        sentence = (
+            f"{missing} {capital(share_clause)} (probability {probability_text(probability)})."
+        )
+    else:
+        sentence = (
+            f"{capital(listing(phrases))} is missing (probability "
+            f"{probability_text(probability)}): {share_clause}."
+        )
     if comparison.has_held_out and not share.held_out:
         sentence += " In the held-out trials it has hardly any force."
     unexplained_text = comparison.unexplained_text(best_hypothesis, share)

@@ -1,7 +1,6 @@
 """Tables of a lumped model's file: damping, loads, outputs, ports, laws and controllers."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
@@ -260,7 +259,7 @@ class LawSection(Section):
         row = {"kind": self.kind, "port": self.port, **(self.model_extra or {})}
         (law,) = ModelPatch.from_list([row], f"the law {self.name!r}")
         assert isinstance(law, PortForce)  # the kind is checked
-        return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
+        return law.scaled(factor)
 
 
 class ControllerSection(NamedSection):

@@ -20,6 +20,7 @@ from .laws.position import PowerStiffness as PowerStiffness
 from .laws.position import SineForce as SineForce
 from .laws.speed import Overflow as Overflow
 from .laws.speed import PowerDamping as PowerDamping
+from .laws.tables import TableStiffness as TableStiffness
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
 from .primitive import time_formula as time_formula
@@ -320,8 +321,15 @@ class ModelPatch:
         )
 
 
-_ACCEPTED_TYPES: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
-"""The types that a value may have in a file, by the type that it is converted to."""
+_ACCEPTED_TYPES: dict[type, tuple[type, ...]] = {
+    float: (float, int),
+    int: (int,),
+    str: (str,),
+    tuple: (list, tuple),
+}
+"""The types that a value may have in a file, by the type that it is converted to. A tuple is one of
+numbers."""
+_NAMES_OF_TYPES = {float: "a number", int: "a number", str: "text", tuple: "a list of numbers"}
 _WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 
@@ -377,13 +385,24 @@ def _checked_values(
     InvalidPatchError
         If a value is missing, superfluous or of another type.
     """
+    values: dict[str, Any] = {}
     for name, value in row.items():
         if name not in types:
             raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
-        if isinstance(value, bool) or not isinstance(value, _ACCEPTED_TYPES[types[name]]):
-            type_name = "text" if types[name] is str else "a number"
+        value_type = types[name]
+        numbers = value if isinstance(value, list | tuple) else ()
+        if not _is_accepted(value, value_type) or not all(
+            _is_accepted(number, float) for number in numbers
+        ):
+            type_name = _NAMES_OF_TYPES[value_type]
             raise InvalidPatchError(f"{where}: {name} must be {type_name}, but is {value!r}.")
+        values[name] = tuple(map(float, numbers)) if value_type is tuple else value_type(value)
     missing_names = [name for name in required if name not in row]
     if missing_names:
         raise InvalidPatchError(f"{where} lacks {', '.join(missing_names)}.")
-    return {name: types[name](value) for name, value in row.items()}
+    return values
+
+
+def _is_accepted(value: object, value_type: type) -> bool:
+    """Return whether a value of a file may stand for a value of a type; true and false may not."""
+    return isinstance(value, _ACCEPTED_TYPES[value_type]) and not isinstance(value, bool)

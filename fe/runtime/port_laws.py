@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
-from typing import Any
 
 import numpy as np
 
@@ -55,10 +54,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
             primitives.append(primitive)
             continue
         for port, fraction in zip(STATION_PORTS, area_fractions.tolist(), strict=True):
-            changes: dict[str, Any] = {}
-            for name in primitive.proportional:
-                changes[name] = fraction * getattr(primitive, name)
-            primitives.append(replace(primitive, **changes, port=port))
+            primitives.append(replace(primitive.scaled(fraction), port=port))
     return ModelPatch(tuple(primitives))
 
 

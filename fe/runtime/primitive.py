@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from inspect import get_annotations
 from math import inf, isfinite
-from typing import Any, ClassVar, NamedTuple, dataclass_transform
+from typing import Any, ClassVar, NamedTuple, dataclass_transform, get_origin
 
 import numpy as np
 
@@ -47,9 +47,10 @@ def time_formula(text: str, kind: str) -> Expression:
 
 
 def _type_of_value(declared_type: Any) -> type:
-    """Return the type of a value; that of a number may be annotated with its unit."""
-    plain_type: type = getattr(declared_type, "__origin__", declared_type)
-    return plain_type
+    """Return the type of a value; that of a number, or of several, may have its unit beside it."""
+    plain_type = getattr(declared_type, "__origin__", declared_type)
+    value_type: type = get_origin(plain_type) or plain_type
+    return value_type
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
@@ -104,8 +105,8 @@ class Primitive:
         self._check_windows()
         for name in self._types_of_values:
             value = getattr(self, name)
-            is_number = isinstance(value, float | int) and not isinstance(value, bool)
-            if is_number and not isfinite(value):
+            numbers = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(number, float | int) and not isfinite(number) for number in numbers):
                 raise InvalidPatchError(
                     f"{name} of the primitive {self.kind!r} must be finite, but is {value!r}."
                 )

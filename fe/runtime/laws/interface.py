@@ -22,8 +22,9 @@ duration : float
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
+from dataclasses import replace
 from inspect import get_annotations
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -53,6 +54,15 @@ class PortForce(Primitive):
         """Names of the parameters that scale the force; without the first one there is no force."""
         first_number = next(iter(self.units))
         return (first_number,)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the law with its force multiplied by a factor."""
+        changes: dict[str, Any] = {}
+        for name in self.proportional:
+            value = getattr(self, name)
+            is_table = isinstance(value, tuple)
+            changes[name] = tuple(factor * item for item in value) if is_table else factor * value
+        return replace(self, **changes)
 
     @property
     def parameter_row(self) -> FloatArray:

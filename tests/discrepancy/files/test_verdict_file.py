@@ -127,7 +127,12 @@ def test_intervals_of_a_patch_are_those_of_its_draws(patch_read_back):
 
 
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
-VALUES = {float: NUMBER, int: st.integers(-5, 50), str: st.text(max_size=5)}
+VALUES = {
+    float: NUMBER,
+    int: st.integers(-5, 50),
+    str: st.text(max_size=5),
+    tuple: st.lists(NUMBER, max_size=4).map(tuple),
+}
 
 COURSE = st.sampled_from(["3 * time", "step(time - 1.5)"])
 
@@ -164,7 +169,7 @@ def test_every_key_is_in_the_schema_and_the_page(schema):
     assert {kind for kind in PRIMITIVES if f"`{kind}`" in page} == set(PRIMITIVES) == set(PRIMITIVE_UNITS)
     for kind, primitive in PRIMITIVES.items():  # every real parameter has a unit
         assert set(PRIMITIVE_UNITS[kind]) == {
-            key for key, own in primitive.value_types().items() if own is float
+            key for key, own in primitive.value_types().items() if own in (float, tuple)
         }
 
 

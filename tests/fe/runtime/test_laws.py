@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
+from scipy.interpolate import CubicHermiteSpline
 
 from fe.compilation import compiled_kernel
 from fe.runtime import laws, patch
 from fe.runtime.arrays import FORCE, FloatArray
-from fe.runtime.errors import SolutionError
+from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.motion import static_solution
 from fe.runtime.patch import (
@@ -22,6 +23,7 @@ from fe.runtime.patch import (
     PointMass,
     PowerStiffness,
     Primitive,
+    TableStiffness,
 )
 from fe.runtime.port_laws import STATION_PORTS, PortLaws, port_laws, spread_over_stations
 from fe.runtime.static_path import solve_port_position
@@ -34,7 +36,11 @@ INPUTS = Inputs(__file__)
 
 def read_laws(table: str) -> list[Primitive]:
     """Return the laws of a table of `laws.toml`, which has a row of kind and values for each."""
-    return [patch.PRIMITIVES[kind](*values) for kind, *values in INPUTS.table("laws.toml")[table]]
+    laws_of_table = []
+    for kind, *values in INPUTS.table("laws.toml")[table]:
+        fields = [tuple(value) if isinstance(value, list) else value for value in values]
+        laws_of_table.append(patch.PRIMITIVES[kind](*fields))
+    return laws_of_table
 
 
 LAW_OF_KIND = {law.kind: law for law in read_laws("each")}
@@ -85,6 +91,35 @@ def test_the_force_is_that_of_the_equation(kind, displacement):
 
     expected = force_of(LAW_OF_KIND[kind], displacement, displacement / STEP_LENGTH, memory)
     assert force == pytest.approx(expected, rel=1e-12)
+
+
+@given(
+    points=st.lists(st.tuples(st.floats(0.001, 0.02), st.floats(0.1, 9.0)), min_size=2, max_size=6),
+    share=st.floats(0.0, 1.0),
+)
+def test_a_table_is_a_cubic_hermite_curve_that_goes_straight_on(points, share):
+    widths, forces = zip(*points, strict=True)
+    displacements = np.cumsum(widths) - 0.02
+    law = make_laws(TableStiffness("planform", tuple(displacements), forces))
+    memory = law.unloaded_memory()
+    slopes = np.gradient(forces, displacements)
+    curve = CubicHermiteSpline(displacements, forces, slopes)
+
+    inside = displacements[0] + share * (displacements[-1] - displacements[0])
+    beyond = displacements[-1] + share
+    force_inside, _ = force_and_slope(law, memory, inside)
+    force_beyond, _ = force_and_slope(law, memory, beyond)
+
+    assert force_inside == pytest.approx(float(curve(inside)), rel=1e-9, abs=1e-9)
+    assert force_beyond == pytest.approx(forces[-1] + slopes[-1] * share, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("displacements", "forces"), [((0.0,), (1.0,)), ((0.0, 0.0), (1.0, 2.0)), ((0.0, 1.0), (1.0,))]
+)
+def test_a_table_without_rising_points_is_refused(displacements, forces):
+    with pytest.raises(InvalidPatchError, match="two or more rising numbers"):
+        make_laws(TableStiffness("planform", displacements, forces))
 
 
 @pytest.mark.parametrize("kind", LAW_OF_KIND)

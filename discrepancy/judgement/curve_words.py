@@ -1,0 +1,125 @@
+"""The shape of a force over the displacement in words, such as "no force up to 2 mm, then 480 N/m".
+
+A force counts positive against the motion, as that of a spring.
+"""
+
+import numpy as np
+
+from discrepancy.campaign.records import BoolArray, FloatArray
+from reporting.words import listing, number
+
+NO_FORCE = 0.12
+"""Fraction of the largest force below which a force counts as none."""
+LEAST_DEAD_BAND = 0.15
+"""Least width of a stretch without force, as a fraction of the range of the displacement."""
+STEADY_SLOPE = 0.5
+"""Slope next to a stretch without force over the slope at the end of the range, from which on the
+force rises like that of a spring with play."""
+ONE_SIDED = 0.2
+"""Largest force on one side over that on the other, up to which the force acts on one side only."""
+CONSTANT_EXPONENT, LINEAR_EXPONENT = 0.3, 1.2
+"""Exponents of the displacement below which a force is constant, and proportional."""
+
+
+def curve_in_words(displacements: FloatArray, forces: FloatArray, force_unit: str) -> str:
+    """Return how a force depends on the displacement, as the end of a sentence on that force.
+
+    Parameters
+    ----------
+    displacements : (P,) ndarray
+        The displacements, rising [m if the force has the unit N, else rad].
+    forces : (P,) ndarray
+        The force at each displacement [`force_unit`].
+    force_unit : str
+        N or N m.
+    """
+    motion = _displacement_text if force_unit == "N" else _turn_text
+    motion_unit = "m" if force_unit == "N" else "rad"
+    dead_band = _stretch_without_force(displacements, forces)
+    if dead_band is None:
+        return _growth(displacements, forces)
+    low, high = dead_band
+    slopes = []
+    if low > displacements[0]:
+        slope, low = _line_to_zero(displacements, forces, displacements <= low)
+        slopes.append(f"{number(slope)} {force_unit}/{motion_unit} below")
+    if high < displacements[-1]:
+        slope, high = _line_to_zero(displacements, forces, displacements >= high)
+        slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
+    return f"it is zero from {motion(low)} to {motion(high)}, with a slope of {listing(slopes)}"
+
+
+def _line_to_zero(
+    displacements: FloatArray, forces: FloatArray, is_beyond: BoolArray
+) -> tuple[float, float]:
+    """Return the slope of a force beyond a stretch without force, and where its line is zero."""
+    slope, at_zero = np.polyfit(displacements[is_beyond], forces[is_beyond], 1)
+    return float(slope), float(-at_zero / slope)
+
+
+def _stretch_without_force(
+    displacements: FloatArray, forces: FloatArray
+) -> tuple[float, float] | None:
+    """Return the ends of the stretch in which there is no force; None if there is none.
+
+    Beyond such a stretch the force rises at once. That of a cubic spring is also small in the
+    middle, but rises slowly there.
+    """
+    is_zero = np.abs(forces) <= NO_FORCE * np.abs(forces).max()
+    # the longest stretch of zeros
+    edges = np.flatnonzero(np.diff(np.r_[False, is_zero, False].astype(int)))
+    stretches = [(first, end - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+    if not stretches:
+        return None
+    first, last = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+    low, high = float(displacements[first]), float(displacements[last])
+    if high - low < LEAST_DEAD_BAND * np.ptp(displacements):
+        return None
+    slopes = np.abs(np.gradient(forces, displacements))
+    for beyond in (slopes[: first + 1][::-1], slopes[last:]):
+        count = len(beyond) // 3
+        if len(beyond) > 1 and not count:
+            return None
+        if count and beyond[:count].mean() < STEADY_SLOPE * beyond[-count:].mean():
+            return None
+    return low, high
+
+
+def _growth(displacements: FloatArray, forces: FloatArray) -> str:
+    """Return how a force grows with the displacement, and to which side it acts."""
+    at_zero = float(np.interp(0.0, displacements, forces))
+    changes = forces - at_zero
+    largest_by_side = {}
+    for side in (-1.0, 1.0):
+        on_side = np.where(side * displacements > 0.0, changes, 0.0)
+        largest_by_side[side] = float(np.abs(on_side).max())
+    stronger = max(largest_by_side, key=lambda side: largest_by_side[side])
+    is_one_sided = largest_by_side[-stronger] < ONE_SIDED * largest_by_side[stronger]
+    # the force on the stronger side, as a power of the displacement
+    on_side = (stronger * displacements > 0.0) & (np.abs(changes) > 0.0)
+    size = np.log(np.abs(changes[on_side]))
+    distance = np.log(np.abs(displacements[on_side]))
+    weights = np.sqrt(np.abs(changes[on_side]))  # small forces tell little of the power
+    exponent = float(np.polyfit(distance, size, 1, w=weights)[0])
+    end = int(np.argmax(np.where(on_side, np.abs(changes), 0.0)))
+    acts_against = changes[end] * displacements[end] > 0.0
+    if exponent < CONSTANT_EXPONENT:
+        growth = "it is nearly constant"
+    elif exponent < LINEAR_EXPONENT:
+        growth = "it grows in proportion to the displacement"
+    else:
+        verb = "stiffens" if acts_against else "softens"
+        growth = f"it {verb}, growing about as the power {exponent:.2g} of the displacement"
+    side_text = "positive" if stronger > 0.0 else "negative"
+    where = f" at {side_text} displacements only" if is_one_sided else ""
+    return f"{growth}{where}"
+
+
+def _displacement_text(displacement: float) -> str:
+    """Return a displacement in millimetres."""
+    return f"{number(round(1e3 * displacement, 3))} mm"
+
+
+def _turn_text(turn: float) -> str:
+    """Return a turn in radians."""
+    return f"{number(turn)} rad"

@@ -1,0 +1,44 @@
+"""The shape of a force over the displacement in words."""
+
+import numpy as np
+import pytest
+
+from discrepancy.judgement.curve_words import curve_in_words
+
+DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
+
+
+@pytest.mark.parametrize(
+    ("forces", "words"),
+    [
+        (
+            400.0 * np.maximum(DISPLACEMENTS - 0.007, 0.0),
+            "it is zero from −20 mm to 7 mm, with a slope of 400 N/m above",
+        ),
+        (
+            300.0 * np.sign(DISPLACEMENTS) * np.maximum(np.abs(DISPLACEMENTS) - 0.005, 0.0),
+            "it is zero from −5 mm to 5 mm, with a slope of 300 N/m below and 300 N/m above",
+        ),
+        (
+            1e6 * DISPLACEMENTS**3,
+            "it stiffens, growing about as the power 3 of the displacement",
+        ),
+        (
+            -1e5 * np.maximum(DISPLACEMENTS, 0.0) ** 2,
+            "it softens, growing about as the power 2 of the displacement "
+            "at positive displacements only",
+        ),
+        (80.0 * DISPLACEMENTS, "it grows in proportion to the displacement"),
+        (0.5 * np.sign(DISPLACEMENTS), "it is nearly constant"),
+    ],
+    ids=["stop", "play", "cubic", "one-sided", "linear", "constant"],
+)
+def test_a_curve_is_told_by_its_shape(forces, words):
+    assert curve_in_words(DISPLACEMENTS, forces, "N") == words
+
+
+def test_the_motion_of_a_moment_is_told_in_radians():
+    moments = 2.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0)
+    assert curve_in_words(DISPLACEMENTS, moments, "N m") == (
+        "it is zero from −0.02 rad to 0.01 rad, with a slope of 2 N m/rad above"
+    )
