@@ -27,6 +27,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.unlisted_laws.campaigns import drawn, write
 from benchmarks.unlisted_laws.kinds import KINDS, Kind
 from discrepancy.campaign.reading import read_campaign
+from discrepancy.catalogue.force_curve import FORCE_CURVE
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
 from discrepancy.missing_force.port_force import missing_force
@@ -123,8 +124,10 @@ def verdict_row(kind: Kind, verdict: Verdict, followed: tuple[str, ...]) -> dict
 def has_right_dependence(kind: Kind, effect: NamedEffect) -> bool:
     """Return whether an effect of a verdict depends on the same variable as the law of a kind.
 
-    An effect with a fitted shape stands for its family.
+    An effect with a fitted shape stands for its family, and a curve for what it runs over.
     """
+    if effect.identifier == FORCE_CURVE:
+        return kind.variables == ("displacement",)
     if effect.shape:
         return effect.family in kind.families
     return effect_label(effect.identifier, effect.place) in kind.effects

@@ -51,7 +51,8 @@ class EffectTerm:
     @property
     def name_in_words(self) -> str:
         """The name of the effect, or of its family if the shape of the law is free."""
-        return f"a law of the family {self.effect.family}" if self.free_shape else self.effect.name
+        is_family = self.free_shape and self.effect.table is None
+        return f"a law of the family {self.effect.family}" if is_family else self.effect.name
 
     @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:

@@ -241,12 +241,13 @@ class Conclusion:
         effects = named_effects(self.search.problem, fit_with_draws)
         free_terms = [term for term in fit.candidate.terms if term.free_shape]
         family = ", ".join(sorted({term.effect.family for term in free_terms}))
-        sentence = curve_sentence(self.search.problem, fit)
+        sentence = curve_sentence(self.search.problem, fit, probability)
         if not sentence:
             other_names = ", ".join(effect.name for effect in effects if not effect.shape)
             beside_clause = f", beside {other_names}" if other_names else ""
             sentence = (
-                f"An effect of the family {family} is missing, with a fitted shape{beside_clause}."
+                f"An effect of the family {family} is missing, with a fitted shape{beside_clause} "
+                f"(probability {probability_text(probability)})."
             )
         return self.build_outcome(
             VerdictKind.FAMILY,
@@ -259,8 +260,18 @@ class Conclusion:
         )
 
 
-def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis) -> str:
-    """Return the sentence on a force of free shape; empty if the hypothesis is none."""
+def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis, probability: float) -> str:
+    """Return the sentence on a force of free shape; empty if the hypothesis is none.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model.
+    hypothesis : ComparedHypothesis
+        The hypothesis at its most probable values.
+    probability : float
+        Its probability.
+    """
     terms = hypothesis.candidate.terms
     table = terms[0].effect.table if len(terms) == 1 else None
     if table is None:
@@ -269,8 +280,8 @@ def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis) -> str:
     force_unit, _ = problem.model.port_units(term.place)
     shape = curve_in_words(table.displacements, table.functions @ hypothesis.effect, force_unit)
     return (
-        f"A force that follows the displacement is missing at {term.place}, and no law of the "
-        f"catalogue has its shape: {shape}."
+        f"A force that follows the displacement is missing at {term.place} (probability "
+        f"{probability_text(probability)}), and no law of the catalogue has its shape: {shape}."
     )
 
 

@@ -500,6 +500,8 @@ def missing_force_of_verdict(
     if len({law.place for law in laws}) > 1:
         names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
         at_port = replace(at_port, law=" and ".join(names_at_ports))
+    if estimate.leaves_no_force:
+        return replace(force, at_port=at_port)
     # if the shares cannot be computed, the force is returned without them
     with suppress(*ESTIMATION_ERRORS):
         shares = ForceShares(search)

@@ -229,7 +229,8 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
         cards.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
     if proof is not None and proof.closed is not None:
         taken_or_added = "taken away" if proof.closed.value >= 0.0 else "added"
-        reservation = "" if verdict.kind in NAMING else ", which is not named"
+        is_named = verdict.kind in (*NAMING, VerdictKind.FAMILY)
+        reservation = "" if is_named else ", which is not named"
         meaning = (
             f"of the mean square error in {proof.closed.trials} trials is {taken_or_added} by "
             f"{added_label(investigation)}{reservation}"

@@ -169,7 +169,7 @@ def error_sentence(investigation: Investigation) -> str:
         return ""
     if proof.closed is None:
         return proof.closed_reason
-    is_named = investigation.verdict.kind in NAMING
+    is_named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
     # the clause begins with the subject "it", which is replaced
     before, after, _ = proof_scores(proof)
     errors = ErrorComparison(proof.closed, proof.closed_reason, before.rms, after.rms)

@@ -94,7 +94,8 @@ def test_the_effects_of_right_dependence_are_in_the_catalogue():
 
 
 def _effect(identifier: str, place: str = "mass", *, free_shape: bool = False) -> NamedEffect:
-    (family,) = (effect.family for effect in library() if effect.identifier == identifier)
+    families = {effect.identifier: effect.family for effect in library()}
+    family = families.get(identifier, identifier)
     shape = (ParameterEstimate("exponent", 1.0, 0.9, 1.1, "1"),) if free_shape else ()
     return NamedEffect(identifier, identifier, place, family, (), shape, ModelPatch())
 
@@ -108,6 +109,7 @@ def _effect(identifier: str, place: str = "mass", *, free_shape: bool = False) -
         ("group", [_effect("coulomb_friction"), _effect("clock_error", "")], "false name"),
         ("family", [_effect("quadratic_damping", free_shape=True)], "false name"),
         ("family", [_effect("breathing_crack", free_shape=True)], "dependence"),
+        ("family", [_effect("force_over_displacement")], "dependence"),
         ("unexplained", [], "no name"),
     ],
 )

@@ -25,8 +25,7 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
         ),
         (
             -1e5 * np.maximum(DISPLACEMENTS, 0.0) ** 2,
-            "it softens, growing about as the power 2 of the displacement "
-            "at positive displacements only",
+            "it softens, growing about as the power 2 of the displacement at positive displacements only",
         ),
         (80.0 * DISPLACEMENTS, "it grows in proportion to the displacement"),
         (0.5 * np.sign(DISPLACEMENTS), "it is nearly constant"),
