@@ -13,7 +13,7 @@ import pytest
 from fe.structure.mesh_file import read_mesh
 from scenarios import structure_files
 from tests.command_line import refused, said
-from uav_twin import load_scenario
+from uav_twin import load_scenario, open_run
 from uav_twin.init_command import KINDS
 from uav_twin.projects.mesh import draft_part
 
@@ -51,6 +51,8 @@ def test_a_project_runs_at_once_to_its_report(project):
             if not any(words in command for words in WITHOUT_END):
                 said(*shlex.split(command)[1:])
     assert (copy / REPORTS[kind]).is_file()
+    if kind != "rig":  # the first flight shows a decision: the twin leaves the hard control
+        assert set(open_run(copy / "runs/first")["observed"]["control_index"].values) == {0, 1}
 
 
 def test_every_file_names_its_schema_to_editors(project):

@@ -39,6 +39,8 @@ _REWARDS = (-0.1, 0.1)
 """Rewards of the gentle and of the hard control."""
 _WORSENING = (0.03, 0.08)
 """Probabilities that a damage gets worse by a level, under both controls."""
+_GAMMA = 0.8
+"""The discount factor of the mission, as in its template."""
 _STEPS_TO_SETTLE = 5
 _NOISE = 0.05
 """Noise as a fraction of the change between no damage and the largest one."""
@@ -215,9 +217,14 @@ def _sensors(draft: FmuDraft, readings: FloatArray) -> dict[str, object]:
     rise = np.where(healthy > 0.0, (worst - healthy) / np.where(healthy > 0.0, healthy, 1.0), 0.0)
     limited = int(np.argmax(rise))
     limit = rounded_to(float(hard_readings[_LEVELS - 2, limited])) or 1.0
-    # The gentle control is the better one from the last level but one on, if that can be
-    saved = (hard_readings - readings[0])[:, limited] / limit
-    weight = float(saved[_LEVELS - 3 : _LEVELS - 1].mean()) / (_REWARDS[1] - _REWARDS[0])
+    # The gentle control is the better one from the last level but one on, if that can be: what it
+    # saves at once there, and what it saves in later steps because it wears less, equal what it
+    # costs.
+    saved_at_once = (hard_readings - readings[0])[:, limited] / limit
+    loss_of_level = float(np.diff(hard_readings[: _LEVELS - 1, limited]).mean()) / limit
+    saved_later = _GAMMA / (1.0 - _GAMMA) * (_WORSENING[1] - _WORSENING[0]) * loss_of_level
+    saved = float(saved_at_once[_LEVELS - 3 : _LEVELS - 1].mean()) + max(saved_later, 0.0)
+    weight = saved / (_REWARDS[1] - _REWARDS[0])
     titles: list[str] = []
     for entry in draft.binding.observation.values():
         titles += entry.variables
