@@ -22,6 +22,8 @@ _ALLOWED_OVERLAP = 4.0
 """Overlap of two boxes that is ignored, since it is the margin around their letters [pt]."""
 _MARGIN = 3.0
 """Margin around the boxes of a tile [pt]."""
+_WIDER_LETTERS = 0.1
+"""Space behind the text of a legend, as a fraction of it: a browser may have wider letters."""
 _POINTS_PER_INCH = 72.0
 
 
@@ -95,6 +97,7 @@ def _boxes_of_entries(legend: Legend, renderer: RendererAgg) -> list[Bbox]:
     boxes = []
     for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
         box = text.get_window_extent(renderer)
+        box = Bbox.from_extents(box.x0, box.y0, box.x1 + _WIDER_LETTERS * box.width, box.y1)
         if handle is not None:
             box_of_handle = handle.get_window_extent(renderer)
             if np.isfinite(box_of_handle.extents).all():  # a handle without a line has no extent
@@ -156,7 +159,7 @@ def _split_into_narrow_groups(boxes: Sequence[Tile]) -> Iterator[list[Tile]]:
         return
     x_start = min(box.x for box in boxes)
     x_end = max(box.x_end for box in boxes)
-    if x_end - x_start <= NARROW:
+    if x_end - x_start <= NARROW - 2.0 * _MARGIN:
         yield list(boxes)
         return
     columns = _separate(boxes, lambda box: (box.x, box.x_end))
@@ -201,7 +204,7 @@ def _side_by_side(columns: Sequence[list[Tile]]) -> list[list[Tile]]:
     for column in columns[1:]:
         x_start = min(box.x for box in groups[-1])
         x_end = max(box.x_end for box in column)
-        if x_end - x_start <= NARROW:
+        if x_end - x_start <= NARROW - 2.0 * _MARGIN:
             groups[-1] += column
         else:
             groups.append(list(column))
