@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.unlisted_laws.campaigns import drawn, write
 from benchmarks.unlisted_laws.kinds import KINDS, Kind
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.catalogue.force_curve import FORCE_CURVE
+from discrepancy.catalogue.force_curve import IDENTIFIERS
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
 from discrepancy.missing_force.port_force import missing_force
@@ -126,8 +126,9 @@ def has_right_dependence(kind: Kind, effect: NamedEffect) -> bool:
 
     An effect with a fitted shape stands for its family, and a curve for what it runs over.
     """
-    if effect.identifier == FORCE_CURVE:
-        return kind.variables == ("displacement",)
+    for variable, identifier in IDENTIFIERS.items():
+        if effect.identifier == identifier:
+            return kind.variables == (variable,)
     if effect.shape:
         return effect.family in kind.families
     return effect_label(effect.identifier, effect.place) in kind.effects

@@ -264,17 +264,20 @@ class EffectKeys:
 
 @dataclass(frozen=True, eq=False)
 class ForceTable:
-    """A force over the displacement of a port, as a sum of functions with free amplitudes.
+    """A force over the displacement or velocity of a port: functions with free amplitudes.
 
     Attributes
     ----------
-    displacements : (P,) ndarray
-        The displacements, rising [m or rad].
+    variable : {"displacement", "velocity"}
+        What the force follows.
+    points : (P,) ndarray
+        The displacements or velocities, rising [m or rad, or per s].
     functions : (P, K) ndarray
-        The force at each displacement for a unit of each of the K amplitudes [N or N m].
+        The force at each point for a unit of each of the K amplitudes [N or N m].
     """
 
-    displacements: FloatArray
+    variable: Literal["displacement", "velocity"]
+    points: FloatArray
     functions: FloatArray
 
 

@@ -1,4 +1,4 @@
-"""A force of free shape at a port: a curve over the displacement that no equation prescribes.
+"""A force of free shape at a port: a curve over the displacement or the velocity.
 
 The prior of the curve is a Gaussian process (Rasmussen and Williams 2006, *Gaussian Processes for
 Machine Learning*, chapter 2). It is written as a sum of functions with independent amplitudes (the
@@ -7,6 +7,7 @@ Karhunen-Loeve expansion), so that the curve is an effect with ordinary paramete
 
 from collections.abc import Mapping
 from functools import cache
+from typing import Literal
 
 import numpy as np
 
@@ -20,17 +21,24 @@ from discrepancy.catalogue.entry import (
     Prior,
     Setting,
 )
-from fe.runtime.patch import ModelPatch, TableStiffness
+from fe.runtime.patch import ModelPatch, TableDamping, TableStiffness
 
-FORCE_CURVE = "force_over_displacement"
-"""Identifier of a force of free shape over the displacement."""
+IDENTIFIERS = {"displacement": "force_over_displacement", "velocity": "force_over_velocity"}
+"""Identifier of a force of free shape, by what it follows."""
 POINT_COUNT = 49
 """Number of points of the table of a curve."""
 CORRELATION_LENGTHS = (0.12, 0.06)
-"""Correlation lengths that are tried, as fractions of the range of the displacement. The shorter
-one follows a sharper bend, such as that of a stop, and costs evidence where the curve is smooth."""
+"""Correlation lengths that are tried, as fractions of the range. The shorter one follows a sharper
+bend, such as that of a stop, and costs evidence where the curve is smooth."""
+DENSE_VELOCITY = 0.03
+"""Velocity over the largest one below which the points of a curve are evenly spaced. Beyond it they
+are spaced by its logarithm, since friction changes most near zero."""
 NEGLECTED_VARIANCE = 1e-4
 """Share of the prior variance that the neglected functions would have."""
+
+Variable = Literal["displacement", "velocity"]
+VARIABLES: tuple[Variable, ...] = ("displacement", "velocity")
+"""What a curve may run over."""
 
 
 @cache
@@ -53,29 +61,61 @@ def curve_functions(correlation_length: float) -> FloatArray:
     return np.asarray(shapes[:, :count] * np.sqrt(variances[:count]))
 
 
+def curve_points(variable: Variable, low: float, high: float) -> FloatArray:
+    """Return the points (P,) of a curve between two ends, dense around zero for velocities."""
+    if variable == "displacement":
+        return np.linspace(low, high, POINT_COUNT)
+    dense = DENSE_VELOCITY * max(abs(low), abs(high))
+    ends = np.arcsinh(low / dense), np.arcsinh(high / dense)
+    return np.asarray(dense * np.sinh(np.linspace(*ends, POINT_COUNT)))
+
+
+def variance_along_curve(variable: Variable, values: FloatArray, force: FloatArray) -> float:
+    """Return the share of a force's mean square that a curve over a variable explains.
+
+    Parameters
+    ----------
+    variable : {"displacement", "velocity"}
+        What the curve runs over.
+    values, force : (N,) array
+        The variable and the force at the same times.
+    """
+    points = curve_points(variable, float(values.min()), float(values.max()))
+    functions = curve_functions(CORRELATION_LENGTHS[0])
+    at_values = np.column_stack([np.interp(values, points, shape) for shape in functions.T])
+    amplitudes = np.linalg.lstsq(at_values, force, rcond=None)[0]
+    left = force - at_values @ amplitudes
+    return 1.0 - float(left @ left) / float(force @ force)
+
+
 def force_curve(
     port: str,
-    displacements: tuple[float, float],
+    variable: Variable,
+    ends: tuple[float, float],
     force_deviation: float,
     correlation_length: float = CORRELATION_LENGTHS[0],
 ) -> Effect:
-    """Return the effect of a force that is any smooth curve over the displacement of a port.
+    """Return the effect of a force that is any smooth curve over the motion of a port.
 
     Parameters
     ----------
     port : str
         Name of the port.
-    displacements : tuple of float
-        Least and largest displacement in the trials [m or rad].
+    variable : {"displacement", "velocity"}
+        What the curve runs over.
+    ends : tuple of float
+        Least and largest displacement or velocity in the trials [m or rad, or per s].
     force_deviation : float
-        Prior standard deviation of the force at each displacement [N or N m].
+        Prior standard deviation of the force at each point [N or N m].
     correlation_length : float
-        Correlation length of the curve, as a fraction of the range of the displacement.
+        Correlation length of the curve, as a fraction of the range.
     """
     table = ForceTable(
-        displacements=np.linspace(*displacements, POINT_COUNT),
+        variable=variable,
+        points=curve_points(variable, *ends),
         functions=force_deviation * curve_functions(correlation_length),
     )
+    law = TableStiffness if variable == "displacement" else TableDamping
     # a physical value of one is one prior standard deviation
     amplitude_prior = Prior("normal", -NINETY_PERCENT_QUANTILE, NINETY_PERCENT_QUANTILE)
     parameters = []
@@ -94,14 +134,14 @@ def force_curve(
     def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         amplitudes = np.array([values[parameter.name] for parameter in parameters])
         forces = tuple((table.functions @ amplitudes).tolist())
-        return ModelPatch((TableStiffness(place, tuple(table.displacements.tolist()), forces),))
+        return ModelPatch((law(place, tuple(table.points.tolist()), forces),))
 
     return Effect(
-        identifier=FORCE_CURVE,
-        name="force of free shape over the displacement",
-        family="force over the displacement",
-        equation="F = F(x), a curve through estimated points",
-        signature="The missing force is a function of the displacement.",
+        identifier=IDENTIFIERS[variable],
+        name=f"force of free shape over the {variable}",
+        family=f"force over the {variable}",
+        equation=f"F = F({variable}), a curve through estimated points",
+        signature=f"The missing force is a function of the {variable}.",
         reference="Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, chapter 2",
         acts_on=DYNAMIC,
         parameters=tuple(parameters),

@@ -13,7 +13,12 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.force_curve import CORRELATION_LENGTHS, force_curve
+from discrepancy.catalogue.force_curve import (
+    CORRELATION_LENGTHS,
+    VARIABLES,
+    force_curve,
+    variance_along_curve,
+)
 from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm
 
 from .estimate import Estimate
@@ -288,28 +293,37 @@ class _Ranking:
             best_estimate = self.best
 
     def estimate_curve(self) -> Estimate | None:
-        """Estimate a force of free shape over the displacement where no named law is enough.
+        """Estimate a force of free shape over the motion where no named law is enough.
 
         A named law is enough if it leaves no force, and no exponent of it had to be fitted. The
-        curve acts at the port that shows most of the missing force.
+        curve acts at the port that shows most of the missing force, and runs over what explains
+        more of that force: displacement or velocity.
         """
         if self.best.leaves_no_force and not self.best.candidate.has_free_shape:
             return None
         base = self.search.estimate_without_effects
         port = max(base.processes, key=self.search.force_deviation)
-        positions = np.concatenate(
-            [smoothed_trial.trajectory.positions[:, port] for smoothed_trial in base.trials]
+        force = np.concatenate([trial.missing_forces[port] for trial in base.trials])
+        values_of = {
+            "displacement": np.concatenate(
+                [trial.trajectory.positions[:, port] for trial in base.trials]
+            ),
+            "velocity": np.concatenate([trial.trajectory.speeds[:, port] for trial in base.trials]),
+        }
+        variable = max(
+            VARIABLES, key=lambda name: variance_along_curve(name, values_of[name], force)
         )
-        port_name = self.search.ports[port]
+        values = values_of[variable]
         estimates = []
         for correlation_length in CORRELATION_LENGTHS:
             curve = force_curve(
-                port_name,
-                (float(positions.min()), float(positions.max())),
+                self.search.ports[port],
+                variable,
+                (float(values.min()), float(values.max())),
                 CURVE_DEVIATION * self.search.force_deviation(port),
                 correlation_length,
             )
-            candidate = Candidate((EffectTerm(curve, port_name, free_shape=True),))
+            candidate = Candidate((EffectTerm(curve, self.search.ports[port], free_shape=True),))
             self.on_progress(f"estimating {candidate.description} together with the motion")
             estimate = self.search.estimate_effects(base, candidate, candidate.start_values())
             if estimate is not None:

@@ -278,9 +278,11 @@ def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis, probability
         return ""
     (term,) = terms
     force_unit, _ = problem.model.port_units(term.place)
-    shape = curve_in_words(table.displacements, table.functions @ hypothesis.effect, force_unit)
+    shape = curve_in_words(
+        table.variable, table.points, table.functions @ hypothesis.effect, force_unit
+    )
     return (
-        f"A force that follows the displacement is missing at {term.place} (probability "
+        f"A force that follows the {table.variable} is missing at {term.place} (probability "
         f"{probability_text(probability)}), and no law of the catalogue has its shape: {shape}."
     )
 
@@ -353,7 +355,7 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
 def _forces_of_table(
     problem: Problem, term: EffectTerm, hypothesis: ComparedHypothesis, numbers: slice
 ) -> list[ParameterEstimate]:
-    """Return the forces of a curve of free shape at some displacements, with 90 % intervals.
+    """Return the forces of a curve of free shape at some of its points, with 90 % intervals.
 
     Parameters
     ----------
@@ -375,22 +377,23 @@ def _forces_of_table(
     forces = functions @ amplitudes
     variances = np.sum((functions @ covariance) * functions, axis=1)
     half_widths = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
-    force_unit, displacement_unit, *_ = problem.model.port_units(term.place)
+    force_unit, motion_unit = problem.model.port_units(term.place)
+    unit = motion_unit if table.variable == "displacement" else f"{motion_unit}/s"
     estimates = []
-    for displacement, force, half_width in zip(
-        table.displacements[::TOLD_POINT].tolist(),
+    for point, force, half_width in zip(
+        table.points[::TOLD_POINT].tolist(),
         forces.tolist(),
         half_widths.tolist(),
         strict=True,
     ):
         estimates.append(
             ParameterEstimate(
-                name=f"force_at_{displacement:.3g}",
+                name=f"force_at_{point:.3g}",
                 value=force,
                 low=force - half_width,
                 high=force + half_width,
                 unit=force_unit,
-                description=f"force at a displacement of {displacement:.3g} {displacement_unit}",
+                description=f"force at a {table.variable} of {point:.3g} {unit}",
             )
         )
     return estimates

@@ -1,4 +1,4 @@
-"""The shape of a force over the displacement in words, such as "no force up to 2 mm, then 480 N/m".
+"""The shape of a force over the motion in words, such as "no force up to 2 mm, then 480 N/m".
 
 A force counts positive against the motion, as that of a spring.
 """
@@ -17,36 +17,68 @@ STEADY_SLOPE = 0.5
 force rises like that of a spring with play."""
 ONE_SIDED = 0.2
 """Largest force on one side over that on the other, up to which the force acts on one side only."""
+PEAK_OVER_END = 1.2
+"""Friction near rest over that at the largest velocity, from which on it has a peak near rest."""
+LEAST_POINTS_OF_FRICTION = 6
+"""Least number of points in each direction that can show such a peak."""
 CONSTANT_EXPONENT, LINEAR_EXPONENT = 0.3, 1.2
 """Exponents of the displacement below which a force is constant, and proportional."""
 
 
-def curve_in_words(displacements: FloatArray, forces: FloatArray, force_unit: str) -> str:
-    """Return how a force depends on the displacement, as the end of a sentence on that force.
+def curve_in_words(variable: str, points: FloatArray, forces: FloatArray, force_unit: str) -> str:
+    """Return how a force depends on the motion, as the end of a sentence on that force.
 
     Parameters
     ----------
-    displacements : (P,) ndarray
-        The displacements, rising [m if the force has the unit N, else rad].
+    variable : str
+        "displacement" or "velocity".
+    points : (P,) ndarray
+        The displacements or velocities, rising [m or m/s if the force has the unit N, else rad].
     forces : (P,) ndarray
-        The force at each displacement [`force_unit`].
+        The force at each point [`force_unit`].
     force_unit : str
         N or N m.
     """
-    motion = _displacement_text if force_unit == "N" else _turn_text
     motion_unit = "m" if force_unit == "N" else "rad"
-    dead_band = _stretch_without_force(displacements, forces)
+    if variable == "velocity":
+        return _friction_in_words(points, forces, force_unit, f"{motion_unit}/s")
+    dead_band = _stretch_without_force(points, forces)
     if dead_band is None:
-        return _growth(displacements, forces)
+        return _growth(variable, points, forces)
     low, high = dead_band
     slopes = []
-    if low > displacements[0]:
-        slope, low = _line_to_zero(displacements, forces, displacements <= low)
+    if low > points[0]:
+        slope, low = _line_to_zero(points, forces, points <= low)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} below")
-    if high < displacements[-1]:
-        slope, high = _line_to_zero(displacements, forces, displacements >= high)
+    if high < points[-1]:
+        slope, high = _line_to_zero(points, forces, points >= high)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
+    motion = _displacement_text if force_unit == "N" else _turn_text
     return f"it is zero from {motion(low)} to {motion(high)}, with a slope of {listing(slopes)}"
+
+
+def _friction_in_words(
+    velocities: FloatArray, forces: FloatArray, force_unit: str, velocity_unit: str
+) -> str:
+    """Return how a force depends on the velocity: as friction with a peak near rest, or a power."""
+    sizes = []
+    for side in (-1.0, 1.0):
+        on_side = side * velocities > 0.0
+        order = np.argsort(np.abs(velocities[on_side]))
+        sizes.append(side * forces[on_side][order])
+    count = min(len(size) for size in sizes)
+    if count < LEAST_POINTS_OF_FRICTION:
+        return _growth("velocity", velocities, forces)
+    # the mean of both directions, from rest to the largest velocity
+    mean_size = 0.5 * (sizes[0][:count] + sizes[1][:count])
+    speeds = np.sort(np.abs(velocities[velocities > 0.0]))[:count]
+    peak = int(np.argmax(mean_size))
+    if mean_size[peak] > PEAK_OVER_END * abs(mean_size[-1]) and peak < count // 2:
+        return (
+            f"it is largest near rest, and falls to {number(float(mean_size[-1]))} {force_unit} at "
+            f"{number(float(speeds[-1]))} {velocity_unit}"
+        )
+    return _growth("velocity", velocities, forces)
 
 
 def _line_to_zero(
@@ -85,8 +117,8 @@ def _stretch_without_force(
     return low, high
 
 
-def _growth(displacements: FloatArray, forces: FloatArray) -> str:
-    """Return how a force grows with the displacement, and to which side it acts."""
+def _growth(variable: str, displacements: FloatArray, forces: FloatArray) -> str:
+    """Return how a force grows with the displacement or velocity, and to which side it acts."""
     at_zero = float(np.interp(0.0, displacements, forces))
     changes = forces - at_zero
     largest_by_side = {}
@@ -106,12 +138,14 @@ def _growth(displacements: FloatArray, forces: FloatArray) -> str:
     if exponent < CONSTANT_EXPONENT:
         growth = "it is nearly constant"
     elif exponent < LINEAR_EXPONENT:
-        growth = "it grows in proportion to the displacement"
+        growth = f"it grows in proportion to the {variable}"
     else:
         verb = "stiffens" if acts_against else "softens"
-        growth = f"it {verb}, growing about as the power {exponent:.2g} of the displacement"
+        begin = f"it {verb}, growing" if variable == "displacement" else "it grows"
+        growth = f"{begin} about as the power {exponent:.2g} of the {variable}"
     side_text = "positive" if stronger > 0.0 else "negative"
-    where = f" at {side_text} displacements only" if is_one_sided else ""
+    plural = "displacements" if variable == "displacement" else "velocities"
+    where = f" at {side_text} {plural} only" if is_one_sided else ""
     return f"{growth}{where}"
 
 

@@ -13,7 +13,14 @@ from discrepancy.system.interface import Model
 from discrepancy.system.response import EITHER, MOVES, TURNS
 from discrepancy.verdict import NamedEffect, VerdictKind
 from discrepancy.workflow import Investigation
-from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive, SupportCompliance, TableStiffness
+from fe.runtime.patch import (
+    CHANNEL_UNIT,
+    ModelPatch,
+    Primitive,
+    SupportCompliance,
+    TableDamping,
+    TableStiffness,
+)
 from reporting.words import between, rounded
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
@@ -45,7 +52,7 @@ def si_sizes(
     for size in intervals:
         primitive = patch.primitives[size.primitive]
         unit = definite_unit(size.unit, primitive, model, campaign)
-        if isinstance(primitive, TableStiffness):
+        if isinstance(primitive, TableDamping | TableStiffness):
             continue  # the page has its points
         if not unit or size.parameter in BESIDE or size.value == 0.0:
             continue

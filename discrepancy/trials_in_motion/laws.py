@@ -17,7 +17,9 @@ from fe.runtime.laws.speed import (
     LEVEL,
     ONE_SIDED,
     POSITION_EXPONENT,
+    TABLE,
     steady_force,
+    table_integral,
 )
 from reporting.arrays import LEAST_DIVISOR
 
@@ -60,7 +62,7 @@ def mean_force(law: FloatArray, x: float, speed: float, half_width: float) -> fl
     """Return the mean of a law of the speed over a window of speeds, at a position of its port.
 
     The law is a power of the speed above a level, so that the mean is a difference of the next
-    higher powers.
+    higher powers, or a table, so that it is a difference of integrals of straight lines.
 
     Parameters
     ----------
@@ -73,6 +75,9 @@ def mean_force(law: FloatArray, x: float, speed: float, half_width: float) -> fl
     """
     if half_width == 0.0:
         return steady_force(law, x, speed)
+    if law[ONE_SIDED] == TABLE:
+        area = table_integral(law, speed + half_width) - table_integral(law, speed - half_width)
+        return float(area / (2.0 * half_width))
     low = speed - half_width - law[LEVEL]
     high = speed + half_width - law[LEVEL]
     if law[ONE_SIDED] == 1.0:

@@ -20,6 +20,7 @@ from .laws.position import PowerStiffness as PowerStiffness
 from .laws.position import SineForce as SineForce
 from .laws.speed import Overflow as Overflow
 from .laws.speed import PowerDamping as PowerDamping
+from .laws.speed import TableDamping as TableDamping
 from .laws.tables import TableStiffness as TableStiffness
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window

@@ -2,7 +2,9 @@
 
 Alone at a port of speed s a law gives s' = -strength |s - l|^p sgn(s - l) with the strength w k
 |x|^a, w the inverse mass of the port: its speed after a unit impulse. The functions below solve
-that in closed form. NumPy and relative imports only: this file is copied into the FMU.
+that in closed form. A law may also be a table of forces at speeds, with straight lines in between,
+along which the solution is closed, too. NumPy and relative imports only: this file is copied into
+the FMU.
 """
 
 from typing import Annotated, ClassVar
@@ -10,10 +12,14 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from ..arrays import POSITION
-from .interface import NOT_NEGATIVE, POSITIVE, FloatArray, PortForce, power
+from .interface import NOT_NEGATIVE, PARAMETERS, POSITIVE, FloatArray, PortForce, power
+from .tables import LEAST_DIVISOR, check_table
 
 COEFFICIENT, EXPONENT, POSITION_EXPONENT, LEVEL, ONE_SIDED = range(5)
-"""Columns of a law's parameters: k, p, a, l, and 1 if there is no force below the level."""
+"""Columns of a law's parameters: k, p, a, l, and 1 if there is no force below the level. With
+`TABLE` in the last one, the number of points follows, then their speeds, their forces over k, and
+the integral of these from the first point on."""
+TABLE = 2.0
 
 
 def force_of_mean_speed(
@@ -25,6 +31,9 @@ def force_of_mean_speed(
     largest one, with the sign for a forward motion.
     """
     exponent = law[EXPONENT]
+    if law[ONE_SIDED] == TABLE:
+        size, slope = table_force_and_slope(law, (x - memory[POSITION]) / duration)
+        return size, slope / duration
     size = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
     above_level = (x - memory[POSITION]) / duration - law[LEVEL]
     if law[ONE_SIDED] == 1.0 and above_level <= 0.0:
@@ -90,6 +99,122 @@ class Overflow(PortForce):
         return np.array((k, self.exponent, 0.0, self.level, 1.0))
 
 
+class TableDamping(PortForce):
+    """F(v) by a table: `forces` at rising `speeds`, with straight lines in between.
+
+    Before the first speed and beyond the last one the force is constant.
+    """
+
+    depends_on_speed: ClassVar[bool] = True
+    speeds: Annotated[tuple[float, ...], "m/s or rad/s"]
+    forces: Annotated[tuple[float, ...], "N or N m"]
+    force_and_slope = staticmethod(force_of_mean_speed)
+
+    @property
+    def proportional(self) -> tuple[str, ...]:
+        """The forces; the speeds do not scale the law."""
+        return ("forces",)
+
+    @property
+    def magnitude(self) -> float:
+        """The largest force of the table [N or N m]."""
+        return max(map(abs, self.forces), default=0.0)
+
+    @property
+    def parameter_row(self) -> FloatArray:
+        """The largest force as k, and the table as the head of this file says."""
+        forces = np.array(self.forces) / max(self.magnitude, LEAST_DIVISOR)
+        areas = 0.5 * (forces[1:] + forces[:-1]) * np.diff(self.speeds)
+        head = [self.magnitude, 1.0, 0.0, 0.0, TABLE, len(forces)]
+        return np.array([*head, *self.speeds, *forces, 0.0, *np.cumsum(areas)])
+
+    def check(self) -> None:
+        """Raise `InvalidPatchError` unless there are two points or more, in rising order."""
+        check_table(self, "speeds", self.speeds, self.forces)
+
+
+def table_force_and_slope(law: FloatArray, speed: float) -> tuple[float, float]:
+    """Return the force of a table at a speed, and its derivative by the speed."""
+    count = int(law[PARAMETERS])
+    speeds = law[PARAMETERS + 1 : PARAMETERS + 1 + count]
+    forces = law[PARAMETERS + 1 + count : PARAMETERS + 1 + 2 * count]
+    if speed <= speeds[0]:
+        return law[COEFFICIENT] * forces[0], 0.0
+    if speed >= speeds[-1]:
+        return law[COEFFICIENT] * forces[-1], 0.0
+    left = np.searchsorted(speeds, speed) - 1
+    slope = (forces[left + 1] - forces[left]) / (speeds[left + 1] - speeds[left])
+    force = forces[left] + slope * (speed - speeds[left])
+    return law[COEFFICIENT] * force, law[COEFFICIENT] * slope
+
+
+def table_integral(law: FloatArray, speed: float) -> float:
+    """Return the integral of the force of a table over the speed, from its first point on."""
+    count = int(law[PARAMETERS])
+    speeds = law[PARAMETERS + 1 : PARAMETERS + 1 + count]
+    forces = law[PARAMETERS + 1 + count : PARAMETERS + 1 + 2 * count]
+    integrals = law[PARAMETERS + 1 + 2 * count : PARAMETERS + 1 + 3 * count]
+    left = max(int(np.searchsorted(speeds, speed)) - 1, 0)
+    force, _ = table_force_and_slope(law, speed)
+    # the force is a straight line from the point at the left, or constant beyond the ends
+    mean_force = 0.5 * (law[COEFFICIENT] * forces[left] + force)
+    return float(law[COEFFICIENT] * integrals[left] + mean_force * (speed - speeds[left]))
+
+
+def speed_after_table(law: FloatArray, speed: float, strength: float, duration: float) -> float:
+    """Return the speed of a port after the force of a table has acted on it alone.
+
+    Along each straight line of the table the speed follows an exponential function. Where the force
+    is zero, the speed stays.
+
+    Parameters
+    ----------
+    law : (5 + E,) array
+        The table.
+    speed : float
+        Speed at the beginning.
+    strength : float
+        Deceleration by the largest force of the table.
+    duration : float
+        Duration [s].
+    """
+    count = int(law[PARAMETERS])
+    speeds = law[PARAMETERS + 1 : PARAMETERS + 1 + count]
+    forces = law[PARAMETERS + 1 + count : PARAMETERS + 1 + 2 * count]
+    remaining = duration
+    for _ in range(count + 2):
+        force = table_force_and_slope(law, speed)[0] / law[COEFFICIENT]
+        if force == 0.0:
+            return speed
+        # the next point in the direction in which the force drives the speed
+        falls = force > 0.0
+        if falls:
+            target = np.searchsorted(speeds, speed) - 1
+        else:
+            target = np.searchsorted(speeds, speed, "right")
+        if target < 0 or target >= count:  # beyond the table the force is constant
+            return float(speed - strength * force * remaining)
+        distance = speeds[target] - speed
+        slope = (forces[target] - force) / distance
+        rate = strength * slope
+        # the force changes as exp(-rate t), and reaches that of the point unless it vanishes before
+        ratio = forces[target] / force
+        if abs(ratio - 1.0) < 1e-9:
+            time_to_point = -distance / (strength * force)
+        elif ratio > 0.0:
+            time_to_point = -np.log(ratio) / rate
+        else:
+            time_to_point = np.inf
+        if time_to_point >= remaining:
+            decay = rate * remaining
+            if abs(decay) < 1e-9:
+                return float(speed - strength * force * remaining)
+            return float(speed + force / slope * np.expm1(-decay))
+        speed = speeds[target]
+        remaining -= time_to_point
+    return speed
+
+
 def can_hold(law: FloatArray) -> bool:
     """Return whether the force can bring a port to rest in finite time, and hold it there."""
     return bool(law[EXPONENT] < 1.0 and law[ONE_SIDED] == 0.0)
@@ -107,6 +232,8 @@ def strength(law: FloatArray, x: float, inverse_mass: float) -> float:
 
 def steady_force(law: FloatArray, x: float, speed: float) -> float:
     """Return the force at a position and a speed."""
+    if law[ONE_SIDED] == TABLE:
+        return float(table_force_and_slope(law, speed)[0])
     above_level = speed - law[LEVEL]
     if above_level == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0):
         return 0.0
@@ -127,6 +254,8 @@ def speed_after(
     sgn(s - l), which has a closed solution for each exponent. With `passes_zero`, dry friction
     keeps its sign when the speed passes zero, instead of stopping the port there.
     """
+    if law[ONE_SIDED] == TABLE:
+        return speed_after_table(law, speed, strength, duration)
     exponent = law[EXPONENT]
     above_level = speed - law[LEVEL]
     size = abs(above_level)

@@ -14,6 +14,27 @@ LEAST_DIVISOR = 1e-300
 """In place of the largest force of a table of zeros."""
 
 
+def check_table(
+    law: PortForce, name: str, positions: tuple[float, ...], forces: tuple[float, ...]
+) -> None:
+    """Raise `InvalidPatchError` unless a table has two points or more, in rising order.
+
+    Parameters
+    ----------
+    law : PortForce
+        The law, for the message.
+    name : str
+        Name of the positions, for the message.
+    positions, forces : tuple of float
+        The positions (displacements or speeds), and the force at each.
+    """
+    if len(positions) < 2 or len(forces) != len(positions) or np.any(np.diff(positions) <= 0.0):
+        raise InvalidPatchError(
+            f"{name} of {law.kind!r} must be two or more rising numbers, each with one of the "
+            f"forces, but are {list(positions)} with {len(forces)} forces."
+        )
+
+
 class TableStiffness(PortForce):
     """F(x) by a table: `forces` at rising `displacements`, and a smooth curve through these points.
 
@@ -48,12 +69,7 @@ class TableStiffness(PortForce):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` unless there are two points or more, in rising order."""
-        count = len(self.displacements)
-        if count < 2 or len(self.forces) != count or np.any(np.diff(self.displacements) <= 0.0):
-            raise InvalidPatchError(
-                f"displacements of {self.kind!r} must be two or more rising numbers, each with one "
-                f"of the forces, but are {list(self.displacements)} with {len(self.forces)} forces."
-            )
+        check_table(self, "displacements", self.displacements, self.forces)
 
     @staticmethod
     def force_and_slope(

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.unlisted_laws.campaigns import drawn, write
 from benchmarks.unlisted_laws.rig import law_force
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.catalogue.force_curve import CORRELATION_LENGTHS, FORCE_CURVE, curve_functions
+from discrepancy.catalogue.force_curve import CORRELATION_LENGTHS, curve_functions
 from discrepancy.estimation.estimate import Estimate
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.ranking import rank_hypotheses
@@ -39,7 +39,7 @@ def ranked(search: ForceSearch) -> Sequence[Estimate]:
 def test_the_curve_is_more_probable_than_a_law_of_another_shape(ranked):
     best, *others = ranked
 
-    assert [term.effect.identifier for term in best.candidate.terms] == [FORCE_CURVE]
+    assert [term.effect.identifier for term in best.candidate.terms] == ["force_over_displacement"]
     assert best.log_evidence > max(other.log_evidence for other in others) + 30.0
 
 

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from discrepancy.catalogue.force_curve import curve_points
 from discrepancy.judgement.curve_words import curve_in_words
 
+VELOCITIES = curve_points("velocity", -0.5, 0.5)
 DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
 
 
@@ -33,11 +35,27 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
     ids=["stop", "play", "cubic", "one-sided", "linear", "constant"],
 )
 def test_a_curve_is_told_by_its_shape(forces, words):
-    assert curve_in_words(DISPLACEMENTS, forces, "N") == words
+    assert curve_in_words("displacement", DISPLACEMENTS, forces, "N") == words
 
 
 def test_the_motion_of_a_moment_is_told_in_radians():
     moments = 2.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0)
-    assert curve_in_words(DISPLACEMENTS, moments, "N m") == (
+    assert curve_in_words("displacement", DISPLACEMENTS, moments, "N m") == (
         "it is zero from −0.02 rad to 0.01 rad, with a slope of 2 N m/rad above"
     )
+
+
+@pytest.mark.parametrize(
+    ("forces", "words"),
+    [
+        (
+            np.sign(VELOCITIES) * (0.4 + 0.6 * np.exp(-((VELOCITIES / 0.1) ** 2))),
+            "it is largest near rest, and falls to 0.4 N at 0.5 m/s",
+        ),
+        (np.sign(VELOCITIES), "it is nearly constant"),
+        (3.0 * VELOCITIES * np.abs(VELOCITIES), "it grows about as the power 2 of the velocity"),
+    ],
+    ids=["Stribeck", "dry", "drag"],
+)
+def test_friction_is_told_by_its_shape(forces, words):
+    assert curve_in_words("velocity", VELOCITIES, forces, "N") == words

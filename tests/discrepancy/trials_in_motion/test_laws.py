@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from discrepancy.trials_in_motion.laws import force_and_tangents, mean_force
-from fe.runtime.laws.speed import Overflow, steady_force
+from fe.runtime.laws.speed import Overflow, TableDamping, steady_force
 from fe.runtime.patch import PowerDamping, PowerStiffness
 
 TIME = np.linspace(0.0, 2.0, 401)
@@ -65,6 +65,17 @@ def test_the_mean_over_a_window_is_the_integral_of_the_law(exponent, speed, half
         law = Overflow("p", 2.0, max(exponent, 0.1), level, 5.0).parameter_row
     ends = speed - half_width, speed + half_width
     kinks = [point for point in (0.0, level or 0.0) if ends[0] < point < ends[1]]
+    integral, _ = quad(lambda v: steady_force(law, 0.3, v), *ends, points=kinks or None, epsabs=1e-12)
+    mean = integral / (2.0 * half_width)
+    assert mean_force(law, 0.3, speed, half_width) == pytest.approx(mean, rel=1e-6, abs=1e-8)
+
+
+@given(speed=st.floats(-2.0, 2.0), half_width=st.floats(1e-3, 1.0))
+def test_the_mean_of_a_table_over_a_window_is_its_integral(speed, half_width):
+    speeds = (-1.0, -0.1, 0.2, 0.9)
+    law = TableDamping("p", speeds, (-3.0, -2.0, 2.5, 1.0)).parameter_row
+    ends = speed - half_width, speed + half_width
+    kinks = [point for point in speeds if ends[0] < point < ends[1]]
     integral, _ = quad(lambda v: steady_force(law, 0.3, v), *ends, points=kinks or None, epsabs=1e-12)
     mean = integral / (2.0 * half_width)
     assert mean_force(law, 0.3, speed, half_width) == pytest.approx(mean, rel=1e-6, abs=1e-8)

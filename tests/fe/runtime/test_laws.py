@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from fe.compilation import compiled_kernel
@@ -14,6 +14,7 @@ from fe.runtime import laws, patch
 from fe.runtime.arrays import FORCE, FloatArray
 from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.laws.interface import PARAMETERS, PortForce
+from fe.runtime.laws.speed import speed_after
 from fe.runtime.motion import static_solution
 from fe.runtime.patch import (
     BoucWen,
@@ -23,6 +24,7 @@ from fe.runtime.patch import (
     PointMass,
     PowerStiffness,
     Primitive,
+    TableDamping,
     TableStiffness,
 )
 from fe.runtime.port_laws import STATION_PORTS, PortLaws, port_laws, spread_over_stations
@@ -118,8 +120,36 @@ def test_a_table_is_a_cubic_hermite_curve_that_goes_straight_on(points, share):
     ("displacements", "forces"), [((0.0,), (1.0,)), ((0.0, 0.0), (1.0, 2.0)), ((0.0, 1.0), (1.0,))]
 )
 def test_a_table_without_rising_points_is_refused(displacements, forces):
-    with pytest.raises(InvalidPatchError, match="two or more rising numbers"):
-        make_laws(TableStiffness("planform", displacements, forces))
+    for kind in (TableStiffness, TableDamping):
+        with pytest.raises(InvalidPatchError, match="two or more rising numbers"):
+            make_laws(kind("planform", displacements, forces))
+
+
+@given(
+    points=st.lists(st.tuples(st.floats(0.05, 0.5), st.floats(-3.0, 3.0)), min_size=2, max_size=6),
+    begin=st.floats(-2.0, 2.0),
+    duration=st.floats(0.0, 2.0),
+)
+@settings(deadline=None)
+def test_a_table_of_speeds_decelerates_as_its_equation(points, begin, duration):
+    widths, forces = zip(*points, strict=True)
+    speeds = np.cumsum(widths) - 1.0
+    law = make_laws(TableDamping("planform", tuple(speeds), (*forces[:-1], 1.5)))
+    row = law.parameters[0]
+    inverse_mass = 0.7
+
+    end = speed_after(row, begin, inverse_mass * row[0], duration, True)
+
+    solution = solve_ivp(
+        lambda t, v: [-inverse_mass * np.interp(v[0], speeds, (*forces[:-1], 1.5))],
+        (0.0, duration),
+        [begin],
+        method="LSODA",
+        rtol=1e-9,
+        atol=1e-10,
+        max_step=0.01,
+    )
+    assert end == pytest.approx(solution.y[0, -1], abs=2e-6)
 
 
 @pytest.mark.parametrize("kind", LAW_OF_KIND)
