@@ -386,7 +386,7 @@ def _checked_values(
     InvalidPatchError
         If a value is missing, superfluous or of another type.
     """
-    values: dict[str, Any] = {}
+    checked: dict[str, Any] = {}
     for name, value in row.items():
         if name not in types:
             raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
@@ -397,11 +397,11 @@ def _checked_values(
         ):
             type_name = _NAMES_OF_TYPES[value_type]
             raise InvalidPatchError(f"{where}: {name} must be {type_name}, but is {value!r}.")
-        values[name] = tuple(map(float, numbers)) if value_type is tuple else value_type(value)
+        checked[name] = tuple(map(float, numbers)) if value_type is tuple else value_type(value)
     missing_names = [name for name in required if name not in row]
     if missing_names:
         raise InvalidPatchError(f"{where} lacks {', '.join(missing_names)}.")
-    return values
+    return checked
 
 
 def _is_accepted(value: object, value_type: type) -> bool:

@@ -59,9 +59,11 @@ class PortForce(Primitive):
         """Return the law with its force multiplied by a factor."""
         changes: dict[str, Any] = {}
         for name in self.proportional:
-            value = getattr(self, name)
-            is_table = isinstance(value, tuple)
-            changes[name] = tuple(factor * item for item in value) if is_table else factor * value
+            size = getattr(self, name)
+            if isinstance(size, tuple):
+                changes[name] = tuple(factor * force for force in size)
+            else:
+                changes[name] = factor * size
         return replace(self, **changes)
 
     @property

@@ -130,7 +130,7 @@ def test_a_table_without_rising_points_is_refused(displacements, forces):
     begin=st.floats(-2.0, 2.0),
     duration=st.floats(0.0, 2.0),
 )
-@settings(deadline=None)
+@settings(deadline=None, max_examples=25)
 def test_a_table_of_speeds_decelerates_as_its_equation(points, begin, duration):
     widths, forces = zip(*points, strict=True)
     speeds = np.cumsum(widths) - 1.0
