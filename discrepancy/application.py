@@ -18,8 +18,12 @@ from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.proof_record import Proof
 from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
+from fe.runtime.errors import FiniteElementError
 from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
 from fe.runtime.state import DigitalState
+from fe.structure.changed_file import WRITTEN, changed_tables
+from fe.structure.design import MeshDesign, load_structure
 from fmu_asset.errors import PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.structure_fmu import pack_wing
@@ -72,9 +76,10 @@ def apply_verdict(
     out : path, optional
         The file to write. Its ending chooses the format: .json for a patch that refers to the
         model's file and can be used wherever a model is expected; .toml for a lumped model with the
-        effects as tables `[[law]]`; .fmu for a wing with the effects switched on. The default is
-        MODEL_patched in the working folder, as .toml if that format can express the effects, else
-        as .json.
+        effects as tables `[[law]]`, or a structure from a mesh with supports, masses and loads as
+        they were found; .fmu for a wing with the effects switched on. The default is
+        MODEL_patched in the working folder, as .toml if the model's own file can state the effects,
+        else as .json.
     member : str, optional
         Member of a group, one of `Verdict.group`; the first by default.
     replace : bool
@@ -105,12 +110,10 @@ def apply_verdict(
     applied_patch = _patch_to_apply(stored, verdict_file, member)
     choice = model_of(stored.origin, verdict_file, progress)
     patch = changed(applied_patch, origin=stored.origin).combine_with(choice.built_in)
-    has_laws_only = choice.kind is ModelKind.LUMPED and all(
-        isinstance(primitive, PortForce) and not primitive.windows for primitive in patch.patch
-    )
+    is_stated_by_file = _is_stated_by_file(choice, patch.patch)
     if out is None:
         stem = Path(choice.file or "wing").stem
-        out = f"{stem}_patched{'.toml' if has_laws_only else '.json'}"
+        out = f"{stem}_patched{'.toml' if is_stated_by_file else '.json'}"
     path = Path(out)
     _check_destination(path, choice, verdict_file, replace=replace)
     sentence = f"{_applied_effects(applied_patch)}, {_certainty_clause(applied_patch, stored)}."
@@ -119,16 +122,53 @@ def apply_verdict(
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
         return AppliedVerdict(path, sentence, "")
     if path.suffix == ".toml":
-        if not has_laws_only:
+        if not is_stated_by_file:
             raise ModelError(
-                f"{path}: only laws at the ports of a lumped model can be written into its own "
-                "file; give --out with the ending .json, which can be given wherever a model is "
-                "expected."
+                f"{path}: only laws at the ports of a lumped model, and supports, masses and loads "
+                "of a structure from a mesh, can be written into the model's own file; give --out "
+                "with the ending .json, which can be given wherever a model is expected."
             )
-        atomic_write_text(path, _lumped_text(choice, patch))
+        is_structure = choice.kind is ModelKind.STRUCTURE
+        text = _structure_text(choice, patch, path) if is_structure else _lumped_text(choice, patch)
+        atomic_write_text(path, text)
     else:
         files.write_patch(path, patch)
     return AppliedVerdict(path, sentence, _command_with_model(stored.origin.command, path))
+
+
+def _is_stated_by_file(choice: ModelChoice, patch: ModelPatch) -> bool:
+    """Return whether the own file of a model has tables for all primitives of a patch."""
+    if choice.kind is ModelKind.STRUCTURE and choice.path is not None:
+        is_of_mesh = isinstance(load_structure(choice.path), MeshDesign)
+        return is_of_mesh and all(isinstance(primitive, WRITTEN) for primitive in patch)
+    return choice.kind is ModelKind.LUMPED and all(
+        isinstance(primitive, PortForce) and not primitive.windows for primitive in patch
+    )
+
+
+def _structure_text(choice: ModelChoice, patch: files.StoredPatch, path: Path) -> str:
+    """Return the file of a structure, as text, with the changes and parameters of a patch.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot state a change.
+    """
+    assert choice.path is not None
+    with ModelError.instead_of(FiniteElementError, before=f"{path}: "):
+        tables = changed_tables(choice.path, patch.patch, path.parent)
+    calibrated = {parameter.name: parameter for parameter in patch.parameters}
+    for row in tables.get("parameter", ()):
+        if row["name"] in calibrated:
+            row["nominal"] = float(calibrated[row["name"]].mean)
+    for row in tables.get("mass", ()):
+        if row["name"] in calibrated:
+            row["mass"] = float(calibrated[row["name"]].mean)
+    tables["name"] = f"{tables['name']}_patched"
+    return (
+        f"# {patch.sentence}\n# Changes and parameters: {patch.origin.short_command}\n\n"
+        f"{toml_text(tables)}"
+    )
 
 
 def _check_destination(

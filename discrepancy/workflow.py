@@ -321,7 +321,7 @@ def _remarks(
     look_alikes = look_alike_remark(verdict, search.effects)
     if look_alikes is not None:
         remarks.append(look_alikes)
-    if not problem.model.parameters:
+    if len(problem.model.parameters) == len(problem.model.nuisance_parameters):
         remarks.append(
             f"The model {problem.model.name!r} has no uncertain parameter, so that a small error "
             "in stiffness or damping can be mistaken for an effect: give it uncertain parameters "

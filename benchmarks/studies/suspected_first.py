@@ -1,262 +1,177 @@
-"""What an engineer suspects first, named on a coarse mesh; the truth is CalculiX on a finer one.
+"""What an engineer suspects first, hidden in 24 campaigns, and what the verdicts say of it.
 
-A curved arm and a flat bar, clamped at one end, are loaded at the other end and released. The truth
-has twice as many elements along each axis, and its displacements and modes are those of CalculiX.
-It hides a soft clamp, a mass, a patch with less stiffness, a load that leans, a gauge that is
-turned, a gain error, or nothing. The model knows none of it. The figures stand in
-docs/how_to/soft_clamp.md.
+The truth is CalculiX on a mesh of twice as many cells along each axis as the model has: its
+displacements at rest and its modes. It hides a support that yields, a mass, a patch with less
+stiffness, a load or a gauge beside its place, a gain error, two of these, or nothing. The model
+knows none of it. The figures stand in docs/how_to/soft_clamp.md.
 
-    python -m benchmarks.studies.suspected_first            # all cases
-    python -m benchmarks.studies.suspected_first arm clamp  # one part, one case
+    python -m benchmarks.studies.suspected_first FOLDER            # all cases
+    python -m benchmarks.studies.suspected_first FOLDER arm plate  # two parts
+
+Truths are kept in FOLDER, so that a second run needs no CalculiX.
 """
 
+import re
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
-import meshio
 import numpy as np
 from scipy.sparse.linalg import spsolve
 
+from benchmarks.studies.suspected_parts import PARTS, Fault, Part, write_part
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
-from discrepancy.model_choice import load_model
+from discrepancy.system.structures import StructureModel
+from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import investigate
-from fe.elements.kinds import KINDS
+from fe.reduction.model_cache import changeable_model
 from fe.runtime.arrays import FloatArray
-from fe.structure.operators import Structure, load_and_assemble
+from fe.runtime.changeable import ChangeableModel
+from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_deck import Step, structure_deck
 from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
 
-LENGTH = 160.0
-WIDTH = 20.0
-HEIGHT = 8.0
-"""Size of the parts along, across and through [mm]."""
-RADIUS = LENGTH / (0.5 * np.pi)
-"""Radius of the middle line of the arm, a quarter of a circle [mm]."""
-DIVISIONS = (16, 2, 2)
-"""Elements of the model along, across and through; the truth has twice as many."""
-MODES = 6
-FORCE = 300.0
-"""Largest static force [N]."""
+MODES = 8
+"""Number of modes in the motion of a truth."""
 NOISE = {"strain": 2e-6, "displacement": 2e-6}
 """Standard deviations of readings [1 and m]."""
-INTERVAL = 2e-4
-"""Interval of the samples of a release [s]."""
+GAIN_DEVIATION = 0.005
+"""Standard deviation of the gains of the truth; the campaign states twice as much [1]."""
 SAMPLES = 200
 """Number of samples of a release."""
+SAMPLES_PER_PERIOD = 30.0
+"""Samples in a period of the first mode."""
 DAMPING = (1.0, 1e-5)
 """Rayleigh's alpha [1/s] and beta [s]."""
-
-TEXT = """name = "{part}"
-mesh = "part.vtu"
-length_unit = "mm"
-set = [{sets}]
-control = [{{ name = "pull", unit = "N", nominal = 100, minimum = -2000, maximum = 2000 }}]
-parameter = [{{ name = "e", minimum = 0.9, maximum = 1.1 }}]
-support = [{support}]
-load = [{{ name = "pull", control = "pull", point = {tip}, force = {force} }}]
-damage = [{{ name = "z", set = "declared" }}]
-mass = [{masses}]
-gauge = [{gauges}]
-displacement = [
-    {{ name = "tip", point = {tip}, direction = {force} }},
-    {{ name = "middle", point = {middle}, direction = {normal} }},
-]
-damping = {{ alpha = 1.0, beta = 1e-5 }}
-{materials}
-"""
+RELEASES = (("first", 0, 0.6), ("second", 1, 0.5), ("held out", 0, 0.4))
+"""Name of each release, number of its load, and fraction of the largest force."""
 
 
-@dataclass(frozen=True)
-class Hidden:
-    """What a truth hides: pieces of its structure file, a gain, and what a verdict should name."""
-
-    effect: str = ""
-    place: str = ""
-    pieces: dict[str, object] = field(default_factory=dict)
-    gain: float = 1.0
-    value: float = 0.0
+def support(place: str, motion: str, spring: float) -> Fault:
+    """Return a support that yields against a spring [N/m or N m/rad]."""
+    return Fault("support_compliance", place, motion, spring)
 
 
-def arm(points: FloatArray) -> FloatArray:
-    """Return points (n, 3) of a bar, bent to a quarter of a circle in the plane of x and z."""
-    along, across, through = points.T
-    angle = along / RADIUS
-    radius = RADIUS + through - 0.5 * HEIGHT
-    return np.column_stack((radius * np.sin(angle), across, radius * np.cos(angle) - RADIUS))
+def mass(x: float, y: float, z: float, kilograms: float) -> Fault:
+    """Return a mass at a point of the grid [mm]."""
+    return Fault("added_mass", value=kilograms, point=(x, y, z))
 
 
-def bar(points: FloatArray) -> FloatArray:
-    """Return points (n, 3) as they are, with the middle line at z = 0."""
-    return points - [0.0, 0.0, 0.5 * HEIGHT]
-
-
-PARTS: dict[str, Callable[[FloatArray], FloatArray]] = {"arm": arm, "bar": bar}
-
-
-def hidden_causes() -> dict[str, Hidden]:
-    """Return the cases by name."""
-    return {
-        "nothing": Hidden(),
-        "clamp": Hidden(
-            "support_compliance", "CLAMP, turn about y", {"spring": 6000.0}, value=6000.0
-        ),
-        "mass": Hidden("added_mass", "tip", {"mass": 0.02}, value=0.02),
-        "loss": Hidden("region_stiffness_loss", "patch", {"loss": 0.35}, value=0.35),
-        "lean": Hidden("load_direction", "pull, towards y", {"lean": 0.12}, value=0.12),
-        "turned gauge": Hidden("gauge_misalignment", "g3", {"turn": 0.4}, value=0.4),
-        "gain": Hidden("gauge_gain", "g2", gain=1.06, value=0.06),
-    }
-
-
-def write_part(folder: Path, part: str, refinement: int, hidden: Hidden) -> Path:
-    """Write mesh and structure file of a part, with what a truth hides."""
-    shape = PARTS[part]
-    points, cells = _grid(tuple(count * refinement for count in DIVISIONS))
-    mesh = meshio.Mesh(shape(points), [("hexahedron20", cells)])
-    meshio.write(folder / "part.vtu", mesh)
-    pieces = hidden.pieces
-
-    def place(along: float, across: float = 10.0, through: float = HEIGHT) -> list[float]:
-        point = shape(np.array([[along, across, through]]))[0]
-        return [round(float(value), 6) for value in point]
-
-    def direction(along: float, turn: float = 0.0) -> list[float]:
-        step = np.subtract(place(along + 0.1), place(along - 0.1))
-        tangent = step / np.linalg.norm(step)
-        turned = np.cos(turn) * tangent + np.sin(turn) * np.array([0.0, 1.0, 0.0])
-        return [float(value) for value in turned]
-
-    def slab(name: str, begin: float, end: float) -> str:
-        # parts are monotonic along x, so that slabs of x part them
-        low, high = (place(value, 10.0, 0.5 * HEIGHT)[0] for value in (begin, end))
-        return f'{{ name = "{name}", of = "cells", box = [[{low}, -99, -999], [{high}, 99, 999]] }}'
-
-    patch_begin = 64.0
-    patch_end = 80.0
-    sets = [
-        '{ name = "CLAMP", of = "nodes", box = [[-0.001, -99, -99], [0.001, 99, 99]] }',
-        slab("declared", 0.0, 16.0),
-    ]
-    steel = 'density = 7850\nyoung_modulus = {modulus}\npoisson_ratio = 0.3\nscaled_by = "e"\n'
-    materials = f'[[material]]\nname = "steel"\n{steel.format(modulus=2.1e11)}'
-    if "loss" in pieces:
-        slabs = {
-            "inner": (0.0, patch_begin),
-            "patch": (patch_begin, patch_end),
-            "outer": (patch_end, LENGTH),
-        }
-        sets += [slab(name, *ends) for name, ends in slabs.items()]
-        materials = ""
-        for name in slabs:
-            modulus = 2.1e11 * (1.0 - float(str(pieces["loss"])) * (name == "patch"))
-            materials += (
-                f'[[material]]\nname = "{name}"\nset = "{name}"\n{steel.format(modulus=modulus)}'
-            )
-    support = '{ set = "CLAMP", hold = ["x", "y", "z"] }'
-    if "spring" in pieces:
-        support = (
-            f'{{ set = "CLAMP", rigid_about = {place(0.0, 10.0, 0.5 * HEIGHT)}, '
-            'hold = ["x", "y", "z", "rx", "rz"], '
-            f"springs = [0, 0, 0, 0, {pieces['spring']}, 0] }}"
-        )
-    masses = [f'{{ name = "tool", point = {place(150.0)}, mass = 0.1 }}']
-    if "mass" in pieces:
-        masses.append(f'{{ name = "hidden", point = {place(LENGTH)}, mass = {pieces["mass"]} }}')
-    gauges = []
-    for number, along in enumerate((24.0, 56.0, 72.0, 104.0), start=1):
-        turn = float(str(pieces.get("turn", 0.0))) if number == 3 else 0.0
-        gauges.append(
-            f'{{ name = "g{number}", point = {place(along)}, direction = {direction(along, turn)}, '
-            "length = 3 }"
-        )
-    lean = float(str(pieces.get("lean", 0.0)))
-    force = [0.0, np.sin(lean), np.cos(lean)]
-    text = TEXT.format(
-        part=part,
-        sets=", ".join(sets),
-        support=support,
-        tip=place(LENGTH - 2.0),
-        force=[float(value) for value in force],
-        masses=", ".join(masses),
-        gauges=", ".join(gauges),
-        middle=place(80.0),
-        normal=[0.0, 0.0, 1.0],
-        materials=materials,
+def loss(low: tuple[float, ...], high: tuple[float, ...], fraction: float) -> Fault:
+    """Return a loss of stiffness in a box of the grid [mm]."""
+    x, y, z = 0.5 * (np.array(low) + np.array(high))
+    return Fault(
+        "region_stiffness_loss",
+        value=fraction,
+        point=(float(x), float(y), float(z)),
+        box=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
     )
-    text = text.replace(
-        f'name = "tip", point = {place(LENGTH - 2.0)}, direction = {[float(v) for v in force]}',
-        f'name = "tip", point = {place(LENGTH - 2.0)}, direction = [0.0, 0.0, 1.0]',
-    )
-    file = folder / "part.toml"
-    file.write_text(text, encoding="utf-8")
-    return file
 
 
-def _grid(divisions: tuple[int, ...]) -> tuple[FloatArray, np.ndarray]:
-    """Return points (n, 3) [mm] and cells (nc, 20) of a bar of 20-node hexahedra."""
-    kind = KINDS["hexahedron20"]
-    corners = np.array(
-        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-    )
-    starts = np.indices(divisions).reshape(3, -1).T
-    doubled = 2 * (starts[:, np.newaxis] + corners)
-    middles = [
-        (doubled[:, first] + doubled[:, second])[:, np.newaxis] // 2 for first, second in kind.edges
-    ]
-    nodes = np.concatenate((doubled, *middles), axis=1)
-    points, cells = np.unique(nodes.reshape(-1, 3), axis=0, return_inverse=True)
-    size = np.array([LENGTH, WIDTH, HEIGHT]) / (2.0 * np.array(divisions))
-    return points * size, cells.reshape(len(nodes), 20)
+GAIN_OF_G2 = Fault("gauge_gain", "g2", value=0.06)
+BRACKET_MASS = mass(70.0, 15.0, 8.0, 0.04)
+PORTAL_MASS = mass(67.0, 8.0, 150.0, 0.06)
+PLATE_LOSS = loss((49.0, 0.0, 0.0), (81.0, 45.0, 4.0), 0.4)
+CASES: tuple[tuple[str, tuple[Fault, ...]], ...] = (
+    ("bracket", ()),
+    ("bracket", (support("CLAMP", "ry", 3e4),)),
+    ("bracket", (BRACKET_MASS,)),
+    ("bracket", (loss((35.0, 0.0, 0.0), (54.0, 30.0, 8.0), 0.45),)),
+    ("bracket", (Fault("gauge_offset", "g3", value=0.006),)),
+    ("bracket", (support("CLAMP", "ry", 3e4), GAIN_OF_G2)),
+    ("portal", ()),
+    ("portal", ()),
+    ("portal", (support("LEFT", "ry", 8e3),)),
+    ("portal", (PORTAL_MASS,)),
+    ("portal", (loss((232.0, 0.0, 15.0), (240.0, 16.0, 48.0), 0.45),)),
+    ("portal", (Fault("load_offset", "down", "x", 0.009),)),
+    ("portal", (PORTAL_MASS, GAIN_OF_G2)),
+    ("plate", ()),
+    ("plate", (support("CLAMP", "ry", 1.2e5),)),
+    ("plate", (mass(110.0, 85.0, 4.0, 0.05),)),
+    ("plate", (PLATE_LOSS,)),
+    ("plate", (Fault("load_offset", "corner", "y", -0.007),)),
+    ("plate", (mass(110.0, 85.0, 4.0, 0.05), PLATE_LOSS)),
+    ("arm", ()),
+    ("arm", ()),
+    ("arm", (Fault("gauge_offset", "g2", value=-0.006),)),
+    ("arm", (Fault("gauge_gain", "g3", value=-0.06),)),
+    ("arm", (support("CLAMP", "ry", 2.5e4), mass(120.0, 10.0, 8.0, 0.03))),
+)
+"""Part and faults of each campaign."""
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Answers of CalculiX: outputs per newton at rest, and frequency, outputs and load of modes."""
+class Truth(NamedTuple):
+    """Answers of CalculiX.
+
+    Attributes
+    ----------
+    static : (L, O) array
+        Outputs at rest per newton of each load.
+    frequency : (M,) array
+        Natural frequencies [Hz].
+    shapes : (O, M) array
+        Outputs of mass-normalised modes.
+    loads : (L, M) array
+        Each load on the modes.
+    """
 
     static: FloatArray
     frequency: FloatArray
     shapes: FloatArray
-    load: FloatArray
+    loads: FloatArray
 
 
-def truth_of(file: Path, folder: Path) -> Truth:
-    """Return the answers of CalculiX for a structure file."""
-    structure: Structure = load_and_assemble(file, mass_as_stiffness=True)
-    deck = structure_deck(structure)
+def truth_of(folder: Path, part: Part, faults: Sequence[Fault]) -> Truth:
+    """Return the answers of CalculiX for a part with faults, or those that a folder keeps."""
+    kept = folder / "truth.npz"
+    if kept.is_file():
+        with np.load(kept) as arrays:
+            return Truth(**arrays)
+    folder.mkdir(parents=True, exist_ok=True)
+    structure = load_and_assemble(write_part(folder, part, 2, faults), mass_as_stiffness=True)
+    losses = [fault.value for fault in faults if fault.effect == "region_stiffness_loss"]
+    deck = replace(structure_deck(structure), values={"lost": losses[0]} if losses else {})
     prints = ["*NODE PRINT, NSET=NALL", "U"]
-    load = deck.loads["pull"]
-    nodal = read_tables(
-        run_calculix(deck.text(load._replace(lines=[*load.lines, *prints])), folder, "s")
-    )
-    modal_step = Step(lines=prints, procedure=("*FREQUENCY", f"{MODES}"))
-    modal = run_calculix(deck.text(modal_step), folder, "f")
     rows = np.concatenate(
         (structure.gauge_output.toarray(), structure.displacement_output.toarray())
     )
     nodes = len(structure.mesh.points)
+    expansion = structure.expansion
+    gram = (expansion.T @ expansion).tocsc()
 
-    def free(table: FloatArray) -> FloatArray:
-        """Return the free unknowns of nodal displacements, by least squares of the expansion."""
+    def free_unknowns(table: FloatArray) -> FloatArray:
+        """Return the free unknowns (n,) of nodal displacements, by least squares."""
         _, *displacements = table[:nodes].T
-        full = np.transpose(displacements).ravel()
-        expansion = structure.expansion
-        return np.asarray(spsolve((expansion.T @ expansion).tocsc(), expansion.T @ full))
+        return np.asarray(spsolve(gram, expansion.T @ np.transpose(displacements).ravel()))
 
-    shapes = np.column_stack([free(table) for table in _mode_tables(modal)])
+    # statics
+    static = []
+    for load in part.loads:
+        step = deck.loads[load.name]
+        job = deck.text(step._replace(lines=[*step.lines, *prints]))
+        nodal = read_tables(run_calculix(job, folder / load.name, "static"))["NALL"][0]
+        nominal = structure.control_value_alone(load.name)
+        static.append(rows @ free_unknowns(nodal) / nominal)
+    # modes
+    modal_step = Step(lines=prints, procedure=("*FREQUENCY", f"{MODES}"))
+    modal = run_calculix(deck.text(modal_step), folder / "modes", "modes")
+    shapes = np.column_stack([free_unknowns(table) for table in _mode_tables(modal)])
     modal_mass = np.sum(shapes * (structure.mass(structure.masses) @ shapes), axis=0)
     shapes = shapes / np.sqrt(modal_mass)
-    nominal = structure.control_value_alone("pull")
-    return Truth(
-        static=rows @ free(nodal["NALL"][0]) / nominal,
+    truth = Truth(
+        static=np.array(static),
         frequency=read_frequencies(modal),
         shapes=rows @ shapes,
-        load=structure.load("pull", 1.0) @ shapes,
+        loads=np.array([structure.load(load.name, 1.0) @ shapes for load in part.loads]),
     )
+    np.savez(kept, **truth._asdict())
+    return truth
 
 
 def _mode_tables(text: str) -> list[FloatArray]:
@@ -274,119 +189,228 @@ def _mode_tables(text: str) -> list[FloatArray]:
     return tables
 
 
-def write_campaign(folder: Path, truth: Truth, hidden: Hidden, seed: int) -> None:
-    """Write the campaign of a truth: two load lines, two releases and the noise at rest."""
-    names = [*(f"g{number}" for number in range(1, 5)), "tip", "middle"]
-    kinds = ["strain"] * 4 + ["displacement"] * 2
-    deviation = np.array([NOISE[kind] for kind in kinds])
+def write_campaign(
+    folder: Path, part: Part, truth: Truth, faults: Sequence[Fault], seed: int
+) -> None:
+    """Write the campaign of a truth: load lines, releases and the noise at rest."""
+    folder.mkdir(parents=True, exist_ok=True)
+    kinds = {gauge.name: "strain" for gauge in part.gauges}
+    kinds |= {sensor.name: "displacement" for sensor in part.displacements}
+    deviation = np.array([NOISE[kind] for kind in kinds.values()])
     generator = np.random.default_rng(seed)
-    gains = np.where(
-        [hidden.effect == "gauge_gain" and name == hidden.place for name in names], hidden.gain, 1.0
-    )
-    gains = gains * (1.0 + 0.003 * generator.standard_normal(len(names)))
-    omega = 2.0 * np.pi * truth.frequency
-    alpha, beta = DAMPING
-    ratio = 0.5 * (alpha / omega + beta * omega)
-    time_axis: FloatArray = np.arange(SAMPLES, dtype=np.float64) * INTERVAL
-
-    def noisy(values: FloatArray) -> FloatArray:
-        return values * gains + deviation * generator.standard_normal(values.shape)
+    errors = {fault.place: fault.value for fault in faults if fault.effect == "gauge_gain"}
+    gains = np.array([1.0 + errors.get(name, 0.0) for name in kinds])
+    gains *= 1.0 + GAIN_DEVIATION * generator.standard_normal(len(kinds))
+    interval = float(f"{1.0 / (SAMPLES_PER_PERIOD * truth.frequency[0]):.3g}")
+    times: FloatArray = interval * np.arange(SAMPLES, dtype=np.float64)
 
     def write(name: str, head: str, first: FloatArray, values: FloatArray) -> None:
-        table = np.column_stack((first, noisy(values)))
-        np.savetxt(
-            folder / name, table, delimiter=",", header=",".join([head, *names]), comments=""
-        )
+        noisy = values * gains + deviation * generator.standard_normal(values.shape)
+        columns = ",".join([head, *kinds])
+        table = np.column_stack((first, noisy))
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header=columns, comments="")
 
-    lines = [
-        "format = 1",
-        'name = "part"',
-        "[noise]",
-        'file = "noise.csv"',
-        f"interval = {INTERVAL}",
-    ]
-    for name, kind in zip(names, kinds, strict=True):
+    lines = ["format = 1", 'name = "part"', "[noise]", 'file = "noise.csv"']
+    lines.append(f"interval = {interval}")
+    for name, kind in kinds.items():
         unit = "1" if kind == "strain" else "m"
         lines += [
             "[[channel]]",
-            f'name = "{name}"',
-            f'quantity = "{kind}"',
-            f'unit = "{unit}"',
-            f'output = "{name}"',
-            "gain_deviation = 0.005",
-            f"offset_deviation = {2.0 * NOISE[kind]}",
+            f'name = "{name}"\nquantity = "{kind}"\nunit = "{unit}"\noutput = "{name}"',
+            f"gain_deviation = {2.0 * GAIN_DEVIATION}\noffset_deviation = {2.0 * NOISE[kind]}",
         ]
-    write("noise.csv", "time", time_axis, np.zeros((SAMPLES, len(names))))
-    for number, levels in enumerate(
-        (np.linspace(0.0, FORCE, 8), np.linspace(0.0, -0.8 * FORCE, 6))
-    ):
-        write(
-            f"line{number}.csv",
-            "force",
-            np.asarray(levels, dtype=np.float64),
-            np.outer(levels, truth.static),
-        )
+    write("noise", "time", times, np.zeros((SAMPLES, len(kinds))))
+    # load lines
+    load_lines = [(0, 1.0, False), (1, 1.0, False), (0, -0.8, True)]
+    for number, (load, largest, held_out) in enumerate(load_lines):
+        levels = np.asarray(np.linspace(0.0, largest * part.force, 8), dtype=np.float64)
+        write(f"line{number}", "force", levels, np.outer(levels, truth.static[load]))
         lines += [
             "[[trial]]",
-            f'name = "line {number}"',
-            'kind = "static"',
-            f'file = "line{number}.csv"',
+            f'name = "line {number}"\nkind = "static"\nfile = "line{number}.csv"',
+            f'load_place = "{part.loads[load].name}"\nheld_out = {str(held_out).lower()}',
         ]
-        lines += ['load_place = "pull"', f"held_out = {str(number == 1).lower()}"]
-    for number, force in enumerate((0.6 * FORCE, 0.4 * FORCE)):
-        start = force * truth.load / omega**2
-        damped = omega * np.sqrt(1.0 - ratio**2)
-        phase = np.outer(time_axis, damped)
-        envelope = np.exp(-np.outer(time_axis, ratio * omega))
-        motion = (
-            start * envelope * (np.cos(phase) + ratio / np.sqrt(1.0 - ratio**2) * np.sin(phase))
-        )
-        write(f"release{number}.csv", "time", time_axis, motion @ truth.shapes.T)
-        displacement = float(force * truth.static[4])
+    # releases
+    omega = 2.0 * np.pi * truth.frequency
+    alpha, beta = DAMPING
+    ratio = 0.5 * (alpha / omega + beta * omega)
+    damped = omega * np.sqrt(1.0 - ratio**2)
+    phase = np.outer(times, damped)
+    decay = np.exp(-np.outer(times, ratio * omega))
+    course = decay * (np.cos(phase) + ratio / np.sqrt(1.0 - ratio**2) * np.sin(phase))
+    for name, load, fraction in RELEASES:
+        force = fraction * part.force
+        motion = force * truth.loads[load] / omega**2 * course
+        write(name, "time", times, motion @ truth.shapes.T)
+        along_load = [
+            number
+            for number, sensor in enumerate(part.displacements)
+            if sensor.direction == part.loads[load].direction
+            and sensor.point == part.loads[load].point
+        ]
+        released = float(force * truth.static[load][len(part.gauges) + along_load[0]])
         lines += [
             "[[trial]]",
-            f'name = "release {number}"',
-            'kind = "ringdown"',
-            f'file = "release{number}.csv"',
+            f'name = "release {name}"\nkind = "ringdown"\nfile = "{name}.csv"',
+            f'load_place = "{part.loads[load].name}"',
+            f"held_out = {str(name == 'held out').lower()}",
+            f'release = {{ displacement = {released!r}, unit = "m", deviation = 0.02 }}',
         ]
-        lines += ['load_place = "pull"', f"held_out = {str(number == 1).lower()}"]
-        lines += [f'release = {{ displacement = {displacement!r}, unit = "m", deviation = 0.02 }}']
     (folder / "campaign.toml").write_text("\n".join(lines), encoding="utf-8")
 
 
-def results(parts: list[str], cases: list[str]) -> Iterator[str]:
-    """Yield a line for each campaign: what was hidden, and the verdict."""
-    for number, (part, case) in enumerate((part, case) for part in parts for case in cases):
-        hidden = hidden_causes()[case]
-        with TemporaryDirectory() as name:
-            folder = Path(name)
-            (folder / "truth").mkdir()
-            (folder / "campaign").mkdir()
-            truth = truth_of(write_part(folder / "truth", part, 2, hidden), folder / "ccx")
-            write_campaign(folder / "campaign", truth, hidden, seed=number)
-            model = load_model(write_part(folder, part, 1, Hidden()))
-            begin = time.process_time()
-            investigation = investigate(
-                read_campaign(folder / "campaign"), model, library(), seed=1, thorough=False
-            )
-            seconds = time.process_time() - begin
-        verdict = investigation.verdict
-        phrases = []
-        for effect in verdict.effects:
-            sizes = [
-                f"{item.value:.3g} [{item.low:.3g}, {item.high:.3g}]" for item in effect.parameters
-            ]
-            phrases.append(f"{effect.identifier} at {effect.place} ({', '.join(sizes)})")
-        cause = f"{hidden.effect or 'nothing'} {hidden.place} {hidden.value:g}"
-        named_causes = "; ".join(phrases) or ", ".join(verdict.group)
-        name_of_case = f"{part:4} {case:13} hidden {cause}"
-        yield f"{name_of_case}: {verdict.kind.value}: {named_causes} [{seconds:.0f} s]"
+class Score(NamedTuple):
+    """What a verdict is worth.
+
+    Attributes
+    ----------
+    outcome : str
+        "right", "in part", "open" (nothing is named though something is hidden) or "wrong".
+    places : list of bool
+        For each mass and loss that is named: whether it lies within one patch.
+    sizes : list of bool
+        For each fault that is named at exactly its place: whether the 90 % interval holds it.
+    """
+
+    outcome: str
+    places: list[bool]
+    sizes: list[bool]
+
+
+NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
+"""Verdicts that name effects."""
+
+
+def score(verdict: Verdict, part: Part, faults: Sequence[Fault], model: ChangeableModel) -> Score:
+    """Return what a verdict is worth against the faults that are hidden."""
+    places: list[bool] = []
+    sizes: list[bool] = []
+    if verdict.kind is VerdictKind.GROUP:
+        hidden = {fault.effect for fault in faults}
+        members = [set(member.split(" + ")) for member in verdict.group]
+        holds_truth = any(member <= hidden for member in members)
+        outcome = "in part" if holds_truth else "wrong" if faults else "open"
+        return Score(outcome, places, sizes)
+    if verdict.kind not in NAMING:
+        is_closed = verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+        return Score("right" if is_closed and not faults else "open", places, sizes)
+    matched = 0
+    for effect in verdict.effects:
+        faults_of_kind = [fault for fault in faults if fault.effect == effect.identifier]
+        if not faults_of_kind:
+            return Score("wrong", places, sizes)
+        (fault,) = faults_of_kind
+        if fault.effect in ("added_mass", "region_stiffness_loss"):
+            candidates = model.mass_places
+            if fault.effect == "region_stiffness_loss":
+                candidates = model.loss_places
+            places.append(_is_within_one_patch(effect.place, part.place(fault.point), candidates))
+            matched += places[-1]
+        elif _is_at(effect, fault):
+            matched += 1
+            sizes.append(_holds(effect, fault))
+    if matched < len(verdict.effects):
+        return Score("wrong", places, sizes)
+    return Score("right" if matched == len(faults) else "in part", places, sizes)
+
+
+def _is_at(effect: NamedEffect, fault: Fault) -> bool:
+    """Return whether an effect is named at the place of a fault, with its motion."""
+    (primitive,) = effect.patch.primitives
+    named = [getattr(primitive, name, "") for name in ("support", "control", "channel")]
+    motion = getattr(primitive, "motion", getattr(primitive, "axis", fault.motion))
+    return fault.place in named and motion == fault.motion
+
+
+def _holds(effect: NamedEffect, fault: Fault) -> bool:
+    """Return whether the 90 % interval of an effect's size holds that of a fault."""
+    (primitive,) = effect.patch.primitives
+    (estimate,) = effect.parameters
+    sizes = ("compliance", "distance", "gain")
+    (size,) = [getattr(primitive, name) for name in sizes if hasattr(primitive, name)]
+    unit = size / estimate.value
+    true_size = fault.value
+    if fault.effect == "support_compliance":
+        true_size = 1.0 / fault.value
+    low, high = sorted((unit * estimate.low, unit * estimate.high))
+    return bool(low <= true_size <= high)
+
+
+def _is_within_one_patch(name: str, point: Sequence[float], candidates: Sequence[str]) -> bool:
+    """Return whether a named place is the candidate nearest to a point [mm], or next to it."""
+    positions = {}
+    for candidate in candidates:
+        if found := re.search(r"\(([^)]*)\) mm", candidate):
+            positions[candidate] = np.array([float(value) for value in found[1].split(",")])
+    if name not in positions:
+        return False
+    distances = [float(np.linalg.norm(place - point)) for place in positions.values()]
+    nearest = [*positions.values()][int(np.argmin(distances))]
+    spacings = sorted(float(np.linalg.norm(place - nearest)) for place in positions.values())
+    reach = min(distances) + 1.5 * spacings[1]
+    return float(np.linalg.norm(positions[name] - point)) <= reach
+
+
+def results(folder: Path, parts: Sequence[str], cases: Sequence[int]) -> Iterator[str]:
+    """Yield a line for each campaign: what is hidden, the verdict and its worth; then the sums."""
+    outcomes: Counter[str] = Counter()
+    null_outcomes: Counter[str] = Counter()
+    places: list[bool] = []
+    sizes: list[bool] = []
+    seconds = []
+    models = {}
+    for part_name in parts:
+        model_folder = folder / part_name
+        model_folder.mkdir(parents=True, exist_ok=True)
+        begin = time.process_time()
+        models[part_name] = changeable_model(write_part(model_folder, PARTS[part_name], 1, ()))
+        error = models[part_name].change_errors.max()
+        built = time.process_time() - begin
+        yield f"{part_name}: largest error of the reduced model {error:.1e} [{built:.0f} s]"
+    for number, (part_name, faults) in enumerate(CASES):
+        if part_name not in parts or (cases and number not in cases):
+            continue
+        part = PARTS[part_name]
+        folder_of_case = folder / f"case{number:02}"
+        truth = truth_of(folder_of_case, part, faults)
+        write_campaign(folder_of_case / "campaign", part, truth, faults, seed=number)
+        begin = time.process_time()
+        campaign = read_campaign(folder_of_case / "campaign")
+        model = StructureModel(models[part_name])
+        verdict = investigate(campaign, model, library(), seed=1, thorough=False).verdict
+        seconds.append(time.process_time() - begin)
+        worth = score(verdict, part, faults, models[part_name])
+        counted = outcomes if faults else null_outcomes
+        counted[worth.outcome] += 1
+        places += worth.places
+        sizes += worth.sizes
+        hidden = " and ".join(
+            f"{fault.effect} {fault.place} {fault.motion} {fault.value:g}" for fault in faults
+        )
+        yield (
+            f"{number:2} {part_name:7} {worth.outcome:7} {hidden or 'nothing'}: "
+            f"{_verdict_text(verdict)} [{seconds[-1]:.0f} s]"
+        )
+    yield f"with faults: {dict(outcomes)}; without: {dict(null_outcomes)}"
+    yield f"places within one patch {sum(places)} of {len(places)}"
+    yield f"sizes in their 90 % intervals {sum(sizes)} of {len(sizes)}"
+    yield f"processor time: mean {np.mean(seconds):.0f} s, largest {np.max(seconds):.0f} s"
+
+
+def _verdict_text(verdict: Verdict) -> str:
+    """Return kind, effects and sizes of a verdict on one line."""
+    phrases = []
+    for effect in verdict.effects:
+        numbers = [
+            f"{item.value:.3g} [{item.low:.3g}, {item.high:.3g}]" for item in effect.parameters
+        ]
+        phrases.append(f"{effect.identifier} at {effect.place} ({', '.join(numbers)})")
+    return f"{verdict.kind.value}: {'; '.join(phrases)} {', '.join(verdict.group)}"
 
 
 if __name__ == "__main__":
-    chosen_parts = [name for name in sys.argv[1:] if name in PARTS] or list(PARTS)
-    chosen_cases = [name for name in sys.argv[1:] if name in hidden_causes()] or list(
-        hidden_causes()
-    )
-    for line in results(chosen_parts, chosen_cases):
+    arguments = sys.argv[2:]
+    chosen_parts = [name for name in arguments if name in PARTS] or list(PARTS)
+    chosen_cases = [int(name) for name in arguments if name.isdigit()]
+    for line in results(Path(sys.argv[1]), chosen_parts, chosen_cases):
         print(line, flush=True)

@@ -462,6 +462,8 @@ def calibrated_parameters(
     for parameter, value, deviation in zip(
         problem.model.parameters, values, deviations, strict=True
     ):
+        if parameter.name in problem.model.nuisance_parameters:
+            continue
         parameter_records.append(
             CalibratedParameter(parameter.name, float(value), float(deviation), parameter.unit)
         )

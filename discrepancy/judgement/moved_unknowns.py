@@ -141,7 +141,8 @@ def _reference_sizes(problem: Problem) -> dict[str, float]:
     sizes = {_name_of_gain(channel): 1.0 for channel in layout.gain_channels}
     # the centres of gains follow those of the parameters
     for parameter, centre in zip(problem.model.parameters, layout.centre, strict=False):
-        sizes[parameter.name] = abs(float(centre))
+        # an error of the mesh, which is stated as zero, is a fraction itself
+        sizes[parameter.name] = abs(float(centre)) or 1.0
     for data in problem.trials:
         for column, channel in enumerate(data.trial.channels):
             readings = data.trial.values[data.trial.used[:, column], column]

@@ -140,7 +140,7 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
                 f"{parameter.high:g} in which {model} holds: correct [parameters.{name}], or widen "
                 "the range in the model's file."
             )
-        if deviation > 0.0:
+        if deviation > 0.0 and name not in choice.model.nuisance_parameters:
             stated_by = "the campaign" if name in campaign.parameters else model
             priors.append(
                 replace(parameter, mean=mean, deviation=deviation, stated_by=stated_by, title="")

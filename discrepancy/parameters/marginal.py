@@ -59,8 +59,8 @@ class MarginalPosterior:
     Attributes
     ----------
     parameter_indices : (P,) ndarray of int
-        The indices of the calibrated parameters whose prior deviation is not zero; u has one entry
-        for each of them.
+        The indices of the calibrated parameters whose prior deviation is not zero and that are no
+        nuisances; u has one entry for each of them.
     low, high : (P,) ndarray
         The ends of the model's range as scaled parameters; the prior is truncated there.
     refusals : list of Refusal
@@ -70,7 +70,12 @@ class MarginalPosterior:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         shared = problem.shared
-        self.parameter_indices = np.flatnonzero(shared.scale[: shared.parameter_count] > 0.0)
+        is_nuisance = [
+            parameter.name in problem.model.nuisance_parameters
+            for parameter in problem.model.parameters
+        ]
+        is_uncertain = shared.scale[: shared.parameter_count] > 0.0
+        self.parameter_indices = np.flatnonzero(is_uncertain & ~np.array(is_nuisance, dtype=bool))
         self.low, self.high = shared.bounds[:, self.parameter_indices]
         self._start_point = problem.prior_mean_point(NO_EFFECTS)
         self.refusals: list[Refusal] = []

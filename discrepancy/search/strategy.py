@@ -117,7 +117,10 @@ class Search(FittedCandidates):
         screened_effects = reading_effects if has_large_residuals else effects
         fits = self._fit_from_screen(base, screened_effects)
         # effects of the structure begin at a grid, too, where the screen is blind or found nothing
-        some_fit_passes = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
+        some_fit_passes = any(
+            check_absolute_fit(self.problem, fit).passed and not self._is_far_from_truth(fit)
+            for fit in fits
+        )
         needs_grid = has_large_residuals or (self._is_far_from_truth(base) and not some_fit_passes)
         if needs_grid:
             unbiased_base = self._with_unbiased_nuisances(base)

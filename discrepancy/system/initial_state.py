@@ -139,7 +139,9 @@ def released_state(
     initial_by_mode = np.zeros((len(system.angular_frequency), 2))
     initial_by_mode[: len(excitation.initial)] = excitation.initial[: len(initial_by_mode)]
     relative_displacements, relative_velocities = initial_by_mode.T
-    first_load = excitation.loads_at(excitation.time[:1], np.eye(system.unknown_count))
+    first_load = np.zeros((1, system.unknown_count))
+    if excitation.loads:
+        first_load = excitation.loads_at(excitation.time[:1], np.eye(system.unknown_count))
     if point.release.at_rest:
         return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
     frequency = system.angular_frequency

@@ -63,6 +63,8 @@ class Model(ABC):
         Characteristic length [m], if it has any.
     stations : tuple of float, optional
         Least and largest station [m] along the structure, if it has a length.
+    nuisance_parameters : frozenset of str
+        Parameters that no file states and no result lists, such as errors of the mesh.
     patch : ModelPatch
         The primitives that act in every response: a known addition, or an effect that was found.
     regions : tuple of str
@@ -99,6 +101,7 @@ class Model(ABC):
     ports: tuple[str, ...] = ()
     length: float | None = None
     stations: tuple[float, float] | None = None
+    nuisance_parameters: frozenset[str] = frozenset()
     patch: ModelPatch = NO_PATCH
     regions: tuple[str, ...] = ()
     largest_losses: Mapping[str, float] = MappingProxyType({})

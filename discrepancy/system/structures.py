@@ -1,7 +1,8 @@
 """A structure from a mesh or matrices as a model."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +21,12 @@ from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
 from discrepancy.system.time_history import RecordedHistory
 from fe.runtime import patch as changes
-from fe.runtime.changeable import ChangeableModel, ChangedStructure
+from fe.runtime.changeable import (
+    KEPT_SUBSPACES,
+    ChangeableModel,
+    ChangedModes,
+    ChangedStructure,
+)
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
@@ -39,6 +45,14 @@ ROUNDING = 1e-9
 """Differences of two rows below this fraction of the largest entry are rounding errors."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
+MESH_DEVIATION = 0.01
+"""Standard deviation of the relative error of a frequency by the mesh. A ring-down shows a
+frequency to a few parts in 10^5, while a mesh of ordinary fineness has errors of 0.1 to 1.5 percent
+that differ from mode to mode: without an allowance they would be named a soft support."""
+LARGEST_MESH_ERROR = 0.05
+"""Largest relative error of a frequency by the mesh that is fitted."""
+MODES_OF_MESH_ERRORS = 4
+"""Number of modes whose frequencies may differ by the mesh; readings hardly show higher ones."""
 
 
 class StructureWithMatrices(SolvedStructure, Protocol):
@@ -91,6 +105,10 @@ class StructureModel(SystemModel):
         self.regions = model.regions
         self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
+        if isinstance(model, ChangeableModel):
+            mesh_errors = _mesh_errors(model)
+            self.parameters += mesh_errors
+            self.nuisance_parameters = frozenset(error.name for error in mesh_errors)
         # loads
         units = zip(model.controls, model.control_units, strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N" and not _is_at_port(name))
@@ -180,11 +198,52 @@ class StructureModel(SystemModel):
                     "this [[port]] from the file."
                 )
 
+    def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
+        """Return mean and standard deviation of each parameter.
+
+        Without a trial in motion no reading shows errors of the mesh, which are zero then.
+        """
+        moments = super().prior_moments(campaign)
+        if any(trial.is_dynamic for trial in campaign.trials):
+            return moments
+        return [
+            (mean, 0.0 if parameter.name in self.nuisance_parameters else deviation)
+            for parameter, (mean, deviation) in zip(self.parameters, moments, strict=True)
+        ]
+
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the input vector of the reduced model; controls that are missing are nominal."""
         names = (*self.model.parameters, *self.model.masses)
-        parameters = dict(zip(names, state.parameters, strict=True))
+        parameters = dict(zip(names, state.parameters, strict=False))
         return self.model.vector({**parameters, **controls}, state.losses)
+
+    @cached_property
+    def _rows_of_changes(self) -> Callable[[tuple[int, ...]], dict[str, FloatArray]]:
+        """The function that returns the rows (k,) of outputs and ports under some changes.
+
+        They are in the coordinates in which a structure with these changes is solved.
+        """
+        rows = self._rows | {PORT_PREFIX + name: row for name, row in self.port_rows.items()}
+
+        def rows_of(changes_of_structure: tuple[int, ...]) -> dict[str, FloatArray]:
+            if not isinstance(self.model, ChangeableModel):
+                return rows
+            basis = self.model.subspace(changes_of_structure).basis
+            return {name: row @ basis for name, row in rows.items()}
+
+        return lru_cache(KEPT_SUBSPACES)(rows_of)
+
+    def _changes_of(self, state: SystemState) -> tuple[int, ...]:
+        """Return the numbers of the changes of the structure in a state."""
+        if not isinstance(self.model, ChangeableModel):
+            return ()
+        return self.model.changes_of(state.structure).numbers
+
+    def _in_state(self, load: FloatArray, state: SystemState) -> FloatArray:
+        """Return a load (n,) of the reduced model in the coordinates of a state (k,)."""
+        if not isinstance(self.model, ChangeableModel):
+            return load
+        return np.asarray(load @ self.model.subspace(self._changes_of(state)).basis)
 
     def _load_of_controls(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
@@ -203,9 +262,9 @@ class StructureModel(SystemModel):
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
         """Return the equations of outputs, which are rows of the reduced model."""
+        rows = self._rows_of_changes(self._changes_of(case.state))
         return [
-            OutputEquation.from_row(self._rows[output], quantity.order)
-            for output, quantity in outputs
+            OutputEquation.from_row(rows[output], quantity.order) for output, quantity in outputs
         ]
 
     def supports(self, primitive: type[Primitive]) -> bool:
@@ -231,7 +290,7 @@ class StructureModel(SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (n,) of a force of 1 N, or of load factor 1 if there are no forces.
+        """Return the load (k,) of a force of 1 N, or of load factor 1 if there are no forces.
 
         Raises
         ------
@@ -241,9 +300,9 @@ class StructureModel(SystemModel):
         places = self.forces or (LOAD_FACTOR,)
         control = choose_load_place(places, place, self.quoted_name)
         load = self._unit_load(state, control)
-        if not isinstance(self.model, ChangeableModel):
-            return load
-        return self.model.changed_load(load, control, change)
+        if isinstance(self.model, ChangeableModel):
+            load = self.model.changed_load(load, control, change)
+        return self._in_state(load, state)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return the quantity of an output; strains across gauges and shear are not listed."""
@@ -251,8 +310,8 @@ class StructureModel(SystemModel):
         return Quantity.STRAIN if is_across else super().output_quantity(output)
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
-        """Return the load (1, n) of the load factor."""
-        return self._unit_load(state, LOAD_FACTOR)[None]
+        """Return the load (1, k) of the load factor."""
+        return self._in_state(self._unit_load(state, LOAD_FACTOR), state)[None]
 
     def excitation(self, case: PatchedTrial) -> Excitation:
         """Return the excitation of a trial, with the constant loads and unrecorded controls."""
@@ -263,6 +322,7 @@ class StructureModel(SystemModel):
         constant_load = self._load_of_controls(case.state, dict.fromkeys(recorded_controls, 0.0))
         if not constant_load.any():
             return excitation
+        constant_load = self._in_state(constant_load, case.state)
         always = RecordedHistory(excitation.time, np.ones(len(excitation.time)))
         return replace(excitation, loads=(*excitation.loads, Load(constant_load, always)))
 
@@ -287,19 +347,35 @@ class StructureModel(SystemModel):
         return case._replace(state=case.state._replace(structure=case.state.structure + losses))
 
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the linear system in a state, in the coordinates of `ReducedStructure`.
+        """Return the linear system in a state, in the coordinates in which it is solved.
 
         Raises
         ------
         OutsideModelError
             If a value lies outside the validity box of the reduced model.
         """
-        vector = self._input_vector(state, {})
-        if not isinstance(self.model, ChangeableModel):
-            structure: StructureWithMatrices = self.model.structure_at(vector)
-        else:
-            structure = ChangedStructure(self.model, vector, state.structure)
-        return linear_system(structure, self.model.damping, self.port_rows)
+        structure = self._structure_in_state(state._replace(parameters=self._inputs_of(state)))
+        rows = self._rows_of_changes(self._changes_of(state))
+        ports = {name: rows[PORT_PREFIX + name] for name in self.port_rows}
+        errors = np.array(state.parameters[len(self._inputs_of(state)) :])
+        solved = _WithMeshErrors(structure, errors) if errors.any() else None
+        return linear_system(structure, self.model.damping, ports, solved)
+
+    @cached_property
+    def _structure_in_state(self) -> Callable[[SystemState], StructureWithMatrices]:
+        """The function that returns the structure in a state without mesh errors, with a cache."""
+
+        def structure_in(state: SystemState) -> StructureWithMatrices:
+            vector = self._input_vector(state, {})
+            if not isinstance(self.model, ChangeableModel):
+                return self.model.structure_at(vector)
+            return ChangedStructure(self.model, vector, state.structure)
+
+        return lru_cache(self.cache_size)(structure_in)
+
+    def _inputs_of(self, state: SystemState) -> tuple[float, ...]:
+        """Return the parameters of a state that are inputs of the reduced model."""
+        return state.parameters[: len(self.model.parameters) + len(self.model.masses)]
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, with those of supports that may yield."""
@@ -330,6 +406,37 @@ def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     return tuple(priors)
 
 
+def _mesh_errors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
+    """Return the priors of the relative errors of the lowest frequencies by the mesh."""
+    return tuple(
+        ParameterPrior(
+            f"mesh_mode_{number}",
+            "1",
+            0.0,
+            MESH_DEVIATION,
+            -LARGEST_MESH_ERROR,
+            LARGEST_MESH_ERROR,
+            title=f"frequency error of the mesh in mode {number}",
+        )
+        for number in range(1, 1 + min(model.mode_count, MODES_OF_MESH_ERRORS))
+    )
+
+
+class _WithMeshErrors:
+    """A solved structure whose lowest frequencies differ by errors of its mesh."""
+
+    def __init__(self, structure: StructureWithMatrices, errors: FloatArray) -> None:
+        self._structure = structure
+        frequency = structure.modes.frequency.copy()
+        frequency[: len(errors)] *= 1.0 + errors
+        self.modes = ChangedModes(frequency, structure.mode_shapes)
+        self.mode_shapes = structure.mode_shapes
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, for loads (k,) or (k, m)."""
+        return self._structure.static(loads)
+
+
 def _is_at_port(name: str) -> bool:
     """Return whether a control or a displacement acts at a port of the structure file."""
     return name.startswith(PORT_PREFIX)
@@ -350,6 +457,7 @@ def linear_system(
     structure: StructureWithMatrices,
     rayleigh: Iterable[float],
     ports: Mapping[str, FloatArray],
+    solved: SolvedStructure | None = None,
 ) -> LinearSystem:
     """Return the linear system of a structure in a given state.
 
@@ -361,6 +469,8 @@ def linear_system(
         Rayleigh damping: alpha [1/s] and beta [s].
     ports : mapping of str to (n,) array
         The rows that give the displacement of each port from the n states.
+    solved : SolvedStructure, optional
+        The structure with other modes; that with these matrices if left out.
     """
     alpha, beta = rayleigh
     return LinearSystem(
@@ -371,5 +481,5 @@ def linear_system(
         mode_count=structure.mode_count,
         relaxation=beta,
         on_modes=structure.rigid_ports,
-        solved=structure,
+        solved=solved or structure,
     )

@@ -358,13 +358,9 @@ class SystemModel(Model):
         denser_excitation = replace(
             excitation, sample_times=subdivide(excitation.sample_times, parts)
         )
-        return simulate_motion(system, denser_excitation, NO_LAWS).displacements_and_speeds_at(
-            self._rows_of_ports(tuple(self.port_rows))
-        )
-
-    def _rows_of_ports(self, names: tuple[str, ...]) -> FloatArray:
-        """Return the rows (P, N) that give the displacements of P ports from N unknowns."""
-        return np.array([self.port_rows[name] for name in names])
+        port_rows = np.array(list(system.ports.values()))
+        motion = simulate_motion(system, denser_excitation, NO_LAWS)
+        return motion.displacements_and_speeds_at(port_rows)
 
     # ------------------------------------------------------------ natural sizes and scales
 
@@ -392,7 +388,7 @@ class SystemModel(Model):
         state = SystemState(tuple(parameters.tolist()), losses=(0.0,) * len(self.regions))
         system = self.system_in_state(state)
         uncontrolled = self.system_in_state(state._replace(controlled=False))
-        port_rows = self._rows_of_ports(self.ports).reshape(
+        port_rows = np.array([uncontrolled.ports[name] for name in self.ports]).reshape(
             len(self.ports), uncontrolled.unknown_count
         )
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)

@@ -43,7 +43,10 @@ LEAST_REMAINDER = 1e-4
 SAME_DIRECTION = 1e-7
 """Directions of the structure's own bases below this relative length are left out."""
 SOLUTION_TOLERANCE = 1e-7
-"""Relative residual of solutions at other states and with losses."""
+"""Relative residual of solutions at other states, and of those with losses that errors are measured
+by."""
+SNAPSHOT_TOLERANCE = 1e-5
+"""Relative residual of solutions with losses that the basis is made of."""
 MOST_STATES = 8
 """Number of states at which unit responses are computed, beside the middle one."""
 INERTIA_RESPONSES = 1
@@ -203,7 +206,7 @@ class _Columns:
 
     def _shapes(self, structure: ChangedStructure) -> FloatArray:
         """Return the mode shapes of a structure on all unknowns (n', M)."""
-        shapes = structure.modes.shapes
+        shapes = structure.basis @ structure.mode_shapes
         count = len(shapes)
         return np.asarray(np.concatenate(self.blocks, axis=1)[:, :count] @ shapes)
 
@@ -311,7 +314,8 @@ class _Columns:
             lost_forces += self.held_terms.reference[term] * (matrix @ snapshots)
         of_small_loss = self.factors.riesz(lost_forces)
         of_large_losses = [
-            self._solution_with_loss(held, loss, forces) - snapshots for loss in LARGE_LOSSES
+            self._solution_with_loss(held, loss, forces, start=snapshots) - snapshots
+            for loss in LARGE_LOSSES
         ]
         block = np.concatenate((of_small_loss, *of_large_losses), axis=1)
         self._add_remainders(number, self._whitened(block), LEAST_LOSS_REMAINDER)
@@ -332,21 +336,26 @@ class _Columns:
         return np.asarray(forces / np.linalg.norm(self.factors.whitened(forces), axis=0))
 
     def _solution_with_loss(
-        self, lost: dict[int, sparse.csr_array], loss: float, forces: FloatArray
+        self,
+        lost: dict[int, sparse.csr_array],
+        loss: float,
+        forces: FloatArray,
+        start: FloatArray,
+        tolerance: float = SNAPSHOT_TOLERANCE,
     ) -> FloatArray:
-        """Return the solutions (n, k) of the structure, supports held, with a loss of a patch."""
+        """Return the solutions (n, k) of the structure, supports held, with a loss of a patch.
+
+        The iteration starts at displacements `start` (n, k).
+        """
         reference = self.held_terms.reference
-        matrices = (*self.held_terms.stiffness_terms, *lost.values())
-        lost_coefficients = [-loss * reference[term] for term in lost]
-        coefficients = np.concatenate((reference, lost_coefficients))
-        whitened = self.factors.whitened(forces)
+        coefficients = np.array([1.0, *(-loss * reference[term] for term in lost)])
         solutions = solve_near(
             self.factors,
-            matrices,
+            (self.factors.stiffness, *lost.values()),
             np.tile(coefficients[:, np.newaxis], forces.shape[1]),
-            whitened,
-            start=whitened,
-            tolerance=SOLUTION_TOLERANCE,
+            self.factors.whitened(forces),
+            start=self._whitened(start),
+            tolerance=tolerance,
         )
         return self.factors.unwhitened(solutions)
 
@@ -413,7 +422,8 @@ class _Columns:
         """Return the structure with a mass; `gain` is the largest relative gain of a modal mass."""
         place = self.mass_places[number]
         vector = self._middle_vector(model)
-        shapes = ChangedStructure(model, vector, ModelPatch()).modes.shapes
+        unchanged = ChangedStructure(model, vector, ModelPatch())
+        shapes = unchanged.basis @ unchanged.mode_shapes
         largest = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
         primitive = PlaceMass(place.name, gain / largest)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
@@ -428,9 +438,17 @@ class _Columns:
         vector = self._middle_vector(model)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
 
+        basis = np.concatenate(self.blocks, axis=1)[:, : len(structure.basis)] @ structure.basis
+
         def full_solution(loads: FloatArray) -> FloatArray:
-            solution = np.zeros_like(loads)
-            solution[: self.free] = self._solution_with_loss(held, loss, loads[: self.free])
+            solution = basis @ structure.static(basis.T @ loads)
+            solution[: self.free] = self._solution_with_loss(
+                held,
+                loss,
+                loads[: self.free],
+                start=solution[: self.free],
+                tolerance=SOLUTION_TOLERANCE,
+            )
             return solution
 
         return _ChangedCase(structure, full_solution, self.mass)
@@ -461,7 +479,8 @@ class _Columns:
         factors = self.terms.load_factors.tolist()
         numbers = [factors.index(row) for row in self.held_terms.load_factors.tolist()]
         outputs = self.terms.outputs.T @ case.full_solution(self.terms.loads[:, numbers])
-        reduced = model.whole_output[: len(outputs)] @ structure.static(model.whole_load.T)
+        displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
+        reduced = model.whole_output[: len(outputs)] @ displacements
         worst = 0.0
         for group in self.terms.groups:
             largest = np.abs(outputs[group]).max(axis=0)

@@ -71,12 +71,16 @@ class Subspace(NamedTuple):
         The stiffness terms.
     mass : (1 + P, k, k) array
         The mass terms.
+    lost : dict of int to (Q,) array and (Q, k, k) array
+        For each change that is a loss, the numbers of the stiffness terms that its patch holds a
+        part of, and these parts.
     """
 
     basis: FloatArray
     released: int
     stiffness: FloatArray
     mass: FloatArray
+    lost: dict[int, tuple[IntArray, FloatArray]]
 
 
 @dataclass(frozen=True, repr=False)
@@ -242,22 +246,32 @@ class ChangeableModel(ReducedModel):
         rows, columns = np.tril_indices(len(self.column_owner))
         return rows, columns
 
-    def lost_stiffness(self, change: int, theta: FloatArray) -> FloatArray:
-        """Return the stiffness (n, n) of a patch, by the number of its change from one.
+    def parts_of_patch(self, change: int, basis: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return the stiffness that a patch holds, by the number of its change from one.
 
         Parameters
         ----------
         change : int
             Number of the change.
-        theta : (T,) array
-            Coefficients of the stiffness terms.
+        basis : (n, k) array
+            The coordinates of the structure from those of a subspace.
+
+        Returns
+        -------
+        terms : (Q,) array of int
+            Numbers of the stiffness terms.
+        parts : (Q, k, k) array
+            The part of each of these terms.
         """
         patch = change - 1 - len(self.supports) - len(self.mass_places)
-        parts = np.flatnonzero(self.loss_patch == patch)
+        numbers = np.flatnonzero(self.loss_patch == patch)
         size = len(self.column_owner)
-        lower = np.zeros((size, size))
-        lower[self._triangle] = theta[self.loss_term[parts]] @ self.loss_stiffness[parts]
-        return lower + np.tril(lower, -1).T
+        parts = []
+        for number in numbers:
+            lower = np.zeros((size, size))
+            lower[self._triangle] = self.loss_stiffness[number]
+            parts.append(basis.T @ (lower + np.tril(lower, -1).T) @ basis)
+        return self.loss_term[numbers], np.array(parts)
 
     def support_number(self, support: str, motion: str) -> int:
         """Return the number of a motion of a support; raise `InvalidPatchError` without one."""
@@ -322,13 +336,15 @@ class ChangeableModel(ReducedModel):
         """
         structure = ChangedStructure(self, vector, ModelPatch())
         loads = self.whole_load.T
-        displacements = structure.static(loads)
+        displacements = structure.basis @ structure.static(structure.basis.T @ loads)
         work = np.sum(loads * displacements, axis=0)
         by_load = self.reactions(loads, displacements) ** 2 / np.where(work > 0.0, work, np.inf)
-        frequency, shapes = structure.modes
+        frequency = structure.modes.frequency
+        shapes = structure.basis @ structure.mode_shapes
         squares = (2.0 * np.pi * frequency) ** 2
         # a mode is the displacement at rest under its inertia forces
-        inertia = squares * (structure.mass @ shapes)
+        mass = dense_sum(self.mass_coefficients(vector), self.whole_mass)
+        inertia = squares * (mass @ shapes)
         by_mode = self.reactions(inertia, shapes) ** 2 / squares
         return np.concatenate((by_load, by_mode), axis=1)
 
@@ -372,6 +388,11 @@ class _Subspaces:
             released=len(released),
             stiffness=basis.T @ model.whole_stiffness @ basis,
             mass=basis.T @ model.whole_mass @ basis,
+            lost={
+                change: model.parts_of_patch(change, basis)
+                for change in changes
+                if change > len(model.supports) + len(model.mass_places)
+            },
         )
 
 
@@ -382,7 +403,7 @@ class ChangedModes(NamedTuple):
     ----------
     frequency : (M,) array
         Natural frequencies [Hz].
-    shapes : (n, M) array
+    shapes : (k, M) array
         Mass-normalised shapes.
     """
 
@@ -391,7 +412,7 @@ class ChangedModes(NamedTuple):
 
 
 class ChangedStructure:
-    """A reduced structure at fixed inputs under a patch, in the n coordinates of its model.
+    """A reduced structure at fixed inputs under a patch, in the k coordinates of its changes.
 
     Parameters
     ----------
@@ -404,8 +425,10 @@ class ChangedStructure:
 
     Attributes
     ----------
-    mass, stiffness : (n, n) array
-        The matrices. Motions of supports that stay held are columns that nothing moves.
+    basis : (n, k) array
+        The coordinates of the model from those of this structure: `Subspace.basis`.
+    mass, stiffness : (k, k) array
+        The matrices.
     mode_count : int
         The number of modes.
 
@@ -423,59 +446,63 @@ class ChangedStructure:
         self._last_output = model.whole_output[-1]
         changes = model.changes_of(patch)
         subspace = model.subspace(changes.numbers)
+        self.basis = subspace.basis
         theta = model.stiffness_coefficients(vector)
-        masses = model.mass_coefficients(vector)
-        self.mass = dense_sum(masses, model.whole_mass)
-        self.stiffness = dense_sum(theta, model.whole_stiffness)
-        stiffness = dense_sum(theta, subspace.stiffness)
-        mass = dense_sum(masses, subspace.mass)
+        self.stiffness = dense_sum(theta, subspace.stiffness)
+        self.mass = dense_sum(model.mass_coefficients(vector), subspace.mass)
         for change, kilograms in changes.masses.items():
-            rows = model.mass_rows[change - 1 - len(model.supports)]
-            rows_in_subspace = rows @ subspace.basis
+            rows = model.mass_rows[change - 1 - len(model.supports)] @ self.basis
             self.mass += kilograms * rows.T @ rows
-            mass += kilograms * rows_in_subspace.T @ rows_in_subspace
         for change, loss in changes.losses.items():
-            lost = loss * model.lost_stiffness(change, theta)
-            self.stiffness -= lost
-            stiffness -= subspace.basis.T @ lost @ subspace.basis
+            terms, parts = subspace.lost[change]
+            self.stiffness -= dense_sum(loss * theta[terms], parts)
         # A released motion q = sqrt(c) y against its spring 1 / c has the energy y^2 / 2: the
         # limit c = 0 is regular, and holds the support.
-        scale = np.ones(len(stiffness))
-        first_released = len(scale) - subspace.released
+        count = len(self.stiffness)
+        first_released = count - subspace.released
+        self._scale = np.ones(count)
         released = first_released
+        added_springs = np.zeros(count)
         for number, compliance in sorted(changes.compliances.items()):
-            row = model.support_rows[number - 1]
             spring = model.support_springs[number - 1]
             if spring == 0.0:
-                scale[released] = np.sqrt(compliance)
+                self._scale[released] = np.sqrt(compliance)
+                added_springs[released] = 1.0 / compliance if compliance > 0.0 else 0.0
                 released += 1
-                added_spring = 1.0 / compliance if compliance > 0.0 else 0.0
             else:
                 added_spring = 1.0 / (1.0 / spring + compliance) - spring
-                row_in_subspace = row @ subspace.basis
-                stiffness += added_spring * np.multiply.outer(row_in_subspace, row_in_subspace)
-            self.stiffness += added_spring * np.multiply.outer(row, row)
-        stiffness = scale[:, np.newaxis] * stiffness * scale
-        stiffness[np.arange(first_released, len(scale)), np.arange(first_released, len(scale))] += (
-            1.0
-        )
-        self._basis = subspace.basis * scale
-        self._stiffness = stiffness
-        self._mass = scale[:, np.newaxis] * mass * scale
+                row = model.support_rows[number - 1] @ self.basis
+                self.stiffness += added_spring * np.multiply.outer(row, row)
+        self._scaled_stiffness = self._scale[:, np.newaxis] * self.stiffness * self._scale
+        is_released = np.arange(first_released, count)
+        self._scaled_stiffness[is_released, is_released] += 1.0
+        self._scaled_mass = self._scale[:, np.newaxis] * self.mass * self._scale
+        self.stiffness[is_released, is_released] += added_springs[first_released:]
+
+    @cached_property
+    def _inverse_cholesky(self) -> FloatArray:
+        """The inverse L^-1 of the Cholesky factor of the scaled stiffness K = L L^T."""
+        return np.linalg.inv(np.linalg.cholesky(self._scaled_stiffness))
 
     def static(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements K^-1 f of loads (n,) or (n, k)."""
-        return np.asarray(self._basis @ np.linalg.solve(self._stiffness, self._basis.T @ loads))
+        """Return the displacements K^-1 f of loads (k,) or (k, m)."""
+        inverse = self._inverse_cholesky
+        scaled_loads = (self._scale * loads.T).T
+        scaled_displacements = inverse.T @ (inverse @ scaled_loads)
+        return np.asarray((self._scale * scaled_displacements.T).T)
 
     @cached_property
     def modes(self) -> ChangedModes:
         """The lowest undamped modes; the last output is positive in each."""
-        frequency, coordinates = lowest_modes(self._stiffness, self._mass, self.mode_count)
-        shapes = self._basis @ coordinates
-        shapes = shapes * np.where(self._last_output @ shapes < 0.0, -1.0, 1.0)
+        frequency, coordinates = lowest_modes(
+            self._scaled_stiffness, self._scaled_mass, self.mode_count
+        )
+        shapes = self._scale[:, np.newaxis] * coordinates
+        last_output = self._last_output @ self.basis
+        shapes = shapes * np.where(last_output @ shapes < 0.0, -1.0, 1.0)
         return ChangedModes(frequency, shapes)
 
     @property
     def mode_shapes(self) -> FloatArray:
-        """The mass-normalised shapes (n, M) of the modes."""
+        """The mass-normalised shapes (k, M) of the modes."""
         return self.modes.shapes

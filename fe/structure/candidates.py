@@ -24,7 +24,7 @@ from .mesh import StructureMesh
 from .nodal_loads import force_weights, point_weights, set_weights
 from .operators import Structure
 
-GRID_POINTS = 12
+GRID_POINTS = 20
 """Largest number of points of the grid at which a mass may be."""
 GRID_PATCHES = 12
 """Largest number of patches of the grid that may lose stiffness."""
@@ -32,6 +32,8 @@ LEAST_DISTANCE = 0.1
 """Least distance of points of a grid, and of middles of its patches, over the size of the mesh."""
 LARGEST_RADIUS = 0.12
 """Radius of a named set of cells, over the size of the mesh, up to which it is a patch."""
+LARGEST_NODE_SHARE = 0.5
+"""Share of all nodes from which on a named set is no place of a mass, but the structure itself."""
 AXES = ("x", "y", "z")
 """Names of the axes."""
 LEAST_SINE = 0.1
@@ -79,7 +81,7 @@ def mass_places(structure: AffineStructure) -> list[MassPlace]:
     grid. Of matrices these are the nodes that the structure file names.
     """
     if isinstance(structure, Structure):
-        candidates = list(_places_of_mesh(structure.mesh))
+        candidates = list(places_of_mesh(structure.mesh))
     elif isinstance(structure, MatrixStructure):
         candidates = list(_places_of_nodes(structure))
     else:
@@ -94,10 +96,11 @@ def mass_places(structure: AffineStructure) -> list[MassPlace]:
     return places
 
 
-def _places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
+def places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
     """Yield names and weights (nodes,) of sets of nodes, then of points of a grid."""
-    for name in mesh.node_sets:
-        if not name.startswith(SETS_OF_THE_MESHER) and np.all(mesh.node_sets[name] >= 0):
+    for name, nodes in mesh.node_sets.items():
+        is_place = np.all(nodes >= 0) and len(nodes) < LARGEST_NODE_SHARE * len(mesh.points)
+        if is_place and not name.startswith(SETS_OF_THE_MESHER):
             yield name, set_weights(mesh, name, f"the set {name!r}")
     corners = np.unique(mesh.cells[:, list(mesh.kind.corners)])
     for number in _spread_points(mesh.points[corners], GRID_POINTS, LEAST_DISTANCE * mesh.size):

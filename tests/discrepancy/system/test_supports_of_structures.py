@@ -8,7 +8,7 @@ from discrepancy.catalogue.library import library
 from discrepancy.report.sizes import si_sizes
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, investigate
-from fe.runtime.patch import SupportCompliance
+from fe.runtime.patch import ModelPatch, SupportCompliance
 from tests.discrepancy.rigs import chosen, hiding, setting_of, simulated
 
 SHARE = 0.2
@@ -75,3 +75,18 @@ def test_each_motion_of_each_support_is_a_place(beam_model) -> None:
     shifts = [f"root, shift along {axis}" for axis in "xyz"]
     turns = [f"root, turn about {axis}" for axis in "xyz"]
     assert list(places) == [*shifts, *turns]
+
+
+def test_an_error_of_the_mesh_is_no_support_that_yields(beam_model) -> None:
+    """On a finer mesh the frequencies are lower, each by another fraction."""
+    errors = {"mesh_mode_1": (-0.004, 1e-9), "mesh_mode_2": (-0.015, 1e-9)}
+    finer = beam_model.with_patch(ModelPatch(), errors)
+    campaign = simulated(finer, "ringdown", 3)
+    verdict = investigate(campaign, beam_model, RIVALS, seed=3, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
+
+
+def test_at_rest_no_reading_shows_an_error_of_the_mesh(beam_model) -> None:
+    moments = beam_model.prior_moments(simulated(beam_model, "static", 3))
+    names = [parameter.name for parameter in beam_model.parameters]
+    assert {moments[names.index(name)] for name in beam_model.nuisance_parameters} == {(0.0, 0.0)}

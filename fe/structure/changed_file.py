@@ -1,0 +1,152 @@
+"""The tables of a structure file under a patch: supports, masses and loads as they were found."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import InvalidDesignError, InvalidPatchError
+from fe.runtime.patch import (
+    LoadOffset,
+    LoadTilt,
+    ModelPatch,
+    PlaceMass,
+    Primitive,
+    SupportCompliance,
+)
+from reporting.toml_file import read_toml
+
+from .candidates import AXES, places_of_mesh
+from .design import MeshDesign, load_structure, parse_structure
+from .mesh import StructureMesh
+from .nodal_loads import point_weights, set_weights
+from .operators import structure_mesh
+from .tables import MOTIONS
+
+WRITTEN = (SupportCompliance, PlaceMass, LoadOffset, LoadTilt)
+"""Kinds of primitives that a structure file of a mesh can state."""
+
+Tables = dict[str, Any]
+
+
+def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
+    """Return the tables of a structure file with the changes of a patch.
+
+    Parameters
+    ----------
+    file : Path
+        The structure file.
+    patch : ModelPatch
+        The patch: supports that yield, masses that are added, loads that are moved or turned.
+    folder : Path
+        The folder of the new file, from which its mesh is named.
+
+    Raises
+    ------
+    InvalidPatchError
+        If the file cannot state a change.
+    """
+    design = load_structure(file)
+    tables: Tables = dict(read_toml(file, InvalidDesignError, what="structure file"))
+    if not isinstance(design, MeshDesign):
+        raise InvalidPatchError(
+            f"{file} is a structure from matrices, whose file cannot state such changes; give an "
+            "--out that ends in .json, which is accepted wherever a model is expected."
+        )
+    mesh = structure_mesh(design, file)
+    mesh_file = (file.parent / design.mesh).resolve()
+    tables["mesh"] = Path(os.path.relpath(mesh_file, folder.resolve())).as_posix()
+    for primitive in patch:
+        if isinstance(primitive, SupportCompliance):
+            _soften_support(tables, mesh, primitive)
+        elif isinstance(primitive, PlaceMass):
+            _add_mass(tables, mesh, primitive)
+        elif isinstance(primitive, LoadOffset):
+            row = _load_of(tables, primitive.control, "point")
+            point = list(row["point"])
+            point[AXES.index(primitive.axis)] += primitive.distance / mesh.unit
+            row["point"] = point
+        elif isinstance(primitive, LoadTilt):
+            row = _load_of(tables, primitive.control, "force")
+            row["force"] = _tilted(np.array(row["force"], dtype=float), primitive)
+        else:
+            raise _not_stated(primitive, "it has no table for this")
+    # parsed only as a check, which raises if the result is not a structure
+    parse_structure(tables, source=f"{file} with its patch")
+    return tables
+
+
+def _not_stated(primitive: Primitive, reason: str) -> InvalidPatchError:
+    """Return the refusal of a primitive that a structure file cannot state."""
+    return InvalidPatchError(
+        f"A structure file cannot state the primitive {primitive.kind!r}: {reason}; give an --out "
+        "that ends in .json, which is accepted wherever a model is expected."
+    )
+
+
+def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompliance) -> None:
+    """Let a support yield along one motion against a spring, as a rigid set about its centre."""
+    rows = [row for row in tables["support"] if row["set"] == primitive.support]
+    if len(rows) != 1:
+        reason = f"{len(rows)} tables hold the set {primitive.support!r}"
+        raise _not_stated(primitive, reason)
+    (row,) = rows
+    if "rigid_about" not in row:
+        if set(row.get("hold", ())) != set(AXES):
+            reason = f"the support {primitive.support!r} does not hold x, y and z"
+            raise _not_stated(primitive, reason)
+        centre = set_weights(mesh, primitive.support, "the support") @ mesh.points
+        row["rigid_about"] = (centre / mesh.unit).tolist()
+        row["hold"] = list(MOTIONS)
+    springs = [*row.get("springs", ()), *[0.0] * len(MOTIONS)][: len(MOTIONS)]
+    number = MOTIONS.index(primitive.motion)
+    compliance = primitive.compliance
+    if springs[number] > 0.0:
+        compliance += 1.0 / springs[number]
+    springs[number] = 1.0 / compliance
+    row["springs"] = springs
+    row["hold"] = [motion for motion in row.get("hold", ()) if motion != primitive.motion]
+
+
+def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None:
+    """Add a mass at the point of a place; the place of a set is its centre."""
+    if primitive.mass <= 0.0:
+        raise _not_stated(primitive, f"a mass must be positive, and this one is {primitive.mass:g}")
+    weights = dict(places_of_mesh(mesh))[primitive.place]
+    point = tuple((weights @ mesh.points / mesh.unit).tolist())
+    try:
+        point_weights(mesh, point, primitive.place)
+    except InvalidDesignError as cause:
+        reason = f"the centre of {primitive.place!r} lies outside the structure"
+        raise _not_stated(primitive, reason) from cause
+    masses = list(tables.get("mass", ()))
+    names = {row["name"] for row in masses}
+    number = 1
+    while f"added_{number}" in names:
+        number += 1
+    masses.append({"name": f"added_{number}", "point": list(point), "mass": primitive.mass})
+    tables["mass"] = masses
+
+
+def _load_of(tables: Tables, control: str, key: str) -> Tables:
+    """Return the row of the force of a control, which has a key."""
+    rows = [row for row in tables["load"] if row.get("control") == control and key in row]
+    if len(rows) != 1:
+        raise InvalidPatchError(
+            f"The control {control!r} has {len(rows)} loads with {key!r}, and one is expected."
+        )
+    row: Tables = rows[0]
+    return row
+
+
+def _tilted(force: FloatArray, primitive: LoadTilt) -> list[float]:
+    """Return a force (3,) that is turned by an angle towards an axis."""
+    size = float(np.linalg.norm(force))
+    along = force / size
+    across = np.eye(3)[AXES.index(primitive.axis)]
+    across = across - along * (along @ across)
+    across = across / np.linalg.norm(across)
+    turned = np.cos(primitive.angle) * along + np.sin(primitive.angle) * across
+    return [float(value) for value in size * turned]

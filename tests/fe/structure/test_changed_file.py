@@ -1,0 +1,81 @@
+"""The file of a structure under a patch is that of the changed structure."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
+from fe.reduction.change_basis import with_changes
+from fe.reduction.reduced_basis import reduce_structure
+from fe.runtime.arrays import FloatArray
+from fe.runtime.changeable import ChangedStructure
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import (
+    LoadTilt,
+    ModelPatch,
+    PlaceMass,
+    RegionStiffnessLoss,
+    SupportCompliance,
+)
+from fe.structure.changed_file import changed_tables
+from fe.structure.operators import assemble_structure
+from reporting.toml_file import toml_text
+
+WriteBeam = Callable[..., Path]
+
+
+def written(file: Path, folder: Path, patch: ModelPatch) -> Path:
+    """Write the file of a structure under a patch into another folder."""
+    folder.mkdir()
+    changed = folder / "changed.toml"
+    changed.write_text(toml_text(changed_tables(file, patch, folder)))
+    return changed
+
+
+def full_answers(file: Path) -> tuple[FloatArray, FloatArray]:
+    """Return outputs at rest under 50 N of the load, and natural frequencies, of the full model."""
+    full = assemble_structure(file)
+    rows = np.concatenate((full.gauge_output.toarray(), full.displacement_output.toarray()))
+    outputs = rows @ Factorisation(full.stiffness()).solve(full.load("pushed", 50.0))
+    squares, _ = lowest_eigenpairs(full.stiffness(), full.mass(full.masses), 4)
+    return outputs, np.sqrt(squares) / (2.0 * np.pi)
+
+
+def test_a_file_states_a_support_that_yields_a_mass_and_a_load_that_leans(
+    write_beam: WriteBeam, tmp_path: Path
+) -> None:
+    file = write_beam(tmp_path, cells=2)
+    yielding = assemble_structure(file, yielding=True)
+    model = with_changes(yielding, reduce_structure(yielding.held()))
+    patch = ModelPatch(
+        (
+            SupportCompliance("root", "ry", 1e-3),
+            SupportCompliance("root", "z", 1e-7),
+            PlaceMass(model.mass_places[-1], 0.02),
+            LoadTilt("push", "y", 0.1),
+        )
+    )
+    outputs, frequencies = full_answers(written(file, tmp_path / "changed", patch))
+    structure = ChangedStructure(model, model.vector({}), patch)
+    of_push = model.load_factors[:, 0] == 1 + model.controls.index("push")
+    load = 50.0 * model.changed_load(model.whole_load[of_push].sum(axis=0), "push", patch)
+    displacements = structure.basis @ structure.static(structure.basis.T @ load)
+    expected = model.whole_output[: len(outputs)] @ displacements
+    assert outputs == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected[:1]).max())
+    assert frequencies[:3] == pytest.approx(structure.modes.frequency[:3], rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("primitive", "sentence"),
+    [
+        (PlaceMass("root", -0.1), "a mass must be positive"),
+        (RegionStiffnessLoss("around", 0.3), "it has no table for this"),
+    ],
+)
+def test_what_a_file_cannot_state_is_refused(
+    write_beam: WriteBeam, tmp_path: Path, primitive: PlaceMass, sentence: str
+) -> None:
+    with pytest.raises(InvalidPatchError, match=sentence):
+        changed_tables(write_beam(tmp_path), ModelPatch((primitive,)), tmp_path)
