@@ -124,9 +124,9 @@ def apply_verdict(
     if path.suffix == ".toml":
         if not is_stated_by_file:
             raise ModelError(
-                f"{path}: only laws at the ports of a lumped model, and supports, masses and loads "
-                "of a structure from a mesh, can be written into the model's own file; give --out "
-                "with the ending .json, which can be given wherever a model is expected."
+                f"{path}: only laws at the ports of a lumped model can be written into its own "
+                "file, and only supports, masses and loads into that of a structure from a mesh; "
+                "give --out with the ending .json, which can be given wherever a model is expected."
             )
         is_structure = choice.kind is ModelKind.STRUCTURE
         text = _structure_text(choice, patch, path) if is_structure else _lumped_text(choice, patch)

@@ -10,10 +10,8 @@ A mass at a place needs the static responses to forces there, and a loss of stif
 what it changes of the solutions under loads, under outputs as loads, and of the modes.
 """
 
-from collections.abc import Callable
 from dataclasses import fields
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -35,6 +33,7 @@ from fe.structure.candidates import (
 )
 from fe.structure.operators import Structure
 
+from .changed_case import ChangedCase, case_error
 from .reduced_basis import Reduction
 from .terms import ReductionTerms, cube_corners
 
@@ -376,7 +375,7 @@ class _Columns:
         vector[: self.held_terms.varied] = (*self.held_terms.middle, *middle_losses)
         return vector
 
-    def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "_ChangedCase":
+    def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
         """Return the reduced and the full structure whose support yields, mid-range.
 
         Parameters
@@ -410,7 +409,7 @@ class _Columns:
             return self._held_solution(loads) + factor * direction @ (direction.T @ loads)
 
         released_direction = direction if motion.spring == 0.0 else direction[:0]
-        return _ChangedCase(structure, full_solution, self.mass, released_direction)
+        return ChangedCase(structure, full_solution, self.mass, released_direction)
 
     def _held_solution(self, loads: FloatArray) -> FloatArray:
         """Return the displacements (n', k) of the full model, supports held, under loads."""
@@ -418,7 +417,7 @@ class _Columns:
         solution[: self.free] = self.factors.solve(loads[: self.free])
         return solution
 
-    def _case_with_mass(self, model: ChangeableModel, number: int, gain: float) -> "_ChangedCase":
+    def _case_with_mass(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
         """Return the structure with a mass; `gain` is the largest relative gain of a modal mass."""
         place = self.mass_places[number]
         vector = self._middle_vector(model)
@@ -428,9 +427,9 @@ class _Columns:
         primitive = PlaceMass(place.name, gain / largest)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
         mass = (self.mass + primitive.mass * (place.rows.T @ place.rows)).tocsr()
-        return _ChangedCase(structure, self._held_solution, mass)
+        return ChangedCase(structure, self._held_solution, mass)
 
-    def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "_ChangedCase":
+    def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "ChangedCase":
         """Return the structure with a loss of stiffness."""
         patch = self.loss_places[number]
         held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
@@ -451,7 +450,7 @@ class _Columns:
             )
             return solution
 
-        return _ChangedCase(structure, full_solution, self.mass)
+        return ChangedCase(structure, full_solution, self.mass)
 
     def error(self, model: ChangeableModel, number: int) -> float:
         """Return the largest relative error of a model under one change, at both ends of its range.
@@ -459,9 +458,12 @@ class _Columns:
         Outputs at rest are compared with those of the full model, in the middle of all ranges. The
         error of a frequency is its change by one step of inverse iteration with the full model.
         """
-        return max(self._error_of(model, case) for case in self._cases(model, number))
+        return max(
+            case_error(case, model, self.terms, self.held_terms, self._shapes(case.structure))
+            for case in self._cases(model, number)
+        )
 
-    def _cases(self, model: ChangeableModel, number: int) -> "list[_ChangedCase]":
+    def _cases(self, model: ChangeableModel, number: int) -> "list[ChangedCase]":
         """Return the structure under one change, counted from zero, at both ends of its range."""
         change = 1 + number
         if change < self._first_mass:
@@ -471,51 +473,6 @@ class _Columns:
             return [self._case_with_mass(model, place, gain) for gain in MASS_RANGE]
         patch = change - self._first_loss
         return [self._case_with_loss(model, patch, loss) for loss in LOSS_RANGE]
-
-    def _error_of(self, model: ChangeableModel, case: "_ChangedCase") -> float:
-        """Return the largest relative error in one case; see `error`."""
-        structure = case.structure
-        # statics
-        factors = self.terms.load_factors.tolist()
-        numbers = [factors.index(row) for row in self.held_terms.load_factors.tolist()]
-        outputs = self.terms.outputs.T @ case.full_solution(self.terms.loads[:, numbers])
-        displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
-        reduced = model.whole_output[: len(outputs)] @ displacements
-        worst = 0.0
-        for group in self.terms.groups:
-            largest = np.abs(outputs[group]).max(axis=0)
-            difference = np.abs(reduced[group] - outputs[group]).max(axis=0)
-            is_seen = largest > 0.0
-            worst = max(worst, float((difference[is_seen] / largest[is_seen]).max(initial=0.0)))
-        # frequencies by the Rayleigh quotient of the improved modes
-        inertia = case.mass @ self._shapes(structure)
-        improved = case.full_solution(inertia)
-        squares = np.sum(improved * inertia, axis=0)
-        squares = squares / np.sum(improved * (case.mass @ improved), axis=0)
-        frequency = np.sqrt(squares) / (2.0 * np.pi)
-        frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
-        return max(worst, float(frequency_errors.max()))
-
-
-class _ChangedCase(NamedTuple):
-    """A structure with a change.
-
-    Attributes
-    ----------
-    structure : ChangedStructure
-        The reduced structure.
-    full_solution : callable
-        Returns the displacements (n', k) of the full model under loads (n', k).
-    mass : csr (n', n')
-        The mass of the full model.
-    direction : (n', 1) array
-        The unit response of the motion of a support that is held otherwise; empty without one.
-    """
-
-    structure: ChangedStructure
-    full_solution: Callable[[FloatArray], FloatArray]
-    mass: sparse.csr_array
-    direction: FloatArray = np.zeros((0, 1))
 
 
 def _projected(terms: tuple[sparse.csr_array, ...], columns: FloatArray) -> FloatArray:

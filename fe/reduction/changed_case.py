@@ -1,0 +1,78 @@
+"""A structure with one change, in full and reduced, and the error of the reduced one."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fe.runtime.arrays import FloatArray
+from fe.runtime.changeable import ChangeableModel, ChangedStructure
+
+from .terms import ReductionTerms
+
+
+class ChangedCase(NamedTuple):
+    """A structure with a change.
+
+    Attributes
+    ----------
+    structure : ChangedStructure
+        The reduced structure.
+    full_solution : callable
+        Returns the displacements (n', k) of the full model under loads (n', k).
+    mass : csr (n', n')
+        The mass of the full model.
+    direction : (n', 1) array
+        The unit response of the motion of a support that is held otherwise; empty without one.
+    """
+
+    structure: ChangedStructure
+    full_solution: Callable[[FloatArray], FloatArray]
+    mass: sparse.csr_array
+    direction: FloatArray = np.zeros((0, 1))
+
+
+def case_error(
+    case: ChangedCase,
+    model: ChangeableModel,
+    terms: ReductionTerms,
+    held_terms: ReductionTerms,
+    shapes: FloatArray,
+) -> float:
+    """Return the largest relative error of outputs at rest and frequencies in one case.
+
+    The error of a frequency is its change by one step of inverse iteration with the full model.
+
+    Parameters
+    ----------
+    case : ChangedCase
+        The structure with its change.
+    model : ChangeableModel
+        The reduced model.
+    terms, held_terms : ReductionTerms
+        Terms of the structure whose supports yield, and of that whose supports are held.
+    shapes : (n', M) array
+        The reduced mode shapes on all unknowns.
+    """
+    structure = case.structure
+    # statics
+    factors = terms.load_factors.tolist()
+    numbers = [factors.index(row) for row in held_terms.load_factors.tolist()]
+    outputs = terms.outputs.T @ case.full_solution(terms.loads[:, numbers])
+    displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
+    reduced = model.whole_output[: len(outputs)] @ displacements
+    worst = 0.0
+    for group in terms.groups:
+        largest = np.abs(outputs[group]).max(axis=0)
+        difference = np.abs(reduced[group] - outputs[group]).max(axis=0)
+        is_seen = largest > 0.0
+        worst = max(worst, float((difference[is_seen] / largest[is_seen]).max(initial=0.0)))
+    # frequencies by the Rayleigh quotient of the improved modes
+    inertia = case.mass @ shapes
+    improved = case.full_solution(inertia)
+    squares = np.sum(improved * inertia, axis=0)
+    squares = squares / np.sum(improved * (case.mass @ improved), axis=0)
+    frequency = np.sqrt(squares) / (2.0 * np.pi)
+    frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
+    return max(worst, float(frequency_errors.max()))
