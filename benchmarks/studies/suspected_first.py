@@ -129,9 +129,9 @@ class Truth(NamedTuple):
 
 def truth_of(folder: Path, part: Part, faults: Sequence[Fault]) -> Truth:
     """Return the answers of CalculiX for a part with faults, or those that a folder keeps."""
-    kept = folder / "truth.npz"
-    if kept.is_file():
-        with np.load(kept) as arrays:
+    archive = folder / "truth.npz"
+    if archive.is_file():
+        with np.load(archive) as arrays:
             return Truth(**arrays)
     folder.mkdir(parents=True, exist_ok=True)
     structure = load_and_assemble(write_part(folder, part, 2, faults), mass_as_stiffness=True)
@@ -170,7 +170,7 @@ def truth_of(folder: Path, part: Part, faults: Sequence[Fault]) -> Truth:
         shapes=rows @ shapes,
         loads=np.array([structure.load(load.name, 1.0) @ shapes for load in part.loads]),
     )
-    np.savez(kept, **truth._asdict())
+    np.savez(archive, **truth._asdict())
     return truth
 
 
@@ -340,8 +340,10 @@ def _is_within_one_patch(name: str, point: Sequence[float], candidates: Sequence
     """Return whether a named place is the candidate nearest to a point [mm], or next to it."""
     positions = {}
     for candidate in candidates:
-        if found := re.search(r"\(([^)]*)\) mm", candidate):
-            positions[candidate] = np.array([float(value) for value in found[1].split(",")])
+        in_brackets = re.search(r"\(([^)]*)\) mm", candidate)
+        if in_brackets:
+            coordinates = [float(value) for value in in_brackets[1].split(",")]
+            positions[candidate] = np.array(coordinates)
     if name not in positions:
         return False
     distances = [float(np.linalg.norm(place - point)) for place in positions.values()]
@@ -402,7 +404,8 @@ def _verdict_text(verdict: Verdict) -> str:
     phrases = []
     for effect in verdict.effects:
         numbers = [
-            f"{item.value:.3g} [{item.low:.3g}, {item.high:.3g}]" for item in effect.parameters
+            f"{estimate.value:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"
+            for estimate in effect.parameters
         ]
         phrases.append(f"{effect.identifier} at {effect.place} ({', '.join(numbers)})")
     return f"{verdict.kind.value}: {'; '.join(phrases)} {', '.join(verdict.group)}"

@@ -109,8 +109,10 @@ class Part:
         """Return the unit vector of a gauge's direction, which follows the bend."""
         step = 1e-3 * np.array(sensor.direction)
         ends = np.array(sensor.point) + np.array([step, -step])
-        ahead, behind = self.bend(ends)
-        return [float(value) for value in (ahead - behind) / np.linalg.norm(ahead - behind)]
+        plus_end, minus_end = self.bend(ends)
+        return [
+            float(value) for value in (plus_end - minus_end) / np.linalg.norm(plus_end - minus_end)
+        ]
 
 
 def _bent_to_quarter(points: FloatArray) -> FloatArray:
@@ -121,7 +123,9 @@ def _bent_to_quarter(points: FloatArray) -> FloatArray:
     return np.column_stack((radius * np.sin(angle), across, radius * np.cos(angle) - ARM_RADIUS))
 
 
-X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
 DOWN = (0.0, 0.0, -1.0)
 PARTS = {
     "bracket": Part(
