@@ -32,7 +32,7 @@ from discrepancy.verdict import (
 from fe.runtime.patch import Clock, LoadGain, ModelPatch, Primitive, SensorGain
 from reporting.words import listing
 
-from .curve_words import curve_in_words
+from .curve_words import curve_in_words, curve_of, followed_variable
 
 TOLD_POINT = 6
 """Every how many points of a table of forces one is told."""
@@ -241,7 +241,7 @@ class Conclusion:
         effects = named_effects(self.search.problem, fit_with_draws)
         free_terms = [term for term in fit.candidate.terms if term.free_shape]
         family = ", ".join(sorted({term.effect.family for term in free_terms}))
-        sentence = curve_sentence(self.search.problem, fit, probability)
+        sentence = curve_sentence(self.search.problem, effects, probability)
         if not sentence:
             other_names = ", ".join(effect.name for effect in effects if not effect.shape)
             beside_clause = f", beside {other_names}" if other_names else ""
@@ -260,30 +260,26 @@ class Conclusion:
         )
 
 
-def curve_sentence(problem: Problem, hypothesis: ComparedHypothesis, probability: float) -> str:
-    """Return the sentence on a force of free shape; empty if the hypothesis is none.
+def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability: float) -> str:
+    """Return the sentence on a force of free shape; empty if the effects are something else.
 
     Parameters
     ----------
     problem : Problem
         The campaign and the model.
-    hypothesis : ComparedHypothesis
-        The hypothesis at its most probable values.
+    effects : sequence of NamedEffect
+        The effects of a hypothesis at their most probable values.
     probability : float
-        Its probability.
+        The probability of the hypothesis.
     """
-    terms = hypothesis.candidate.terms
-    table = terms[0].effect.table if len(terms) == 1 else None
-    if table is None:
+    curve = curve_of(effects)
+    if curve is None:
         return ""
-    (term,) = terms
-    force_unit, _ = problem.model.port_units(term.place)
-    shape = curve_in_words(
-        table.variable, table.points, table.functions @ hypothesis.effect, force_unit
-    )
+    force_unit, _ = problem.model.port_units(curve.port)
     return (
-        f"A force that follows the {table.variable} is missing at {term.place} (probability "
-        f"{probability_text(probability)}), and no law of the catalogue has its shape: {shape}."
+        f"A force that follows the {followed_variable(curve)} is missing at {curve.port} "
+        f"(probability {probability_text(probability)}), and no law of the catalogue has its "
+        f"shape: {curve_in_words(curve, force_unit)}."
     )
 
 

@@ -3,9 +3,13 @@
 A force counts positive against the motion, as that of a spring.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.verdict import NamedEffect
+from fe.runtime.patch import TableDamping, TableStiffness
 from reporting.words import listing, number
 
 NO_FORCE = 0.12
@@ -25,26 +29,37 @@ CONSTANT_EXPONENT, LINEAR_EXPONENT = 0.3, 1.2
 """Exponents of the displacement below which a force is constant, and proportional."""
 
 
-def curve_in_words(variable: str, points: FloatArray, forces: FloatArray, force_unit: str) -> str:
+def curve_of(effects: Sequence[NamedEffect]) -> TableStiffness | TableDamping | None:
+    """Return the table of the only effect if that is a force of free shape; else None."""
+    if len(effects) != 1 or len(effects[0].patch) != 1:
+        return None
+    (law,) = effects[0].patch
+    return law if isinstance(law, TableStiffness | TableDamping) else None
+
+
+def followed_variable(curve: TableStiffness | TableDamping) -> str:
+    """Return what the force of a curve follows."""
+    return "displacement" if isinstance(curve, TableStiffness) else "velocity"
+
+
+def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str:
     """Return how a force depends on the motion, as the end of a sentence on that force.
 
     Parameters
     ----------
-    variable : str
-        "displacement" or "velocity".
-    points : (P,) ndarray
-        The displacements or velocities, rising [m or m/s if the force has the unit N, else rad].
-    forces : (P,) ndarray
-        The force at each point [`force_unit`].
+    curve : TableStiffness or TableDamping
+        The force at displacements or velocities of its port.
     force_unit : str
-        N or N m.
+        The unit of the force, N or N m.
     """
     motion_unit = "m" if force_unit == "N" else "rad"
-    if variable == "velocity":
-        return _friction_in_words(points, forces, force_unit, f"{motion_unit}/s")
+    forces = np.array(curve.forces)
+    if isinstance(curve, TableDamping):
+        return _friction_in_words(np.array(curve.speeds), forces, force_unit, f"{motion_unit}/s")
+    points = np.array(curve.displacements)
     dead_band = _stretch_without_force(points, forces)
     if dead_band is None:
-        return _growth(variable, points, forces)
+        return _growth("displacement", points, forces)
     low, high = dead_band
     slopes = []
     if low > points[0]:

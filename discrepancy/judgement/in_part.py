@@ -258,7 +258,7 @@ def _named_in_part_outcome(
         phrases.append(f"an effect of the family {family}, with a fitted shape,")
     # what it explains, and what remains
     share_clause = comparison.closed_share_clause(best_hypothesis)
-    missing = curve_sentence(comparison.problem, best_hypothesis, probability)
+    missing = curve_sentence(comparison.problem, effects, probability)
     if missing:
         sentence = f"{missing} {capital(share_clause)}."
     else:

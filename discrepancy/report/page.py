@@ -7,6 +7,7 @@ from math import isfinite, isnan
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.closed_share import percent_with_interval
 from discrepancy.judgement.conclusion import effects_text, named_effects, probability_text
+from discrepancy.judgement.curve_words import curve_in_words, curve_of, followed_variable
 from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.location.locate import Location
 from discrepancy.report import tables, verdict_tables
@@ -198,8 +199,12 @@ def verdict_card(verdict: Verdict) -> str:
             f"but with {moved[0].name} moved by {abs(moved[0].deviations):.1f} stated deviations, "
             "where an error of the model may hide"
         )
+    curve = curve_of(verdict.effects)
+    if curve is not None:
+        unit = "N" if verdict.force is None else verdict.force.unit
+        clauses.append(curve_in_words(curve, unit))
     parameters: list[ParameterEstimate] = []
-    if verdict.kind in NAMING:
+    if verdict.kind in NAMING and curve is None:
         for effect in verdict.effects:
             parameters += effect.parameters
     if verdict.force is not None:
@@ -265,6 +270,9 @@ def missing_effects_text(verdict: Verdict) -> str:
         return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
     if verdict.kind in TEXT_WITHOUT_EFFECT:
         return TEXT_WITHOUT_EFFECT[verdict.kind]
+    curve = curve_of(verdict.effects)
+    if curve is not None:
+        return f"a force that follows the {followed_variable(curve)}"
     phrases = []
     if verdict.kind in NAMING:
         # an effect whose shape was freed is named by its family

@@ -5,6 +5,7 @@ import pytest
 
 from discrepancy.catalogue.force_curve import curve_points
 from discrepancy.judgement.curve_words import curve_in_words
+from fe.runtime.patch import TableDamping, TableStiffness
 
 VELOCITIES = curve_points("velocity", -0.5, 0.5)
 DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
@@ -35,12 +36,12 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
     ids=["stop", "play", "cubic", "one-sided", "linear", "constant"],
 )
 def test_a_curve_is_told_by_its_shape(forces, words):
-    assert curve_in_words("displacement", DISPLACEMENTS, forces, "N") == words
+    assert curve_in_words(TableStiffness("p", tuple(DISPLACEMENTS), tuple(forces)), "N") == words
 
 
 def test_the_motion_of_a_moment_is_told_in_radians():
     moments = 2.0 * np.maximum(DISPLACEMENTS - 0.01, 0.0)
-    assert curve_in_words("displacement", DISPLACEMENTS, moments, "N m") == (
+    assert curve_in_words(TableStiffness("p", tuple(DISPLACEMENTS), tuple(moments)), "N m") == (
         "it is zero from −0.02 rad to 0.01 rad, with a slope of 2 N m/rad above"
     )
 
@@ -58,4 +59,4 @@ def test_the_motion_of_a_moment_is_told_in_radians():
     ids=["Stribeck", "dry", "drag"],
 )
 def test_friction_is_told_by_its_shape(forces, words):
-    assert curve_in_words("velocity", VELOCITIES, forces, "N") == words
+    assert curve_in_words(TableDamping("p", tuple(VELOCITIES), tuple(forces)), "N") == words
