@@ -14,6 +14,7 @@ from calibration.result.file import Tailoring, load_calibration, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
+from discrepancy.judgement.curve_words import curve_of
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.proof_record import Proof
 from discrepancy.system.lumped_file import SHIPPED_MODELS, LumpedDescription
@@ -386,7 +387,8 @@ def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
     """Return the standard deviation of the force of an effect's laws over the force.
 
     It is taken from the 90 % interval of the number that scales the force of the first law or, in a
-    patch without intervals, of the first parameter of the effect.
+    patch without intervals, of the first parameter of the effect. Of a table it is that of the
+    largest force.
     """
     law = effect.patch.primitives[0]
     assert isinstance(law, PortForce)  # only laws at ports are written into a model's file
@@ -396,6 +398,8 @@ def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
         if interval.primitive == 0 and interval.parameter == law.proportional[0]
     ]
     ranges += [(estimate.value, estimate.low, estimate.high) for estimate in effect.parameters]
+    if curve_of((effect,)) is not None:
+        ranges.sort(key=lambda ends: -abs(ends[0]))
     for value, low, high in ranges:
         if value != 0.0 and np.isfinite(high - low):
             return float((high - low) / (2.0 * norm.ppf(0.95) * abs(value)))

@@ -20,6 +20,7 @@ from discrepancy.files.verdict import (
     StoredPatch,
     patch_effects,
     patch_schema,
+    primitive_intervals,
     read_patch,
     verdict_schema,
     write_patch,
@@ -27,7 +28,16 @@ from discrepancy.files.verdict import (
 )
 from discrepancy.judgement.proof import prove_effects
 from discrepancy.verdict import VerdictKind
-from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
+from fe.runtime.patch import (
+    PRIMITIVES,
+    Line,
+    ModelPatch,
+    PointMass,
+    PowerDamping,
+    PowerStiffness,
+    TableStiffness,
+    Window,
+)
 from reporting.errors import FileNotWrittenError
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import same as alike
@@ -339,3 +349,15 @@ def test_an_older_proof_is_read_without_its_share_and_says_why(tmp_path):
     assert proof.held_out_after.rms == prove_effects(FITTED, FITTED).held_out_after.rms
     assert proof.closed is None
     assert "of an earlier version" in proof.closed_reason
+
+
+def test_each_force_of_a_table_has_its_interval():
+    tables = [TableStiffness("p", (0.0, 1.0), (2.0, force)) for force in np.linspace(5.0, 7.0, 41)]
+    patches = [ModelPatch((table,)) for table in tables]
+
+    intervals = {item.parameter: item for item in primitive_intervals(patches[20], patches)}
+
+    assert set(intervals) == {"displacements[0]", "displacements[1]", "forces[0]", "forces[1]"}
+    changing = intervals["forces[1]"]
+    assert (changing.value, changing.unit) == (6.0, "N or N m")
+    assert (changing.low, changing.high) == pytest.approx((5.1, 6.9))
