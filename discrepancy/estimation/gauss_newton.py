@@ -306,6 +306,7 @@ class GaussNewton:
         """Return log evidence plus log prior of missing forces in linear trials [nat]."""
         return linearisation.log_evidence_with_prior(self.prior_medians, processes)
 
+    @np.errstate(over="ignore", invalid="ignore")  # a motion that diverges is rejected
     def iterate(
         self,
         laws: HypothesisLaws,
@@ -362,6 +363,7 @@ class GaussNewton:
             current_start = next_start
         return estimate
 
+    @np.errstate(over="ignore", invalid="ignore")  # a motion that diverges is rejected
     def iterate_along_laws(
         self,
         laws: HypothesisLaws,

@@ -126,6 +126,7 @@ class ScreenedEffect(NamedTuple):
     starts: list[ScreenedStart]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # an effect whose readings diverge is left out
 def screen_effects(
     search: ForceSearch, base: Estimate, effects: Iterable[Effect]
 ) -> list[ScreenedEffect]:
