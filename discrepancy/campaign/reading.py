@@ -65,6 +65,10 @@ def read_campaign(folder: str | Path) -> Campaign:
     if folder.name == CAMPAIGN_FILE:
         folder = folder.parent
     path = folder / CAMPAIGN_FILE
+    if folder.is_file():
+        raise CampaignFileError(
+            f"{folder} is a file: give the folder of a campaign, with its {CAMPAIGN_FILE}."
+        )
     if not path.exists():
         missing_path = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
         raise CampaignFileError(f"There is no {missing_path}: give the folder of a campaign.")

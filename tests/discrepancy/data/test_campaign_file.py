@@ -29,7 +29,10 @@ TOML = "campaign.toml"
 
 
 def test_missing_folders_and_bytes(tmp_path):
+    table = tmp_path / "table.csv"
+    table.touch()
     for place, words in (
+        (table, "is a file: give the folder of a campaign"),
         (tmp_path / "nowhere", "There is no folder"),
         (tmp_path, "There is no campaign.toml in"),
     ):
