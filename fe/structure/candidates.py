@@ -44,6 +44,9 @@ SETS_OF_THE_MESHER = "gmsh:"
 """Begin of the names of sets that a mesher makes, and no engineer."""
 
 
+NO_POINTS = np.zeros(0, dtype=np.int64)
+
+
 class MassPlace(NamedTuple):
     """A place where a mass may be.
 
@@ -129,19 +132,39 @@ def _places_of_nodes(structure: MatrixStructure) -> Iterator[tuple[str, FloatArr
         yield f"node {node}", weights
 
 
-def _spread_points(points: FloatArray, count: int, least_distance: float) -> IntArray:
+def _spread_points(
+    points: FloatArray, count: int, least_distance: float, preferred: IntArray = NO_POINTS
+) -> IntArray:
     """Return the numbers of points that are no nearer to each other than a distance, up to a count.
 
-    Each is the point farthest from those before it, the first the one farthest from the middle.
+    Preferred points come first, up to half of the count. Each further one is the point farthest
+    from those before it; without any, the first is the point farthest from the middle.
+
+    Parameters
+    ----------
+    points : (P, 3) array
+        The points.
+    count : int
+        Largest number of points to choose.
+    least_distance : float
+        Least distance of two chosen points.
+    preferred : array of int
+        Numbers of points that are chosen unless they are too near to another.
     """
-    distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
     chosen: list[int] = []
-    for _ in range(min(count, len(points))):
+    distance = np.full(len(points), np.inf)
+    for number in preferred.tolist():
+        if len(chosen) < count // 2 and distance[number] >= least_distance:
+            chosen.append(number)
+            distance = np.minimum(distance, np.linalg.norm(points - points[number], axis=1))
+    if not chosen:
+        distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
+        chosen.append(int(distance.argmax()))
+        distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)) and distance.max() >= least_distance:
         chosen.append(int(distance.argmax()))
         from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        distance = from_last if len(chosen) == 1 else np.minimum(distance, from_last)
-        if distance.max() < least_distance:
-            break
+        distance = np.minimum(distance, from_last)
     return np.array(chosen, dtype=np.int64)
 
 
@@ -149,7 +172,9 @@ def loss_places(structure: AffineStructure) -> list[LossPlace]:
     """Return the patches of a mesh that may lose stiffness, outside its damage regions.
 
     These are its small named sets of cells, and compact patches of a grid on all other cells,
-    without overlap. Matrices have no cells.
+    without overlap. Where there are gauges, the grid has patches around them: a loss below a gauge
+    changes its strain most, which a patch with the gauge at its edge could not show. Matrices have
+    no cells.
     """
     if not isinstance(structure, Structure):
         return []
@@ -166,7 +191,13 @@ def loss_places(structure: AffineStructure) -> list[LossPlace]:
     remaining = np.flatnonzero(is_open)
     if len(remaining):
         centres = mesh.centres[remaining]
-        middles = _spread_points(centres, GRID_PATCHES, LEAST_DISTANCE * mesh.size)
+        cells_at_gauges = _cells_at_gauges(structure)
+        middles = _spread_points(
+            centres,
+            GRID_PATCHES,
+            LEAST_DISTANCE * mesh.size,
+            preferred=np.searchsorted(remaining, cells_at_gauges[is_open[cells_at_gauges]]),
+        )
         _, patch_of = KDTree(centres[middles]).query(centres)
         for number, middle in enumerate(middles):
             name = f"around {mesh.place(np.round(centres[middle], 4))}"
@@ -181,6 +212,16 @@ def loss_places(structure: AffineStructure) -> list[LossPlace]:
                 terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
         places.append(LossPlace(name, terms))
     return places
+
+
+def _cells_at_gauges(structure: Structure) -> IntArray:
+    """Return the cell (G,) whose middle is nearest to each gauge."""
+    mesh = structure.mesh
+    points = [mesh.unit * np.asarray(gauge.point) for gauge in structure.design.gauge]
+    if not points:
+        return NO_POINTS
+    _, cells = KDTree(mesh.centres).query(points)
+    return np.asarray(cells, dtype=np.int64)
 
 
 class LoadChange(NamedTuple):

@@ -353,6 +353,13 @@ def test_a_patch_that_loses_stiffness_is_that_of_the_full_model(
     )
 
 
+def test_a_patch_lies_around_a_gauge(write_beam: WriteBeam, tmp_path: Path) -> None:
+    beam = assemble_structure(
+        write_beam(tmp_path, {"point = [20, 10, 10]": "point = [35, 10, 10]"}, 8)
+    )
+    assert next(iter(loss_places(beam))).name == "around (31.2, 10, 5) mm"
+
+
 def test_patches_do_not_overlap_and_leave_out_damage_regions(slender: Yielding) -> None:
     """All of them and the damage regions together hold the stiffness of the beam once."""
     free = slice(0, slender.full.held().unknowns)
