@@ -26,6 +26,7 @@ from uav_twin import (
     schema_command,
     structure,
     structure_from_deck,
+    structure_suspects,
     watch_command,
     wing_commands,
 )
@@ -211,6 +212,7 @@ structure_group.command("verify")(structure.verify)
 structure_group.command("field")(structure.field)
 structure_group.command("reduce")(structure.reduce)
 structure_group.command("fmu")(structure.fmu)
+structure_group.command("suspects")(structure_suspects.suspects)
 structure_group.command("from-deck")(structure_from_deck.from_deck)
 
 

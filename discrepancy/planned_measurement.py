@@ -1,0 +1,192 @@
+"""A measurement that is planned on a structure: which suspicions it can tell apart.
+
+Before anything is measured, the gauges, displacements and accelerations of a structure file are the
+channels of a campaign with stated noise, and its forces the trials: static load lines, and releases
+of these loads. `judgement.separability` says what such a campaign can decide.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.errors import ModelError
+from discrepancy.fits.candidate import EffectTerm
+from discrepancy.judgement.separability import Detectability, Separability, compute_separability
+from discrepancy.system.structures import StructureModel
+from discrepancy.system.system_state import SystemState
+from fe.runtime.patch import ModelPatch
+
+SUSPECTS = (
+    "support_compliance",
+    "added_mass",
+    "region_stiffness_loss",
+    "load_offset",
+    "load_direction",
+    "gauge_misalignment",
+    "gauge_gain",
+)
+"""What a structural engineer suspects first."""
+LEVELS = 8
+"""Number of levels of a load line, from zero to the largest force."""
+SAMPLES, SAMPLES_PER_PERIOD = 1200, 20
+"""Number of samples of a release, and of those in a period of the first mode."""
+RELEASED_SHARE = 0.5
+"""Force of a release over the largest one."""
+RELEASE_DEVIATION = 0.02
+"""Standard deviation of the displacement of a release, as a fraction of it."""
+ZERO_OVER_NOISE = 2.0
+"""Standard deviation of a channel's zero over that of its noise."""
+
+
+class Precision(NamedTuple):
+    """How precise the planned channels are.
+
+    Attributes
+    ----------
+    noise : mapping of Quantity to float
+        Standard deviation of the noise of a reading, by quantity [SI].
+    gain : float
+        Standard deviation of the relative error of a gain [1].
+    """
+
+    noise: dict[Quantity, float]
+    gain: float
+
+
+class Plan(NamedTuple):
+    """Trials that are planned, and what they can decide.
+
+    Attributes
+    ----------
+    trials : str
+        The trials in words.
+    setting : Setting
+        The campaign of these trials, and the structure.
+    separability : Separability
+        Which suspicions they show, and which of them look alike.
+    """
+
+    trials: str
+    setting: Setting
+    separability: Separability
+
+    def least_change(self, row: Detectability) -> ModelPatch | None:
+        """Return a suspicion at the least size that the trials show; None if they show none."""
+        if row.reason or not np.isfinite(row.detectable):
+            return None
+        term = EffectTerm(row.effect, row.place)
+        sizes = term.physical_values(term.start_values()) | {row.parameter: row.detectable}
+        return row.effect.patch(self.setting, sizes, row.place)
+
+
+def plans_of(
+    model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
+) -> tuple[Plan, ...]:
+    """Return what static loads can decide, and what static loads and releases can.
+
+    Parameters
+    ----------
+    model : StructureModel
+        The structure with the changes that it may have.
+    precision : Precision
+        How precise the channels are.
+    catalogue : sequence of Effect
+        The effects, of which the suspicions are compared.
+
+    Raises
+    ------
+    ModelError
+        If the structure has no force, or nothing that is read at rest.
+    """
+    if not model.forces:
+        raise ModelError(
+            f"The structure {model.name} has no control in N: a planned load line needs one; give "
+            'a [[control]] with unit = "N" and a [[load]] tied to it.'
+        )
+    if set(model.quantities.values()) <= {Quantity.ACCELERATION}:
+        raise ModelError(
+            f"The structure {model.name} has neither a gauge nor a displacement, which a planned "
+            "load line would be read by: give a [[gauge]] or a [[displacement]]."
+        )
+    suspects = [effect for effect in catalogue if effect.identifier in SUSPECTS]
+    lines = _load_lines(model)
+    campaigns = {
+        "static loads": _campaign_of(model, precision, lines),
+        "static loads and releases": _campaign_of(model, precision, [*lines, *_releases(model)]),
+    }
+    plans = []
+    for name, campaign in campaigns.items():
+        setting = Setting(campaign, model, model.scales(campaign))
+        separability = compute_separability(campaign, model, setting, suspects)
+        plans.append(Plan(name, setting, separability))
+    return tuple(plans)
+
+
+def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[Trial]) -> Campaign:
+    """Return the campaign of planned trials, with the channels that they record."""
+    recorded = {name for trial in trials for name in trial.channels}
+    channels = {}
+    for name, quantity in model.quantities.items():
+        if name in recorded:
+            noise = precision.noise[quantity]
+            channels[name] = Channel(
+                name,
+                quantity,
+                output=name,
+                noise=NoiseRecord(noise),
+                gain_deviation=precision.gain,
+                offset_deviation=ZERO_OVER_NOISE * noise,
+            )
+    return Campaign(
+        name=f"planned on {model.name}",
+        channels=channels,
+        trials=tuple(trials),
+        reference_temperature=None,
+        parameters={},
+        data_hash="",
+    )
+
+
+def _load_lines(model: StructureModel) -> list[Trial]:
+    """Return a load line of each force, with readings of zero; accelerations are not read."""
+    channels = tuple(
+        name for name, quantity in model.quantities.items() if quantity is not Quantity.ACCELERATION
+    )
+    force = np.linspace(0.0, model.largest_force, LEVELS)
+    rows = np.arange(float(LEVELS))
+    lines = []
+    for name in model.forces:
+        lines.append(
+            Trial.plain(
+                f"load {name}", TrialKind.STATIC, channels, rows, force=force, load_place=name
+            )
+        )
+    return lines
+
+
+def _releases(model: StructureModel) -> list[Trial]:
+    """Return a release of each force, from the displacement along it under a static load."""
+    state = SystemState(tuple(model.prior_mean().tolist()))
+    system = model.build_system(state)
+    first_frequency = float(system.angular_frequency.min()) / (2.0 * np.pi)
+    time = np.arange(SAMPLES) / (SAMPLES_PER_PERIOD * first_frequency)
+    releases = []
+    for name in model.forces:
+        load = model.force_row(name, state)
+        flexibility = float(load @ np.linalg.solve(system.stiffness, load))
+        displacement = RELEASED_SHARE * model.largest_force * flexibility
+        releases.append(
+            Trial.plain(
+                f"release of {name}",
+                TrialKind.RINGDOWN,
+                tuple(model.quantities),
+                time,
+                load_place=name,
+                release=Release(displacement, RELEASE_DEVIATION),
+            )
+        )
+    return releases
