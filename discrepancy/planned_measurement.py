@@ -85,7 +85,7 @@ class Plan(NamedTuple):
 
 def plans_of(
     model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
-) -> tuple[Plan, ...]:
+) -> tuple[Plan, Plan]:
     """Return what static loads can decide, and what static loads and releases can.
 
     Parameters
@@ -123,7 +123,8 @@ def plans_of(
         setting = Setting(campaign, model, model.scales(campaign))
         separability = compute_separability(campaign, model, setting, suspects)
         plans.append(Plan(name, setting, separability))
-    return tuple(plans)
+    static, with_releases = plans
+    return static, with_releases
 
 
 def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[Trial]) -> Campaign:

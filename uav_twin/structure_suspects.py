@@ -54,7 +54,8 @@ def suspects(
     model = StructureModel(changeable_model(find_structure(file)))
     with stage("What the planned measurement can decide"):
         plans = plans_of(model, Precision(noise, 0.01 * gain), library())
-    rows = _rows(*plans)
+    static, with_releases = plans
+    rows = _rows(static, with_releases)
     if json:
         terminal.print_json({"suspicions": rows})
         return
