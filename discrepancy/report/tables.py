@@ -76,14 +76,21 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
         fits.append(fit)
     estimates_of_fits = [calibrated_parameters(problem, fitted) for fitted in fits]
     layout = problem.shared
-    means = layout.centre.tolist()[: layout.parameter_count]
-    deviations = layout.scale.tolist()[: layout.parameter_count]
+    priors = {
+        parameter.name: (mean, deviation)
+        for parameter, mean, deviation in zip(
+            problem.model.parameters,
+            layout.centre.tolist()[: layout.parameter_count],
+            layout.scale.tolist()[: layout.parameter_count],
+            strict=True,
+        )
+    }
     rows = []
-    for index, (mean, deviation) in enumerate(zip(means, deviations, strict=True)):
+    for index, parameter in enumerate(estimates_of_fits[0]):
+        mean, deviation = priors[parameter.name]
         cells = [_with_half_width(mean, deviation)]
         for estimates in estimates_of_fits:
             cells.append(_with_half_width(estimates[index].mean, estimates[index].deviation))
-        parameter = estimates_of_fits[0][index]
         name = parameter.name.replace("_", " ")
         rows.append((name, unit_text(parameter.unit), *cells))
     return rows
