@@ -297,12 +297,15 @@ class _Ranking:
 
         A named law is enough if it leaves no force, and no exponent of it had to be fitted. The
         curve acts at the port that shows most of the missing force, and runs over what explains
-        more of that force: displacement or velocity.
+        more of that force: displacement or velocity. A port of a state has neither.
         """
         if self.best.leaves_no_force and not self.best.candidate.has_free_shape:
             return None
         base = self.search.estimate_without_effects
         port = max(base.processes, key=self.search.force_deviation)
+        scale = self.search.problem.setting.scales.ports.get(self.search.ports[port])
+        if scale is not None and scale.of_state:
+            return None
         force = np.concatenate([trial.missing_forces[port] for trial in base.trials])
         values_of = {
             "displacement": np.concatenate(
