@@ -62,15 +62,12 @@ class Plan(NamedTuple):
 
     Attributes
     ----------
-    trials : str
-        The trials in words.
     setting : Setting
         The campaign of these trials, and the structure.
     separability : Separability
         Which suspicions they show, and which of them look alike.
     """
 
-    trials: str
     setting: Setting
     separability: Separability
 
@@ -114,17 +111,21 @@ def plans_of(
         )
     suspects = [effect for effect in catalogue if effect.identifier in SUSPECTS]
     lines = _load_lines(model)
-    campaigns = {
-        "static loads": _campaign_of(model, precision, lines),
-        "static loads and releases": _campaign_of(model, precision, [*lines, *_releases(model)]),
-    }
-    plans = []
-    for name, campaign in campaigns.items():
-        setting = Setting(campaign, model, model.scales(campaign))
-        separability = compute_separability(campaign, model, setting, suspects)
-        plans.append(Plan(name, setting, separability))
-    static, with_releases = plans
+    static = _plan(model, precision, lines, suspects)
+    with_releases = _plan(model, precision, [*lines, *_releases(model)], suspects)
     return static, with_releases
+
+
+def _plan(
+    model: StructureModel,
+    precision: Precision,
+    trials: Sequence[Trial],
+    suspects: Sequence[Effect],
+) -> Plan:
+    """Return what planned trials can decide of some suspicions."""
+    campaign = _campaign_of(model, precision, trials)
+    setting = Setting(campaign, model, model.scales(campaign))
+    return Plan(setting, compute_separability(campaign, model, setting, suspects))
 
 
 def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[Trial]) -> Campaign:

@@ -461,8 +461,8 @@ class Verdict:
         Posterior probability of the conclusion among the hypotheses compared: of all sets that
         contain the named one, of all members of the group, or of 'none' (nothing missing and below
         detectability). For a family it is that of the family and its members, or that of the member
-        if only the shape gate found the family. For an unexplained gap it is that of the most
-        probable set, which is not named, and nan if none was compared [1].
+        if only the shape gate found the family. It has no meaning for an unexplained gap, where no
+        set is named, and is nan where the data are at fault [1].
     log_bayes_factor : float
         Log evidence of the best hypothesis over that of 'none' [nat].
     effects : tuple of NamedEffect

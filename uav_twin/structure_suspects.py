@@ -53,8 +53,7 @@ def suspects(
     }
     model = StructureModel(changeable_model(find_structure(file)))
     with stage("What the planned measurement can decide"):
-        plans = plans_of(model, Precision(noise, 0.01 * gain), library())
-    static, with_releases = plans
+        static, with_releases = plans_of(model, Precision(noise, 0.01 * gain), library())
     rows = _rows(static, with_releases)
     if json:
         terminal.print_json({"suspicions": rows})

@@ -12,8 +12,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, TrialKind
-from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE, EffectParameter, ShapeParameter
-from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.catalogue.entry import (
+    NINETY_PERCENT_QUANTILE,
+    EffectParameter,
+    ForceTable,
+    ShapeParameter,
+)
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
@@ -319,17 +324,16 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
 
     Intervals are those of the posterior draws if the fit has any, else of its covariance.
     """
-    low, high = _scaled_interval(hypothesis)
+    low, high = _intervals(hypothesis, np.eye(hypothesis.candidate.parameter_count))
     first_parameter = 0
     effects = []
     for term, values in hypothesis.candidate.split_by_term(hypothesis.effect):
         parameter_count = len(term.effect.parameters)
+        estimates = []
         if term.effect.table is not None:
-            numbers = slice(first_parameter, first_parameter + parameter_count)
-            estimates = _forces_of_table(problem, term, hypothesis, numbers)
+            estimates = _forces_of_table(problem, term.place, hypothesis, term.effect.table)
             parameter_count = len(estimates)
         else:
-            estimates = []
             for number, parameter in enumerate(term.parameters, start=first_parameter):
                 bounds = (float(low[number]), float(high[number]))
                 estimates.append(_estimate(parameter, float(hypothesis.effect[number]), bounds))
@@ -349,7 +353,7 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
 
 
 def _forces_of_table(
-    problem: Problem, term: EffectTerm, hypothesis: ComparedHypothesis, numbers: slice
+    problem: Problem, port: str, hypothesis: ComparedHypothesis, table: ForceTable
 ) -> list[ParameterEstimate]:
     """Return the forces of a curve of free shape at some of its points, with 90 % intervals.
 
@@ -357,37 +361,26 @@ def _forces_of_table(
     ----------
     problem : Problem
         The campaign and the model.
-    term : EffectTerm
-        The curve at its port.
+    port : str
+        The port of the curve.
     hypothesis : ComparedHypothesis
-        The hypothesis with the posterior of the amplitudes.
-    numbers : slice
-        The numbers of the amplitudes among the effect parameters of the hypothesis.
+        The hypothesis, of which the curve is the only effect.
+    table : ForceTable
+        The curve, as functions of which the hypothesis has the amplitudes.
     """
-    table = term.effect.table
-    assert table is not None
     functions = table.functions[::TOLD_POINT]
-    amplitudes = hypothesis.effect[numbers]
-    first_effect = len(hypothesis.shared)
-    covariance = hypothesis.covariance[first_effect:, first_effect:][numbers, numbers]
-    forces = functions @ amplitudes
-    variances = np.sum((functions @ covariance) * functions, axis=1)
-    half_widths = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
-    force_unit, motion_unit = problem.model.port_units(term.place)
+    forces = functions @ hypothesis.effect
+    low, high = _intervals(hypothesis, functions)
+    force_unit, motion_unit = problem.model.port_units(port)
     unit = motion_unit if table.variable == "displacement" else f"{motion_unit}/s"
     estimates = []
-    for point, force, half_width in zip(
-        table.points[::TOLD_POINT].tolist(),
-        forces.tolist(),
-        half_widths.tolist(),
-        strict=True,
-    ):
+    for number, point in enumerate(table.points[::TOLD_POINT].tolist()):
         estimates.append(
             ParameterEstimate(
                 name=f"force_at_{point:.3g}",
-                value=force,
-                low=force - half_width,
-                high=force + half_width,
+                value=float(forces[number]),
+                low=float(low[number]),
+                high=float(high[number]),
                 unit=force_unit,
                 description=f"force at a {table.variable} of {point:.3g} {unit}",
             )
@@ -395,16 +388,28 @@ def _forces_of_table(
     return estimates
 
 
-def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper ends (E,) of the 90 % intervals of scaled effect parameters."""
-    fitted_values = hypothesis.effect
+def _intervals(
+    hypothesis: ComparedHypothesis, functions: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and upper ends (F,) of 90 % intervals of what is linear in the parameters.
+
+    Parameters
+    ----------
+    hypothesis : ComparedHypothesis
+        The hypothesis with the posterior of its E scaled effect parameters.
+    functions : (F, E) array
+        What each quantity changes by for a unit of each parameter.
+    """
+    most_probable = functions @ hypothesis.effect
     if isinstance(hypothesis, CandidateFit) and hypothesis.draws is not None:
-        low, high = np.quantile(hypothesis.draws, (0.05, 0.95), axis=0)
+        low, high = np.quantile(hypothesis.draws @ functions.T, (0.05, 0.95), axis=0)
         # the most probable value may lie outside of the quantiles, and is included
-        return np.minimum(low, fitted_values), np.maximum(high, fitted_values)
-    variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
+        return np.minimum(low, most_probable), np.maximum(high, most_probable)
+    first_effect = len(hypothesis.shared)
+    covariance = hypothesis.covariance[first_effect:, first_effect:]
+    variances = np.sum((functions @ covariance) * functions, axis=1)
     half_width = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
-    return fitted_values - half_width, fitted_values + half_width
+    return most_probable - half_width, most_probable + half_width
 
 
 def _estimate(

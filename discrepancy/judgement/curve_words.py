@@ -50,9 +50,9 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
     curve : TableStiffness or TableDamping
         The force at displacements or velocities of its port.
     force_unit : str
-        The unit of the force, N or N m.
+        The unit of the force: N, N m or, where the port is not known, "N or N m".
     """
-    motion_unit = "m" if force_unit == "N" else "rad"
+    motion_unit = {"N": "m", "N m": "rad"}.get(force_unit, "m or rad")
     forces = np.array(curve.forces)
     if isinstance(curve, TableDamping):
         return _friction_in_words(np.array(curve.speeds), forces, force_unit, f"{motion_unit}/s")
@@ -68,8 +68,13 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
     if high < points[-1]:
         slope, high = _line_to_zero(points, forces, points >= high)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
-    motion = _displacement_text if force_unit == "N" else _turn_text
-    return f"it is zero from {motion(low)} to {motion(high)}, with a slope of {listing(slopes)}"
+    begin, end = _position_text(low, motion_unit), _position_text(high, motion_unit)
+    return f"it is zero from {begin} to {end}, with a slope of {listing(slopes)}"
+
+
+def _position_text(position: float, unit: str) -> str:
+    """Return a position in its unit; a displacement in metres is told in millimetres."""
+    return f"{number(round(1e3 * position, 3))} mm" if unit == "m" else f"{number(position)} {unit}"
 
 
 def _friction_in_words(
@@ -162,13 +167,3 @@ def _growth(variable: str, displacements: FloatArray, forces: FloatArray) -> str
     plural = "displacements" if variable == "displacement" else "velocities"
     where = f" at {side_text} {plural} only" if is_one_sided else ""
     return f"{growth}{where}"
-
-
-def _displacement_text(displacement: float) -> str:
-    """Return a displacement in millimetres."""
-    return f"{number(round(1e3 * displacement, 3))} mm"
-
-
-def _turn_text(turn: float) -> str:
-    """Return a turn in radians."""
-    return f"{number(turn)} rad"

@@ -42,9 +42,7 @@ OFFSET_STEP = 0.01
 """Step of the place of a force over the size of the mesh, for its derivative."""
 SETS_OF_THE_MESHER = "gmsh:"
 """Begin of the names of sets that a mesher makes, and no engineer."""
-
-
-NO_POINTS = np.zeros(0, dtype=np.int64)
+NO_POINTS: IntArray = np.zeros(0, dtype=np.int64)
 
 
 class MassPlace(NamedTuple):

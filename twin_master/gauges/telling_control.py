@@ -1,9 +1,9 @@
 """Which control tells two hypotheses about the gauges apart, as advice where an alarm is ambiguous.
 
 What a control shows in the next step is simulated under both hypotheses, with the gauges and, if
-the control asks for an inspection, its readings; if one step seldom suffices, ten steps are
-simulated. The hypotheses are told apart if the true one is
-then almost certain: the expected use of an experiment of Lindley (1956), for that loss.
+the control asks for an inspection, its readings. If one step seldom suffices, ten steps are
+simulated. The hypotheses are told apart if the true one is then almost certain; the probability of
+that is the expected use of an experiment (Lindley 1956).
 """
 
 from collections.abc import Sequence

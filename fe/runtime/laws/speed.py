@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import POSITION
 from .interface import NOT_NEGATIVE, PARAMETERS, POSITIVE, FloatArray, PortForce, power
-from .tables import LEAST_DIVISOR, check_table
+from .tables import TabulatedForce
 
 COEFFICIENT, EXPONENT, POSITION_EXPONENT, LEVEL, ONE_SIDED = range(5)
 """Columns of a law's parameters: k, p, a, l, and 1 if there is no force below the level. With
@@ -99,7 +99,7 @@ class Overflow(PortForce):
         return np.array((k, self.exponent, 0.0, self.level, 1.0))
 
 
-class TableDamping(PortForce):
+class TableDamping(TabulatedForce, PortForce):
     """F(v) by a table: `forces` at rising `speeds`, with straight lines in between.
 
     Before the first speed and beyond the last one the force is constant.
@@ -111,26 +111,16 @@ class TableDamping(PortForce):
     force_and_slope = staticmethod(force_of_mean_speed)
 
     @property
-    def proportional(self) -> tuple[str, ...]:
-        """The forces; the speeds do not scale the law."""
-        return ("forces",)
-
-    @property
-    def magnitude(self) -> float:
-        """The largest force of the table [N or N m]."""
-        return max(map(abs, self.forces), default=0.0)
-
-    @property
     def parameter_row(self) -> FloatArray:
         """The largest force as k, and the table as the head of this file says."""
-        forces = np.array(self.forces) / max(self.magnitude, LEAST_DIVISOR)
+        forces = self.relative_forces
         areas = 0.5 * (forces[1:] + forces[:-1]) * np.diff(self.speeds)
         head = [self.magnitude, 1.0, 0.0, 0.0, TABLE, len(forces)]
         return np.array([*head, *self.speeds, *forces, 0.0, *np.cumsum(areas)])
 
     def check(self) -> None:
         """Raise `InvalidPatchError` unless there are two points or more, in rising order."""
-        check_table(self, "speeds", self.speeds, self.forces)
+        self.check_positions("speeds", self.speeds)
 
 
 def table_force_and_slope(law: FloatArray, speed: float) -> tuple[float, float]:
@@ -187,8 +177,7 @@ def speed_after_table(law: FloatArray, speed: float, strength: float, duration: 
         if force == 0.0:
             return speed
         # the next point in the direction in which the force drives the speed
-        falls = force > 0.0
-        if falls:
+        if force > 0.0:
             target = np.searchsorted(speeds, speed) - 1
         else:
             target = np.searchsorted(speeds, speed, "right")

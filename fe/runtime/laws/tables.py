@@ -1,9 +1,9 @@
-"""Laws given by tables: a force at each of some displacements, smooth in between.
+"""Laws given by tables, and the spring among them: a force at each of some displacements.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -14,28 +14,46 @@ LEAST_DIVISOR = 1e-300
 """In place of the largest force of a table of zeros."""
 
 
-def check_table(
-    law: PortForce, name: str, positions: tuple[float, ...], forces: tuple[float, ...]
-) -> None:
-    """Raise `InvalidPatchError` unless a table has two points or more, in rising order.
+class TabulatedForce:
+    """What laws by tables have in common: `forces`, of which each stands at a rising position."""
 
-    Parameters
-    ----------
-    law : PortForce
-        The law, for the message.
-    name : str
-        Name of the positions, for the message.
-    positions, forces : tuple of float
-        The positions (displacements or speeds), and the force at each.
-    """
-    if len(positions) < 2 or len(forces) != len(positions) or np.any(np.diff(positions) <= 0.0):
-        raise InvalidPatchError(
-            f"{name} of {law.kind!r} must be two or more rising numbers, each with one of the "
-            f"forces, but are {list(positions)} with {len(forces)} forces."
-        )
+    kind: ClassVar[str]
+    forces: tuple[float, ...]
+
+    @property
+    def proportional(self) -> tuple[str, ...]:
+        """The forces; the positions do not scale the law."""
+        return ("forces",)
+
+    @property
+    def magnitude(self) -> float:
+        """The largest force of the table [N or N m]."""
+        return max(map(abs, self.forces), default=0.0)
+
+    @property
+    def relative_forces(self) -> FloatArray:
+        """The forces over the largest one; zeros if there is no force."""
+        return np.array(self.forces) / max(self.magnitude, LEAST_DIVISOR)
+
+    def check_positions(self, name: str, positions: tuple[float, ...]) -> None:
+        """Raise `InvalidPatchError` unless there are two positions or more, in rising order.
+
+        Parameters
+        ----------
+        name : str
+            Name of the positions, for the message.
+        positions : tuple of float
+            The displacements or speeds of the table.
+        """
+        count = len(positions)
+        if count < 2 or len(self.forces) != count or np.any(np.diff(positions) <= 0.0):
+            raise InvalidPatchError(
+                f"{name} of {self.kind!r} must be two or more rising numbers, each with one of the "
+                f"forces, but are {list(positions)} with {len(self.forces)} forces."
+            )
 
 
-class TableStiffness(PortForce):
+class TableStiffness(TabulatedForce, PortForce):
     """F(x) by a table: `forces` at rising `displacements`, and a smooth curve through these points.
 
     Between two points the curve is a cubic polynomial (Hermite), with the slopes of differences of
@@ -46,22 +64,12 @@ class TableStiffness(PortForce):
     forces: Annotated[tuple[float, ...], "N or N m"]
 
     @property
-    def proportional(self) -> tuple[str, ...]:
-        """The forces; the displacements do not scale the law."""
-        return ("forces",)
-
-    @property
-    def magnitude(self) -> float:
-        """The largest force of the table [N or N m]."""
-        return max(map(abs, self.forces), default=0.0)
-
-    @property
     def parameter_row(self) -> FloatArray:
         """The largest force, the number of points, zeros; then the points of the curve.
 
         Of the points there are the displacements, then forces and slopes over the largest force.
         """
-        forces = np.array(self.forces) / max(self.magnitude, LEAST_DIVISOR)
+        forces = self.relative_forces
         slopes = np.gradient(forces, self.displacements)
         unused = [0.0] * (PARAMETERS - 2)
         head = [self.magnitude, len(forces), *unused]
@@ -69,7 +77,7 @@ class TableStiffness(PortForce):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` unless there are two points or more, in rising order."""
-        check_table(self, "displacements", self.displacements, self.forces)
+        self.check_positions("displacements", self.displacements)
 
     @staticmethod
     def force_and_slope(
