@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from reporting.files import atomic_write_text
-from twin_master.store.schema import SCHEMA
+from twin_master.store.schema import FIELDS_OF_BELIEFS, SCHEMA, fleet_rows, rows_of_group
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "stores.md"
 _GROUPS = (
@@ -24,13 +24,6 @@ _GROUPS = (
     "truth",
 )
 """The groups of `run.nc` in their order."""
-_LEADS = {"filtered": "step", "smoothed": "step", "predicted": "step horizon"}
-"""The leading axes of the groups that share the variables of a belief."""
-_GIVEN = {
-    "filtered": "observations up to the step",
-    "smoothed": "all observations",
-    "predicted": "observations up to the step, through the policy",
-}
 _MEANING_OF_FIELD = {
     "decided_on": "the belief on which the next control is decided",
     "how": "that the twin assumes or has learnt",
@@ -59,7 +52,8 @@ fleet["north"].sel(twin="north-3")["observed"]["strain"]    # (step, sensor)
 A word in upper case stands for a name of the run: ROLE is the observed quantity, such as `strain`,
 and FACTOR a factor of the state, such as `z1`. A unit in upper case is that of the scenario or
 binding. Where sensors have different units, the unit is `see sensor_unit`. Every variable has its
-unit and meaning in `.attrs["units"]` and `.attrs["long_name"]`.
+unit and meaning in `.attrs["units"]` and `.attrs["long_name"]`. In the steps that a twin of a fleet
+did not fly its numbers are NaN and its control is -1.
 
 The names of the twins are in the group of the fleet, and the groups inside it inherit them.
 
@@ -74,14 +68,9 @@ def page() -> str:
     coordinates = SCHEMA["coordinates"] | SCHEMA["fleet_coordinates"]
     sections.append(_section("Labels of the axes", coordinates, {}))
     for group in _GROUPS:
-        rows = SCHEMA[group]
-        fields: dict[str, str] = {}
-        if group in _LEADS:
-            noise = SCHEMA["noise"] if group == "filtered" else {}
-            rows = SCHEMA["belief"] | noise | rows
-            fields = {"lead": _LEADS[group], "given": _GIVEN[group]}
-        sections.append(_section(f"Group `{group}` of a run", rows, fields))
-    sections.append(_section("A group of a fleet", SCHEMA["fleet"], {}))
+        fields = FIELDS_OF_BELIEFS.get(group, {})
+        sections.append(_section(f"Group `{group}` of a run", rows_of_group(group), fields))
+    sections.append(_section("A group of a fleet", fleet_rows(), {}))
     return "\n".join(sections)
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,34 +19,20 @@ from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, MissionResult
 from twin_master.store.schema import (
+    FIELDS_OF_BELIEFS,
     SCHEMA,
+    Entry,
     coordinate_variables,
     coordinates_of_axes,
     described_variable,
+    observed_entries,
+    rows_of_group,
     scenario_fields,
 )
 
 SchemaFields = Mapping[str, str]
 """The words that take the place of the fields in braces of the schema, the file `run.toml`."""
 _NO_FIELDS: SchemaFields = MappingProxyType({})
-
-
-class Entry(NamedTuple):
-    """A variable to store.
-
-    Attributes
-    ----------
-    name : str
-        Its name in the schema, perhaps with fields in braces.
-    values : array
-        Its values.
-    fields : mapping of str to str
-        The values of its fields.
-    """
-
-    name: str
-    values: AnyArray
-    fields: SchemaFields = _NO_FIELDS
 
 
 _BELIEF_OF_DECISION = {
@@ -117,13 +102,11 @@ class _GroupBuilder:
         filled with those of the mission, of the group, and of the entry; a later one replaces an
         earlier one of the same name.
         """
-        schema = SCHEMA[group]
-        # Groups of a belief share variables; only they say what their belief is given
-        if "given" in fields:
-            schema = SCHEMA["belief"] | SCHEMA["noise"] | schema
+        rows = rows_of_group(group)
+        fields_of_group = {**self._fields, **FIELDS_OF_BELIEFS.get(group, {}), **fields}
         for entry in entries:
-            all_fields = {**self._fields, **fields, **entry.fields}
-            variable = described_variable(schema[entry.name], entry.values, all_fields)
+            all_fields = {**fields_of_group, **entry.fields}
+            variable = described_variable(rows[entry.name], entry.values, all_fields)
             yield entry.name.format(**all_fields), variable
 
     def group(
@@ -155,20 +138,14 @@ class _GroupBuilder:
 
 def _observed_entries(result: MissionResult) -> Iterator[Entry]:
     """Yield the variables of the group `observed`: readings, controls and control inputs."""
-    flight = result.flight
     scenario = result.scenario
-    yield Entry("{role}", flight.observed)
-    yield Entry("control_index", flight.control_index)
-    if scenario.observation.modes is not None:
-        # For identified modes the readings beside the sensors are their covariance
-        yield Entry("{role}_covariance", flight.readings)
-    for index, reading in enumerate(scenario.inspection_readings):
-        fields = {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
-        yield Entry("{reading}", flight.readings[:, index], fields)
+    control_index = result.flight.control_index
+    yield from observed_entries(scenario, result.flight.observation_rows)
+    yield Entry("control_index", control_index)
     for name in sorted(scenario.control[0].values):  # config.json does not preserve their order
         value_of_control = np.array([control.values[name] for control in scenario.control])
         fields = {"input": name, "unit": result.units.get(name, "1")}
-        yield Entry("{input}", value_of_control[flight.control_index], fields)
+        yield Entry("{input}", value_of_control[control_index], fields)
 
 
 def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
@@ -183,7 +160,6 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     values["residual"] = residual / expectation.noise_standard_deviation
     values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
     # The fields complete descriptions of the schema, such as
-    #   "p(state | {given})",
     #   "policy averaged over {decided_on}; its mode is the control of the next step",
     #   "observation minus its filtered mean, in the standard deviations {how}".
     belief_of_decision = result.scenario.planner.decide_on
@@ -193,8 +169,6 @@ def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
         belief_of_decision = "predicted"
     learns = result.knowledge.learning is not None
     fields = {
-        "lead": "step",
-        "given": "observations up to the step",
         "decided_on": _BELIEF_OF_DECISION[belief_of_decision],
         "how": "that the twin has learnt" if learns else "that the twin assumes",
     }
@@ -206,8 +180,7 @@ def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGrou
     smoothed_belief = result.flight.smoothed
     expectation = _expected_in_flight(result, smoothed_belief, is_smoothed=True)
     values = _belief_variables(result, smoothed_belief, expectation)
-    fields = {"lead": "step", "given": "all observations"}
-    return builder.group("smoothed", _plain_entries(values), fields)
+    return builder.group("smoothed", _plain_entries(values))
 
 
 def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
@@ -229,11 +202,7 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
         control_probabilities.append(control_probability)
     values = _belief_variables(result, predicted_belief, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
-    fields = {
-        "lead": "step horizon",
-        "given": "observations up to the step, through the policy",
-    }
-    return builder.group("predicted", _plain_entries(values), fields)
+    return builder.group("predicted", _plain_entries(values))
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:

@@ -1,13 +1,15 @@
 """The schema of stored results, `run.toml`, for the `run.nc` of a run and the store of a fleet."""
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Index
+from reporting.arrays import AnyArray, Index
 from reporting.netcdf import Variable
 from twin_master.scenario.schema import Scenario
 
@@ -18,8 +20,43 @@ SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
 
 The table `quantities` holds the titles of learnt quantities, see `quantity_titles`.
 """
+FIELDS_OF_BELIEFS = {
+    "filtered": {"lead": "step", "given": "observations up to the step"},
+    "smoothed": {"lead": "step", "given": "all observations"},
+    "predicted": {
+        "lead": "step horizon",
+        "given": "observations up to the step, through the policy",
+    },
+}
+"""The groups that share the variables of a belief, with the words for their fields in braces."""
 SEVERAL_UNITS = "see sensor_unit"
 """The unit of a variable over sensors of different units."""
+
+
+def rows_of_group(group: str) -> dict[str, list[str]]:
+    """Return axes, unit and meaning of the variables of a group of `run.nc`, by name."""
+    rows = SCHEMA[group]
+    if group == "filtered":
+        rows = SCHEMA["noise"] | rows
+    if group in FIELDS_OF_BELIEFS:
+        rows = SCHEMA["belief"] | rows
+    return rows
+
+
+def fleet_rows() -> dict[str, list[str]]:
+    """Return axes, unit, meaning and type of the variables of a fleet's store, by path."""
+    rows = {}
+    for path, row in SCHEMA["fleet"].items():
+        group, _, name = path.partition("/")
+        is_of_run = len(row) == 1
+        if is_of_run:
+            words = FIELDS_OF_BELIEFS.get(group, {})
+            texts = rows_of_group(group)[name]
+            for field, word in words.items():
+                texts = [text.replace(f"{{{field}}}", word) for text in texts]
+            row = [*texts, *row]
+        rows[path] = row
+    return rows
 
 
 def variable_paths(role: str) -> list[str]:
@@ -32,11 +69,10 @@ def variable_paths(role: str) -> list[str]:
     """
     paths = [f"observed/{role}"]
     for group in ("observed", "filtered", "smoothed", "predicted", "policy", "calibration"):
-        variables = SCHEMA[group]
-        if group in ("filtered", "smoothed", "predicted"):
-            variables = SCHEMA["belief"] | variables
         # A name with braces is a template, such as "{input}": its variables differ between runs.
-        paths += [f"{group}/{name}" for name in variables if "{" not in name]
+        # Runs of earlier versions do not have the noise.
+        names = [name for name in rows_of_group(group) if "{" not in name]
+        paths += [f"{group}/{name}" for name in names if name not in SCHEMA["noise"]]
     return paths
 
 
@@ -52,6 +88,39 @@ def scenario_fields(scenario: Scenario) -> dict[str, str]:
         "sensor_unit": SEVERAL_UNITS if len(sensor_units) > 1 else sensor_units.pop(),
         "state_unit": ", ".join(dict.fromkeys(factor.unit for factor in scenario.state)),
     }
+
+
+class Entry(NamedTuple):
+    """A variable to store.
+
+    Attributes
+    ----------
+    name : str
+        Its name in the schema, perhaps with fields in braces.
+    values : array
+        Its values.
+    fields : mapping of str to str
+        The values of its fields.
+    """
+
+    name: str
+    values: AnyArray
+    fields: Mapping[str, str] = MappingProxyType({})
+
+
+def observed_entries(scenario: Scenario, rows: AnyArray) -> Iterator[Entry]:
+    """Yield the observed variables of the group `observed`, from rows of observations (..., W).
+
+    A row has the values of the sensors, the covariance of identified modes if the sensors are
+    modes, and the readings of inspections.
+    """
+    observation = scenario.observation
+    yield Entry("{role}", rows[..., : observation.count])
+    if observation.modes is not None:
+        yield Entry("{role}_covariance", rows[..., observation.count : observation.width])
+    for number, reading in enumerate(scenario.inspection_readings):
+        fields = {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
+        yield Entry("{reading}", rows[..., observation.width + number], fields)
 
 
 def described_variable(

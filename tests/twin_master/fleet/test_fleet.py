@@ -160,10 +160,10 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(present_group, single_run,
 
 
 @PATHS
-def test_a_variable_of_a_fleet_has_axes_units_and_labels_of_that_of_a_run(present_group, single_run, path):
+def test_a_variable_of_a_fleet_is_described_as_that_of_a_run(present_group, single_run, path):
     of_fleet, of_run = present_group[path], single_run[path]
     assert of_fleet.dims == ("twin", *of_run.dims)
-    assert of_fleet.attrs["units"] == of_run.attrs["units"]
+    assert of_fleet.attrs == of_run.attrs
     for name, coordinate in of_run.coords.items():
         assert np.array_equal(of_fleet.coords[name], coordinate), name
 

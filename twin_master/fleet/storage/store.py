@@ -16,12 +16,13 @@ from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.members import Member, RecordedMembers
 from twin_master.fleet.storage.store_address import STORE_NAME, address_of
 from twin_master.fleet.storage.store_layout import (
+    NO_STEP,
     NOTICE_KINDS,
     TWIN_AXIS,
     former_names_used,
     in_present_layout,
     is_former_layout,
-    observed_columns,
+    observed_variables,
     stored_layout,
 )
 from twin_master.mission.earnings import discounted_return, earnings
@@ -48,10 +49,6 @@ FLOWN, FAILED, ENDED = 1, 2, 3
 
 The value 0 means that the twin has not flown yet.
 """
-_NO_CONTROL = -1
-"""Value of `control_index` in steps that were not flown."""
-_NO_STEP = -1
-"""Value of `first_notice` for a kind of notice that was never given."""
 _NOT_DEFINED = -1
 """Value of `early` if the policy does not depend on the level of one factor alone."""
 
@@ -82,13 +79,12 @@ def stored_variables(
     mean = [states.mean(belief) for belief in flights.filtered]
     standard_deviation = [states.standard_deviation(belief) for belief in flights.filtered]
     fallbacks = fallbacks_of(knowledge, flights)
-    notices = _notices(flights)
     earned = earnings(knowledge, flights.control_index, flights.filtered, flights.state)
     returns = discounted_return(knowledge.scenario, earned.reward, flights.control_index)
     values: dict[str, object] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
-        **_observed_variables(knowledge.scenario, flights.observation_rows),
+        **observed_variables(knowledge.scenario, flights.observation_rows),
         "observed/control_index": flights.control_index,
         "truth/state": flights.state,
         **{f"earned/{name}": values_of_steps for name, values_of_steps in vars(earned).items()},
@@ -100,27 +96,21 @@ def stored_variables(
         "filtered/last_probability": _last_belief(flights, has_failed),
         "delay": np.where(has_failed, np.nan, fallbacks.delay),
         "early": np.where(has_failed, _NOT_DEFINED, fallbacks.early),
-        "notice/count": notices.number,
-        "notice/first_step": notices.first_step,
+        **_notice_variables(flights),
         "credible": np.where(has_failed, np.nan, _credible_fraction(knowledge, flights)),
     }
     parameters = list(members[0].parameters)
     for name in parameters:
         values[f"truth/{name}"] = [member.parameters[name] for member in members]
     return {
-        path: np.ascontiguousarray(values[path], variable.dtype)
+        path: np.ascontiguousarray(values[path], variable.values.dtype)
         for path, variable in stored_layout(knowledge.scenario, parameters).items()
     }
 
 
-def _observed_variables(scenario: Scenario, rows: Float) -> dict[str, Float]:
-    """Return the observed variables, by their paths, from the rows of observations (B, T, W)."""
-    return {path: rows[..., columns] for path, columns in observed_columns(scenario).items()}
-
-
 def _steps_flown(flights: Flights) -> Index:
     """Return the number of flown steps of each twin, a (B,) array."""
-    return np.asarray((flights.control_index != _NO_CONTROL).sum(axis=1))
+    return np.asarray((flights.control_index >= 0).sum(axis=1))
 
 
 def _last_belief(flights: Flights, has_failed: NDArray[np.bool_]) -> Float:
@@ -150,33 +140,21 @@ def _credible_fraction(knowledge: Knowledge, flights: Flights) -> Float:
     return np.where(is_truth_unknown, np.nan, fraction)
 
 
-class _Notices(NamedTuple):
-    """The notices of B twins: lists with a row for each twin and a column for each `NOTICE_KINDS`.
+def _notice_variables(flights: Flights) -> dict[str, list[list[int]]]:
+    """Return for each twin the number of notices of each of `NOTICE_KINDS`, and their first step.
 
-    Attributes
-    ----------
-    number : list of list of int
-        The number of notices.
-    first_step : list of list of int
-        The step of the first notice; -1 if there is none.
+    The step is -1 if there is no notice of the kind.
     """
-
-    number: list[list[int]]
-    first_step: list[list[int]]
-
-
-def _notices(flights: Flights) -> _Notices:
-    """Count the notices of each kind of each twin, and return the counts and the first steps."""
-    numbers = []
+    counts = []
     first_steps = []
     for notices_of_twin in flights.notices:
         steps_of_kind: dict[str, list[int]] = {kind: [] for kind in NOTICE_KINDS}
         for step, notice in notices_of_twin:
             if notice.kind in steps_of_kind:
                 steps_of_kind[notice.kind].append(step)
-        numbers.append([len(steps) for steps in steps_of_kind.values()])
-        first_steps.append([min(steps, default=_NO_STEP) for steps in steps_of_kind.values()])
-    return _Notices(numbers, first_steps)
+        counts.append([len(steps) for steps in steps_of_kind.values()])
+        first_steps.append([min(steps, default=NO_STEP) for steps in steps_of_kind.values()])
+    return {"notice/count": counts, "notice/first_step": first_steps}
 
 
 class Fallbacks(NamedTuple):

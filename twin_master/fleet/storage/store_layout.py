@@ -20,6 +20,8 @@ from twin_master.store.schema import (
     coordinate_variables,
     coordinates_of_axes,
     described_variable,
+    fleet_rows,
+    observed_entries,
     scenario_fields,
 )
 
@@ -35,11 +37,9 @@ _VALUES_TOGETHER = 200_000
 """Steps of twins that are read together at most, unless `BLOCK_TWINS` have more."""
 TWIN_AXIS = "twin"
 """The dimension with a row for each twin, and the coordinate with their names."""
-_NO_CONTROL = -1
-"""Value of `control_index` in steps that were not flown."""
-_NO_STEP = -1
+NO_STEP = -1
 """Value of `notice/first_step` for a kind of notice that was never given."""
-_FILL_VALUES = {"observed/control_index": _NO_CONTROL, "notice/first_step": _NO_STEP}
+_FILL_VALUES = {"observed/control_index": -1, "notice/first_step": NO_STEP}
 """Values of twins that have not flown, for variables in which 0 has a meaning."""
 
 FORMER_DIMENSIONS = {
@@ -64,33 +64,6 @@ _FORMER_OBSERVED = "observed"
 """The former variable with the sensors and, behind them, what else was read in a step."""
 
 
-class StoredVariable(NamedTuple):
-    """A variable of the store.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Its dimensions beside `twin`.
-    unit, title : str
-        Its unit and its name in words.
-    dtype : str
-        The type of its values, such as "f4".
-    fill_value : float
-        The value of twins that have not flown.
-    """
-
-    axes: tuple[str, ...]
-    unit: str
-    title: str
-    dtype: str
-    fill_value: float
-
-    @property
-    def attributes(self) -> dict[str, str]:
-        """The attributes of the variable, as those of a run."""
-        return {"units": self.unit, "long_name": self.title}
-
-
 def dimension_sizes(scenario: Scenario) -> dict[str, int]:
     """Return the sizes of the store's dimensions for a scenario, by name."""
     observation = scenario.observation
@@ -104,12 +77,11 @@ def dimension_sizes(scenario: Scenario) -> dict[str, int]:
     }
 
 
-def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[str, StoredVariable]:
-    """Return the variables that the store of a fleet has for a group of assets.
+def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[str, Variable]:
+    """Return the variables of a twin that has not flown, as the store of a fleet has them.
 
-    They are listed in the schema, a table that has a row with axes, unit, title and type for each
-    variable. Path and row are templates: a field in braces is filled in for the scenario, and a
-    path with the field of a reading or a parameter stands for a variable of each of them.
+    Paths and rows of the schema are templates: a field in braces is filled in for the scenario, and
+    a path with the field of a reading or a parameter stands for a variable of each of them.
 
     Parameters
     ----------
@@ -120,34 +92,31 @@ def stored_layout(scenario: Scenario, parameters: Sequence[str] = ()) -> dict[st
 
     Returns
     -------
-    dict of str to StoredVariable
-        The variables by their paths in the group.
+    dict of str to Variable
+        The variables by their paths in the group, without the axis `twin`.
     """
     common_fields = scenario_fields(scenario)
+    sizes = dimension_sizes(scenario)
+    # The fields of each variable that a template stands for.
+    fields_of_template: dict[str, list[Mapping[str, str]]] = {
+        "truth/{parameter}": [{"parameter": parameter} for parameter in parameters],
+        "observed/{role}_covariance": [],
+        "observed/{reading}": [],
+    }
+    for entry in observed_entries(scenario, np.arange(scenario.row_width)):
+        fields_of_template.setdefault(f"observed/{entry.name}", []).append(entry.fields)
     layout = {}
-    for path_template, row_templates in SCHEMA["fleet"].items():
-        for own_fields in _fields_of_entries(path_template, scenario, parameters):
-            fields = common_fields | own_fields
-            path = path_template.format(**fields)
-            axes, unit, title, dtype = (template.format(**fields) for template in row_templates)
+    for template, (*row, dtype) in fleet_rows().items():
+        for own_fields in fields_of_template.get(template, [{}]):
+            fields = {**common_fields, **own_fields}
+            path = template.format(**fields)
+            axes = row[0].split()
             usual_fill_value = np.nan if dtype[0] == "f" else 0
-            fill_value = _FILL_VALUES.get(path, usual_fill_value)
-            layout[path] = StoredVariable(tuple(axes.split()), unit, title, dtype, fill_value)
+            unflown = np.full(
+                [sizes[axis] for axis in axes], _FILL_VALUES.get(path, usual_fill_value), dtype
+            )
+            layout[path] = described_variable(row, unflown, fields)
     return layout
-
-
-def _fields_of_entries(
-    template: str, scenario: Scenario, parameters: Sequence[str]
-) -> Iterator[dict[str, str]]:
-    """Yield for each variable that one row of the schema describes the values of its fields."""
-    if "{reading}" in template:
-        for reading in scenario.inspection_readings:
-            yield {"reading": reading.name, "unit": scenario.state[reading.state_index].unit}
-    elif "{parameter}" in template:
-        for parameter in parameters:
-            yield {"parameter": parameter}
-    elif "_covariance" not in template or scenario.observation.modes is not None:
-        yield {}
 
 
 def twin_coordinate(names: Sequence[str]) -> Variable:
@@ -157,7 +126,7 @@ def twin_coordinate(names: Sequence[str]) -> Variable:
 
 
 def coordinates_of_groups(
-    layout: Mapping[str, StoredVariable], scenario: Scenario
+    layout: Mapping[str, Variable], scenario: Scenario
 ) -> dict[str, dict[str, Variable]]:
     """Return for each group of a store the coordinates of all axes that its variables have.
 
@@ -166,7 +135,7 @@ def coordinates_of_groups(
 
     Parameters
     ----------
-    layout : mapping of str to StoredVariable
+    layout : mapping of str to Variable
         The variables by their paths.
     scenario : Scenario
         The scenario of the group of assets.
@@ -181,27 +150,17 @@ def coordinates_of_groups(
     axes_of_group: dict[str, set[str]] = {}
     for path, variable in layout.items():
         group, _, _ = path.rpartition("/")
-        axes_of_group.setdefault(group, set()).update(variable.axes)
+        axes_of_group.setdefault(group, set()).update(variable.dims)
     return {group: coordinates_of_axes(coordinates, axes) for group, axes in axes_of_group.items()}
 
 
-def observed_columns(scenario: Scenario) -> dict[str, slice | int]:
-    """Return where each observed variable stands in the row of observations of a step.
-
-    Returns
-    -------
-    dict of str to slice or int
-        The columns of the sensors and of the covariance of modes, and the column of each reading
-        of an inspection, by the paths of the variables.
-    """
-    observation = scenario.observation
-    columns: dict[str, slice | int] = {f"observed/{observation.role}": slice(observation.count)}
-    if observation.modes is not None:
-        covariance = slice(observation.count, observation.width)
-        columns[f"observed/{observation.role}_covariance"] = covariance
-    for number, reading in enumerate(scenario.inspection_readings):
-        columns[f"observed/{reading.name}"] = observation.width + number
-    return columns
+def observed_variables(scenario: Scenario, rows: AnyArray) -> dict[str, AnyArray]:
+    """Return the observed variables by their paths, from rows of observations (..., W)."""
+    variables = {}
+    for entry in observed_entries(scenario, rows):
+        name = entry.name.format(role=scenario.observation.role, **entry.fields)
+        variables[f"observed/{name}"] = entry.values
+    return variables
 
 
 ALL_ROWS = slice(None)
@@ -235,7 +194,7 @@ def observation_rows(group: "xr.DataTree", scenario: Scenario, twins: slice = AL
     """
     twin_count = len(range(group.sizes["twin"])[twins])
     rows = np.empty((twin_count, scenario.mission.steps, scenario.row_width))
-    for path, columns in observed_columns(scenario).items():
+    for path, columns in observed_variables(scenario, np.arange(scenario.row_width)).items():
         rows[..., columns] = stored_values(group, path, twins)
     return rows
 
@@ -276,7 +235,8 @@ def in_present_layout(
             }
         )
         if name == _FORMER_OBSERVED:
-            for path, columns in observed_columns(scenario).items():
+            all_columns = np.arange(scenario.row_width)
+            for path, columns in observed_variables(scenario, all_columns).items():
                 variables[path] = variable.isel(sensor=columns)
             continue
         path = FORMER_PATHS.get(str(name), str(name))
@@ -289,7 +249,7 @@ def in_present_layout(
     for path, variable in variables.items():
         group, _, name = path.rpartition("/")
         entry = variable.variable.copy(deep=False)
-        entry.attrs = layout[path].attributes
+        entry.attrs = dict(layout[path].attrs)
         groups.setdefault(group, {})[name] = entry
     datasets = {}
     coordinates = coordinates_of_groups(layout, scenario)

@@ -20,7 +20,6 @@ from twin_master.fleet.storage.store_address import STORE_NAME, StoreAddress
 from twin_master.fleet.storage.store_layout import (
     TWIN_AXIS,
     coordinates_of_groups,
-    dimension_sizes,
     stored_layout,
     twin_coordinate,
 )
@@ -83,20 +82,19 @@ def create_store(folder: Path, fleet: Fleet) -> None:
 def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
     """Create the empty arrays and the coordinates of a group of assets in the store of a fleet."""
     scenario = group.scenarios[0]
-    sizes = dimension_sizes(scenario)
     partition = _Partition.of_group(fleet, group)
     layout = stored_layout(scenario, list(group.parameter_spreads))
     for path, variable in layout.items():
-        row_shape = tuple(sizes[axis] for axis in variable.axes)
+        row_shape = variable.values.shape
         zarr_group.create_array(
             path,
             shape=(len(group.members), *row_shape),
             chunks=(partition.chunk_rows, *row_shape),
             shards={"shape": (partition.file_rows, *row_shape), "index_location": "start"},
-            dtype=variable.dtype,
-            fill_value=variable.fill_value,
-            dimension_names=(TWIN_AXIS, *variable.axes),
-            attributes=variable.attributes,
+            dtype=variable.values.dtype,
+            fill_value=variable.values.flat[0],
+            dimension_names=(TWIN_AXIS, *variable.dims),
+            attributes=dict(variable.attrs),
             overwrite=True,
         )
     coordinates = coordinates_of_groups(layout, scenario)
