@@ -12,7 +12,7 @@ from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
 from discrepancy.fits.problem import Problem
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import ModelPatch, Primitive
 from reporting.arrays import LEAST_DIVISOR
 
 from .laws import LawForce, force_and_tangents, holds_at_rest
@@ -145,74 +145,47 @@ class EffectLaws:
     def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
         """Return the forces of all laws, by port, with their derivatives by unknowns.
 
-        The derivatives are central differences. The K shared unknowns are numbered first, then
-        those of the effects.
+        The derivatives are central differences, but for a force of free shape, which is linear in
+        its amplitudes. The K shared unknowns are numbered first, then those of the effects.
         """
         forces = self._checked_forces(arguments)
         derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
 
         effect_values, shared_values = arguments.effect, arguments.shared
+        is_linear = np.repeat(
+            [term.effect.table is not None for term in self.candidate.terms],
+            [len(term.parameters) for term in self.candidate.terms],
+        )
         for k in range(self.candidate.parameter_count):
-            self._add_derivatives(
-                derivatives,
-                len(shared_values) + k,
-                arguments_above=replace(
-                    arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE)
-                ),
-                arguments_below=replace(
-                    arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE)
-                ),
-            )
+            above = replace(arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE))
+            forces_below, difference = forces, HALF_DIFFERENCE
+            if not is_linear[k]:
+                below = replace(arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE))
+                forces_below, difference = self._checked_forces(below), 2.0 * HALF_DIFFERENCE
+            slopes = _slopes(self._checked_forces(above), forces_below, difference)
+            for port, slope in slopes.items():
+                derivatives[port][len(shared_values) + k] = slope
         for k in self.unknowns_of_model_laws:
-            self._add_derivatives(
-                derivatives,
-                k,
-                arguments_above=replace(
-                    arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE)
-                ),
-                arguments_below=replace(
-                    arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE)
-                ),
+            above = replace(arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE))
+            below = replace(arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE))
+            slopes = _slopes(
+                self._checked_forces(above), self._checked_forces(below), 2.0 * HALF_DIFFERENCE
             )
+            for port, slope in slopes.items():
+                derivatives[port][k] = slope
         return {
             port: LinearisedForce(force_at_port, derivatives[port])
             for port, force_at_port in forces.items()
         }
 
-    def _add_derivatives(
-        self,
-        derivatives: Mapping[int, dict[int, FloatArray]],
-        unknown_index: int,
-        arguments_above: LawArguments,
-        arguments_below: LawArguments,
-    ) -> None:
-        """Add the derivatives of the forces at ports by one unknown, unless they are zero.
-
-        Parameters
-        ----------
-        derivatives : mapping of int to dict of int to (F,) array
-            The derivatives by port and unknown, to which those by the unknown are added.
-        unknown_index : int
-            The number of the unknown.
-        arguments_above, arguments_below : LawArguments
-            The arguments with the unknown `HALF_DIFFERENCE` above and below its value.
-        """
-        forces_above = self._checked_forces(arguments_above)
-        forces_below = self._checked_forces(arguments_below)
-        for port, derivatives_at_port in derivatives.items():
-            if port in forces_above and port in forces_below:
-                rise = forces_above[port].force - forces_below[port].force
-                if np.any(rise):
-                    derivatives_at_port[unknown_index] = rise / (2.0 * HALF_DIFFERENCE)
-
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
         trial = self.problem.trials[self.trial_indices[trial_index]].trial
-        patch = ModelPatch()
+        primitives: list[Primitive] = []
         for index, (term, term_values) in enumerate(self.candidate.split_by_term(effect)):
             if trial.kind in term.effect.acts_on:
-                patch = patch + self._patch_of_term(index, term_values).in_trial(trial.name)
-        return patch
+                primitives += self._patch_of_term(index, term_values).in_trial(trial.name)
+        return ModelPatch(tuple(primitives))
 
     def _patch_of_term(self, index: int, values: FloatArray) -> ModelPatch:
         """Return the change of the model by one effect, given its index and its unknowns."""
@@ -336,3 +309,23 @@ class EffectLaws:
             return np.zeros_like(trial.residual)
         patch = term.patch(self.problem.setting, values).in_trial(trial.name)
         return ReadingChanges(self.problem).change(trial, trajectory, index_in_problem, patch)
+
+
+def _slopes(
+    forces_above: Mapping[int, LawForce], forces_below: Mapping[int, LawForce], difference: float
+) -> dict[int, FloatArray]:
+    """Return the slopes (F,) of the forces at ports over a difference of an unknown, if not zero.
+
+    Parameters
+    ----------
+    forces_above, forces_below : mapping of int to LawForce
+        The forces by port at a larger and at a smaller value of the unknown.
+    difference : float
+        The difference of the two values.
+    """
+    slopes = {}
+    for port in forces_above.keys() & forces_below.keys():
+        rise = forces_above[port].force - forces_below[port].force
+        if np.any(rise):
+            slopes[port] = rise / difference
+    return slopes

@@ -22,6 +22,7 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_remarks import missing_port_remark
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
+from tests.costs import once
 from tests.discrepancy.rigs import FEW, drag_found, measured, one_mass, setting_of
 from tests.refusals import Inputs
 
@@ -90,8 +91,8 @@ def test_draws_of_a_patch_have_the_standard_deviation_of_the_posterior():
 
 def test_draws_of_a_patch_repeat_with_their_seed():
     found = drag_found()
-    once = patch_draws(found.problem, found.fit, seed=1, count=300)
-    assert patch_draws(found.problem, found.fit, seed=1, count=300) == once
+    draws = patch_draws(found.problem, found.fit, seed=1, count=300)
+    assert patch_draws(found.problem, found.fit, seed=1, count=300) == draws
 
 
 @pytest.fixture(scope="module")
@@ -333,7 +334,7 @@ def test_parameters_far_from_their_priors_are_told_with_what_data_cannot_disting
     assert "with one channel, these data cannot distinguish the two" in gain_or_parameters.sentence
 
 
-@pytest.fixture(scope="module")
+@once
 def friction_in_part():
     """What is found where friction acts and something slow remains."""
     friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
@@ -342,16 +343,16 @@ def friction_in_part():
     return investigate(campaign, MODEL, competing, thorough=False)
 
 
-def test_a_law_beside_which_something_slow_is_left_is_named_in_part(friction_in_part):
-    verdict = friction_in_part.verdict
+def test_a_law_beside_which_something_slow_is_left_is_named_in_part():
+    verdict = friction_in_part().verdict
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     assert [effect.identifier for effect in verdict.effects] == ["coulomb_friction"]
 
 
-def test_a_law_that_is_named_in_part_has_its_coefficient_and_less_than_the_whole_gap(friction_in_part):
-    (effect,) = friction_in_part.verdict.effects
+def test_a_law_that_is_named_in_part_has_its_coefficient_and_less_than_the_whole_gap():
+    (effect,) = friction_in_part().verdict.effects
     (law,) = effect.patch.primitives
-    closed = friction_in_part.proof.closed
+    closed = friction_in_part().proof.closed
     assert law.coefficient == pytest.approx(0.4, rel=0.1)
     assert 0.8 < closed.low < closed.value < 1.0
 

@@ -93,7 +93,7 @@ def test_long_records_are_thinned_for_the_ranking(search: ForceSearch) -> None:
 
 @pytest.mark.usefixtures("records_count_as_long")
 def test_effects_of_long_records_are_estimated_in_all_samples(search: ForceSearch) -> None:
-    estimates = ranking.rank_by_missing_force(search, chosen("coulomb_friction", "quadratic_damping"))
+    estimates = ranking.rank_by_missing_force(search, chosen("coulomb_friction"))
     assert estimates[0].candidate.identifiers == ("coulomb_friction",)
     for estimate in estimates:
         assert {trial.trial.stride for trial in estimate.trials} == {1}
