@@ -331,7 +331,8 @@ class _Ranking:
             estimate = self.search.estimate_effects(base, candidate, candidate.start_values())
             if estimate is not None:
                 estimates.append(estimate)
-                if estimate.leaves_no_force:
+                # a sharper bend is tried only of a curve that leads and leaves a force
+                if estimate.leaves_no_force or self.score(estimate) < self.score(self.best):
                     break
         if not estimates:
             return None

@@ -1,5 +1,6 @@
 """`uav-twin init rig`: measurements of a rig, and the model that is compared with them."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -163,6 +164,7 @@ def _write_simulated_campaign(model_file: Path, folder: Path) -> None:
     """Write ring-downs and a load test of the model, with friction hidden at its slide."""
     model = choose_model(str(model_file)).model
     plan = usual_plan(model)
+    plan = replace(plan, duration=0.5 * plan.duration)
     plain_campaign = example_campaign(model, "ringdown", 1, plan)
     setting = Setting(plain_campaign, model, model.scales(plain_campaign))
     friction = effect_by_identifier("coulomb_friction", load_catalogue())
