@@ -415,11 +415,17 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
+        from calibration.errors import CalibrationError
+        from fe.runtime.errors import FiniteElementError
+        from fmu_asset.errors import FmuError
+
         our_errors: tuple[type[Exception], ...] = (
             TwinMasterError,
             ReportingError,
             InvalidChoiceError,
-            *_errors_of_lower_layers(),
+            FmuError,
+            FiniteElementError,
+            CalibrationError,
             *further_errors,
         )
         # The system's refusals, such as a full disk, are not defects of the program either.
@@ -447,15 +453,6 @@ def _system_error_sentence(error: OSError) -> str:
         f"The operating system refused to read or write a file or stream: {reason}; repeat with "
         "--verbose to see which."
     )
-
-
-def _errors_of_lower_layers() -> tuple[type[Exception], ...]:
-    """Return the base classes of the errors of models, FMUs and calibrations."""
-    from calibration.errors import CalibrationError
-    from fe.runtime.errors import FiniteElementError
-    from fmu_asset.errors import FmuError
-
-    return FmuError, FiniteElementError, CalibrationError
 
 
 def main() -> None:

@@ -201,7 +201,9 @@ def watch(
             progress=terminal.progress(),
         )
         _print_end_of_watch(folder, watches[0], report=not no_report)
-    _exit_on_complaint(watches[0])
+    complaint = watches[0].intake.complaint()
+    if complaint:
+        raise terminal.error_exit(complaint)
 
 
 def _decision_printer(
@@ -228,13 +230,6 @@ def _decision_printer(
             signal.raise_signal(signal.SIGINT)  # which ends a watch in order
 
     return print_decision
-
-
-def _exit_on_complaint(watched: "Watch") -> None:
-    """End the command with exit code 1 if the observations of a watch were not in order."""
-    complaint = watched.intake.complaint()
-    if complaint:
-        raise terminal.error_exit(complaint)
 
 
 def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None:

@@ -345,28 +345,21 @@ class CoupledSource(SeveralSource):
             settings = _component_settings(section)
             component = Component(section.name, fmus[section.name], settings, section.substeps)
             components.append(component)
+        # The connectors of the system: a connection whose target names no component leads to an
+        # output, and one whose source names none comes from an input.
+        outputs = []
+        inputs = []
+        for connection in connections:
+            if not connection.target.component:
+                outputs.append(Connector(connection.target.variable, "output"))
+            if not connection.source.component:
+                inputs.append(Connector(connection.source.variable, "input"))
         return SystemStructure(
             self._scenario.mission.name,
             tuple(components),
-            _system_connectors(connections),
+            tuple(dict.fromkeys([*outputs, *inputs])),
             tuple(connections),
         )
-
-
-def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
-    """Return each connector of the whole system once, first the outputs and then the inputs.
-
-    A connection leads to an output of the system if its target names no component. It comes from
-    an input of the system if its source names no component.
-    """
-    outputs = []
-    inputs = []
-    for connection in connections:
-        if not connection.target.component:
-            outputs.append(Connector(connection.target.variable, "output"))
-        if not connection.source.component:
-            inputs.append(Connector(connection.source.variable, "input"))
-    return tuple(dict.fromkeys([*outputs, *inputs]))
 
 
 def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path:

@@ -353,7 +353,9 @@ class FmuSource(AssetSource):
         """
         asset = FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters())
         self._warn_of_unset_inputs(asset)
-        self._warn_of_undeclared_units(asset)
+        warning = undeclared_units_sentence(asset.description, asset.binding)
+        if warning:
+            _logger.warning("%s", warning)
         return asset.binding
 
     def _warn_of_unset_inputs(self, asset: FmiAsset) -> None:
@@ -362,7 +364,8 @@ class FmuSource(AssetSource):
         An FMU that uav-twin packed from a design of a wing or structure is skipped: its unset
         inputs are forces at their start value zero, which is right.
         """
-        if _is_packed_from_design(asset.description.path):
+        is_packed_from_design = packed_design_hash(asset.description.path) != ""
+        if is_packed_from_design:
             return
         # Every control has values for the same inputs, so that the first one names all of them.
         inputs_with_values = {
@@ -373,12 +376,6 @@ class FmuSource(AssetSource):
         warning = unset_inputs_sentence(asset.description, asset.binding, inputs_with_values)
         if warning:
             _logger.warning("%s", warning)
-
-    def _warn_of_undeclared_units(self, asset: FmiAsset) -> None:
-        """Warn of variables of which only the binding states a unit, such as degC."""
-        sentence = undeclared_units_sentence(asset.description, asset.binding)
-        if sentence:
-            _logger.warning("%s", sentence)
 
     def _check_state_units(self, binding: Binding) -> None:
         """Refuse a state factor whose unit differs from that of its monitor or health input."""
@@ -520,11 +517,6 @@ class FmuSource(AssetSource):
             session.close()
             raise
         return FmuAsset(session, observation, self.section.load, truth_outputs)
-
-
-def _is_packed_from_design(fmu: Path) -> bool:
-    """Return whether uav-twin packed an FMU from a design, whose hash such an FMU records."""
-    return packed_design_hash(fmu) != ""
 
 
 def _check_calibrated_units(binding: Binding, calibration: "CalibrationRecord") -> None:

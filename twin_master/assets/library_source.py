@@ -112,10 +112,6 @@ class ObservationLibrary:
             self.draws = _read_finite_values(dataset, "parameter_value")
         else:
             self.draws = np.asarray(dataset["parameter_value"].values, np.float64)
-        self.values = self._read_observations(state_names)
-
-    def _read_observations(self, state_names: list[str]) -> Float:
-        """Return the observations (E, S, U, G) as a read-only array with one axis for states."""
         observation = self.dataset["observation"]
         # One axis for each state factor, between those of the draw and the control.
         table = observation.transpose("draw", *state_names, "control", "sensor").values
@@ -124,7 +120,7 @@ class ObservationLibrary:
         if not np.all(np.isfinite(values)):
             raise ValueError("an observation is not finite")
         values.setflags(write=False)
-        return values
+        self.values = values
 
     def state_indices(self, names: tuple[str, ...], coordinates: Float) -> list[int]:
         """Return the index of each of several states in the library.

@@ -95,7 +95,17 @@ def export_scenario(
             wiring = source.wiring()
         else:
             fmu = source.path(FMU_COPY)
-            binding = _with_unbound_parameters(binding, fmu, parameters)
+            # Missing effects add parameters to an FMU, which the scenario names as the FMU does.
+            description = read_fmu(fmu)
+            bound_parameters = dict(binding.parameter)
+            for name in parameters:
+                if name in binding.parameter:
+                    continue
+                variable = description.variable(name)
+                if variable is not None:
+                    unit = variable.unit or "1"
+                    bound_parameters[name] = ParameterBinding(variable=name, unit=unit)
+            binding = binding.model_copy(update={"parameter": bound_parameters})
             wiring = system_of_one_fmu(scenario.mission.name, fmu, binding)
         names = _parameter_names(wiring, binding)
         wiring = _with_values(wiring, binding, parameters, scenario.asset.constant_load)
@@ -208,25 +218,6 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
     component = Component(component_name, fmu)
     structure = SystemStructure(name, (component,), tuple(connectors), tuple(connections))
     return Wiring(structure)
-
-
-def _with_unbound_parameters(
-    binding: Binding, fmu: Path, parameters: Mapping[str, float]
-) -> Binding:
-    """Return the binding, completed by the parameters of a scenario that only the FMU has.
-
-    Missing effects add such parameters to an FMU. A scenario uses their names in the FMU.
-    """
-    description = read_fmu(fmu)
-    bound_parameters = dict(binding.parameter)
-    for name in parameters:
-        if name in binding.parameter:
-            continue
-        variable = description.variable(name)
-        if variable is not None:
-            unit = variable.unit or "1"
-            bound_parameters[name] = ParameterBinding(variable=name, unit=unit)
-    return binding.model_copy(update={"parameter": bound_parameters})
 
 
 def _with_values(

@@ -149,24 +149,17 @@ def choose_feed(
     """
     for candidate in (observations, scenario.watch.recording, default):
         if candidate is not None:
-            return _feed_of(candidate, scenario, follow=follow, authority=authority)
+            if not isinstance(candidate, str | Path):
+                return feed_of_mappings(scenario, candidate)
+            if is_broker(str(candidate)):
+                return parse_broker(str(candidate), authority)
+            if str(candidate) != STANDARD_INPUT:
+                return file_feed(Path(candidate), scenario, follow=follow)
+            if follow:
+                raise MissionInputError(
+                    "--follow belongs to a file; standard input is read to its end anyway."
+                )
+            return feed_of_lines(scenario, sys.stdin.buffer)
     raise MissionInputError(
         f"{scenario.mission.name} names no recording: give the observations that are to be watched."
     )
-
-
-def _feed_of(
-    observations: Observations, scenario: Scenario, *, follow: bool, authority: Path | None
-) -> Feed | Broker:
-    """Return the feed of observations by their kind; see `choose_feed`."""
-    if not isinstance(observations, str | Path):
-        return feed_of_mappings(scenario, observations)
-    if is_broker(str(observations)):
-        return parse_broker(str(observations), authority)
-    if str(observations) != STANDARD_INPUT:
-        return file_feed(Path(observations), scenario, follow=follow)
-    if follow:
-        raise MissionInputError(
-            "--follow belongs to a file; standard input is read to its end anyway."
-        )
-    return feed_of_lines(scenario, sys.stdin.buffer)

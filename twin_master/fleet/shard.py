@@ -282,19 +282,16 @@ class _AssetPool(ExitStack):
         reduced model differ between the twins.
         """
         if self._kit.wing is not None:
-            return self._open_models()
+            # Twins with equal parameters share one reduced model
+            parameters_of_twins = [tuple(sorted(key.parameters.items())) for key in self._keys]
+            models = {}
+            for parameters in set(parameters_of_twins):
+                models[parameters] = self._kit.open_asset(dict(parameters))
+            return [models[parameters] for parameters in parameters_of_twins]
         if any(key != self._keys[0] for key in self._keys):
             return []
         asset = self._open_at_start(0, is_reusable=False)
         return [asset] * len(self._keys) if isinstance(asset, StatelessAsset) else []
-
-    def _open_models(self) -> list[Asset]:
-        """Return the reduced model of each twin; twins with equal parameters share one object."""
-        parameters_of_twins = [tuple(sorted(key.parameters.items())) for key in self._keys]
-        models = {}
-        for parameters in set(parameters_of_twins):
-            models[parameters] = self._kit.open_asset(dict(parameters))
-        return [models[parameters] for parameters in parameters_of_twins]
 
     def asset_at_start(self, twin: int, is_reusable: bool) -> Asset:
         """Return the asset of a twin that flies alone, in its state at the start of the mission.

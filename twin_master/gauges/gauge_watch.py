@@ -157,7 +157,14 @@ class GaugeWatch:
         """
         values, inspections_log_density = self._sensor_model.split_observation(rows)
         is_absurd = self._notices.is_absurd(values, control_index)
-        stuck_gauges = self._update_stuck_gauges(state, values)
+        if state is None:
+            step_count = np.zeros(len(values))
+            before = StuckGauges.initial(*values.shape)
+        else:
+            step_count = state.step_count
+            before = state.stuck_gauges
+        begins_now = self.faults.probability_to_begin_now(step_count)
+        stuck_gauges = self._standstill.update(before, values, step_count, begins_now)
         is_useless = is_absurd | (stuck_gauges.is_stuck > 0.0)
         used_values = np.where(is_useless, np.nan, values)
         inspections = rows[:, values.shape[1] :]
@@ -172,17 +179,6 @@ class GaugeWatch:
             control_index.astype(np.int64),
         )
         return CheckedReadings(used_rows, values, is_absurd, stuck_gauges, observations)
-
-    def _update_stuck_gauges(self, state: WatchState | None, readings: Float) -> StuckGauges:
-        """Return which gauges stand still, given their readings (B, G) in the next step."""
-        if state is None:
-            step_count = np.zeros(len(readings))
-            before = StuckGauges.initial(*readings.shape)
-        else:
-            step_count = state.step_count
-            before = state.stuck_gauges
-        begins_now = self.faults.probability_to_begin_now(step_count)
-        return self._standstill.update(before, readings, step_count, begins_now)
 
     def step(
         self,

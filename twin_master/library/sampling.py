@@ -122,7 +122,16 @@ def sample_library(
         )
     binding = load_binding(grid.binding)
     _check_grid(grid, binding)
-    sensor_count = _count_sensors(grid, binding)
+    # A binding may name a whole array, whose length only the FMU declares.
+    fmu = FmiAsset(grid.fmu, binding)
+    warn_without_sandbox(grid.fmu, binding.limits.grants)
+    sensors = fmu.binding.observation_slice(grid.role)
+    sensor_count = sensors.stop - sensors.start
+    size = _COPIES_IN_MEMORY * BYTES_OF_NUMBER * sensor_count * grid.size
+    check_fits(
+        {f"{sensor_count} sensors at {grid.size} points": size},
+        "take fewer levels, draws or controls",
+    )
     record = _library_record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
@@ -220,21 +229,6 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     for name, levels in grid.states.items():
         if any(second <= first for first, second in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, but {levels} was given.")
-
-
-def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
-    """Return the number of sensors of the FMU; refuse a library that does not fit in memory."""
-    # A binding may name a whole array, whose length only the FMU declares.
-    fmu = FmiAsset(grid.fmu, binding)
-    warn_without_sandbox(grid.fmu, binding.limits.grants)
-    sensors = fmu.binding.observation_slice(grid.role)
-    sensor_count: int = sensors.stop - sensors.start
-    size = _COPIES_IN_MEMORY * BYTES_OF_NUMBER * sensor_count * grid.size
-    check_fits(
-        {f"{sensor_count} sensors at {grid.size} points": size},
-        "take fewer levels, draws or controls",
-    )
-    return sensor_count
 
 
 def _library_record(grid: SamplingGrid) -> JsonObject:

@@ -34,11 +34,21 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
     controls = scenario.control_names
     next_control = line["next_control"]
     is_a_state_believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
+    filtered_belief = array_from_json(line["filtered"])
+    mean = model.states.mean(filtered_belief)
+    deviation = model.states.standard_deviation(filtered_belief)
+    health: JsonObject = {}
+    for index, factor in enumerate(scenario.state):
+        health[factor.name] = {
+            "mean": mean[index] if is_a_state_believed else None,
+            "standard_deviation": deviation[index] if is_a_state_believed else None,
+            "unit": factor.unit,
+        }
     decision: JsonObject = {
         "step": line["step"],
         "control": controls[line.get("control_in_force", line["control_index"])],
         "state_believed": is_a_state_believed,
-        "health": _health_record(line, scenario, model, is_believed=is_a_state_believed),
+        "health": health,
         "next_control": controls[next_control],
         "probability": min(float(line["decision_probability"][next_control]), 1.0),
         "lost_sensors": line["observed"][: scenario.observation.count].count(None),
@@ -67,23 +77,6 @@ def _step_by_messages(line: JsonRecord, numbers_per_step: int) -> int | None:
         if steps >= 0:
             return int(first_number + steps * numbers_per_step)
     return None
-
-
-def _health_record(
-    line: JsonRecord, scenario: Scenario, model: GraphicalModel, *, is_believed: bool
-) -> JsonObject:
-    """Return believed mean, standard deviation and unit of each state factor, by its name."""
-    filtered_belief = array_from_json(line["filtered"])
-    mean = model.states.mean(filtered_belief)
-    deviation = model.states.standard_deviation(filtered_belief)
-    health: JsonObject = {}
-    for index, factor in enumerate(scenario.state):
-        health[factor.name] = {
-            "mean": mean[index] if is_believed else None,
-            "standard_deviation": deviation[index] if is_believed else None,
-            "unit": factor.unit,
-        }
-    return health
 
 
 def health_in_words(decision: JsonRecord) -> dict[str, str]:

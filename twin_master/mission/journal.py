@@ -40,7 +40,6 @@ from twin_master.mission.journal_packing import (
 )
 from twin_master.mission.recent_parts import RecentParts, RecentPartsFile
 from twin_master.mission.steps import GroundTruth, MissionStep, Reading
-from twin_master.network.estimator import Suspicion
 
 JOURNAL_NAME = "journal.jsonl"
 PRESENT_NAMES = {
@@ -140,25 +139,23 @@ def step_record(step: MissionStep) -> JsonObject:
         record["learnt"] = {name: vars(learnt) for name, learnt in twin_step.learnt.items()}
     if twin_step.notices:
         record["notices"] = [notice.as_record() for notice in twin_step.notices]
-    if twin_step.suspicion is not None:
-        record["suspicion"] = _suspicion_record(twin_step.suspicion)
+    suspicion = twin_step.suspicion
+    if suspicion is not None:
+        none_of_these, gauge_off = rounded_probabilities(
+            [suspicion.none_of_these, suspicion.gauge_off]
+        )
+        probabilities = rounded_probabilities(suspicion.hypotheses.values())
+        record["suspicion"] = {
+            "none_of_these": none_of_these,
+            "gauge_off": gauge_off,
+            "log_evidence_none": rounded(suspicion.log_evidence_none),
+            "log_evidence_any_gauge": rounded(suspicion.log_evidence_any_gauge),
+            "log_evidence_gauge": json_from_array(suspicion.log_evidence_gauge),
+            "left_out": suspicion.left_out.tolist(),
+            "hypotheses": dict(zip(suspicion.hypotheses, probabilities, strict=True)),
+            "decided_by": suspicion.decided_by,
+        }
     return record
-
-
-def _suspicion_record(suspicion: Suspicion) -> JsonObject:
-    """Return the record of a suspicion; what lines of the journal have of it is rounded."""
-    none_of_these, gauge_off = rounded_probabilities([suspicion.none_of_these, suspicion.gauge_off])
-    probabilities = rounded_probabilities(suspicion.hypotheses.values())
-    return {
-        "none_of_these": none_of_these,
-        "gauge_off": gauge_off,
-        "log_evidence_none": rounded(suspicion.log_evidence_none),
-        "log_evidence_any_gauge": rounded(suspicion.log_evidence_any_gauge),
-        "log_evidence_gauge": json_from_array(suspicion.log_evidence_gauge),
-        "left_out": suspicion.left_out.tolist(),
-        "hypotheses": dict(zip(suspicion.hypotheses, probabilities, strict=True)),
-        "decided_by": suspicion.decided_by,
-    }
 
 
 def large_parts(record: JsonRecord) -> JsonObject:

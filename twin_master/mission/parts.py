@@ -289,7 +289,13 @@ def object_by_name(role: str, name: str) -> object:
     try:
         file, colon, attribute = name.rpartition(":")
         if colon and file.endswith(".py"):
-            return _object_of_file(Path(file), attribute)
+            path = Path(file)
+            specification = importlib.util.spec_from_file_location(path.stem, path)
+            if specification is None or specification.loader is None:
+                raise ImportError(f"{path} is not a Python file")
+            module = importlib.util.module_from_spec(specification)
+            specification.loader.exec_module(module)
+            return getattr(module, attribute)
         if colon:
             return pkgutil.resolve_name(name)
     except Exception as error:  # the module may fail with any error while it is imported
@@ -302,13 +308,3 @@ def object_by_name(role: str, name: str) -> object:
         f"there is no {words} {name!r}: give MODULE:NAME, FILE.py:NAME, or the name of an entry "
         f"point of the group {group} (installed: {listing(installed) or 'none'})."
     )
-
-
-def _object_of_file(path: Path, attribute: str) -> object:
-    """Return an attribute of the module that a Python file defines."""
-    specification = importlib.util.spec_from_file_location(path.stem, path)
-    if specification is None or specification.loader is None:
-        raise ImportError(f"{path} is not a Python file")
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return getattr(module, attribute)

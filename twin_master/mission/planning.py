@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
@@ -171,7 +170,11 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         content = np.load(path, allow_pickle=False)
         if isinstance(content, np.ndarray):  # NPY: a policy by states (S, U)
             return model.policy(content)  # refuses another shape
-        stored_policy = _read_belief_policy(content)  # NPZ
+        # The policy on the belief in an NPZ archive, and close the archive
+        with content:
+            policy = BeliefPolicy.from_arrays(content)
+            controls = tuple(content["controls"].tolist())
+        stored_policy = _StoredBeliefPolicy(policy, policy.vectors.shape[1], controls)
     except FileNotFoundError:
         raise PlanningError(
             f"there is no file {path} with a policy: give a file of `uav-twin plan --out`, or a "
@@ -203,14 +206,6 @@ class _StoredBeliefPolicy(NamedTuple):
     policy: BeliefPolicy
     state_count: int
     controls: tuple[str, ...]
-
-
-def _read_belief_policy(archive: NpzFile) -> _StoredBeliefPolicy:
-    """Return the policy on the belief in an NPZ archive, and close the archive."""
-    with archive:
-        policy = BeliefPolicy.from_arrays(archive)
-        controls = tuple(archive["controls"].tolist())
-    return _StoredBeliefPolicy(policy, policy.vectors.shape[1], controls)
 
 
 @dataclass(frozen=True)

@@ -393,7 +393,17 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
     mesh = read_mesh(mesh_file, design.unit, design.length_unit)
     gauges = _candidate_gauges(candidates, mesh)
     _append_gauges(extended_file, gauges)
-    extended_design = _read_extended_structure(extended_file, candidates)
+    try:
+        content = read_toml(extended_file, InvalidDesignError)
+    except InvalidDesignError as error:
+        # The file could be read before the tables were appended: a key `gauge` is there already.
+        raise MissionInputError(
+            "--candidates needs the gauges of the structure file as tables [[gauge]], not in a "
+            "list."
+        ) from error
+    # Errors name the option, and not the copied file.
+    extended_design = parse_structure(content, f"--candidates {candidates}")
+    assert isinstance(extended_design, MeshDesign)
     try:
         gauge_rows(mesh, gauges)
     except InvalidDesignError as error:
@@ -480,21 +490,6 @@ def _with_all_gauges(
             "notice": None,
         }
     )
-
-
-def _read_extended_structure(file: Path, candidates: str) -> MeshDesign:
-    """Return the structure with the new gauges; errors name the option, not the copied file."""
-    try:
-        content = read_toml(file, InvalidDesignError)
-    except InvalidDesignError as error:
-        # The file could be read before the tables were appended: a key `gauge` is there already.
-        raise MissionInputError(
-            "--candidates needs the gauges of the structure file as tables [[gauge]], not in a "
-            "list."
-        ) from error
-    design = parse_structure(content, f"--candidates {candidates}")
-    assert isinstance(design, MeshDesign)
-    return design
 
 
 def _candidate_gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:

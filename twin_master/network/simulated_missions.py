@@ -63,7 +63,11 @@ def simulated_returns(
             likelihood = problem.likelihood[control_index]
             # Draw the next state, and the observation.
             states_before = states[missions_with_control]
-            next_probability = _rows_of_states(problem, control_index, states_before)
+            distinct, index_of_distinct = np.unique(states_before, return_inverse=True)
+            distributions = [
+                problem.transition.row(control_index, state) for state in distinct.tolist()
+            ]
+            next_probability = np.array(distributions)[index_of_distinct]
             states[missions_with_control] = _draw_indices(
                 next_probability, uniform_transition[step, missions_with_control]
             )
@@ -128,13 +132,6 @@ def leaving_probability(
             has_left |= policy.decide(beliefs) != control
         fraction[twin] = has_left.mean()
     return fraction
-
-
-def _rows_of_states(problem: DecisionProblem, control: int, states: Index) -> Float:
-    """Return p(next state | state, control) for the states of B missions: (B, S)."""
-    distinct, index_of_distinct = np.unique(states, return_inverse=True)
-    distributions = [problem.transition.row(control, state) for state in distinct.tolist()]
-    return np.array(distributions)[index_of_distinct]
 
 
 def _normalize(rows: Float) -> Float:

@@ -39,22 +39,14 @@ def true_value(run: Run) -> float | None:
     stated_value = run.scenario.asset.true_parameters.get(name)
     if stated_value is not None:
         return float(stated_value)
-    if not _starts_at_calibrated_mean(run):
-        return None
-    mean = run.calibration.get("state", {}).get(name, {}).get("mean")
-    return None if mean is None else float(mean)
-
-
-def _starts_at_calibrated_mean(run: Run) -> bool:
-    """Return whether the simulated asset was given the calibrated mean as its parameter.
-
-    This holds for an FMU that was packed from the calibration, and for the simulation of a model
-    that a campaign calibrated.
-    """
+    # Two kinds of simulated assets have the calibrated mean as their parameter.
     asset = run.config["scenario"]["asset"]
     is_packed_from_calibration = asset.get("design") == "calibration" and not asset.get("file")
     is_simulated_campaign_model = "campaign" in run.calibration and not run.is_watched
-    return is_packed_from_calibration or is_simulated_campaign_model
+    if not (is_packed_from_calibration or is_simulated_campaign_model):
+        return None
+    mean = run.calibration.get("state", {}).get(name, {}).get("mean")
+    return None if mean is None else float(mean)
 
 
 def calibrated_moments(run: Run) -> tuple[float, float]:

@@ -161,6 +161,12 @@ def caption_check(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFig
         sensor = int(np.nanargmin(check.coverage))
         title = small(run.sensors.titles[sensor])
         lowest_coverage = f"Lowest coverage: {title}, {100.0 * check.coverage[sensor]:.0f} %."
+    assumptions = f"a noise of {_assumed_noise(run)}"
+    error = assumed_model_error(run)
+    if error:
+        assumptions += f" and an error of its model of {error} of the predicted value"
+    if run.scenario.learning is not None:
+        assumptions += ", corrected by what it has learnt about it"
     return WORDS.figure(
         "check",
         figure,
@@ -170,19 +176,8 @@ def caption_check(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFig
         rms=f"{check.standard_deviation:.2f}",
         coverage=f"{100 * check.overall_coverage:.1f}",
         lowest_coverage=lowest_coverage,
-        assumptions=_assumptions(run),
+        assumptions=assumptions,
     )
-
-
-def _assumptions(run: Run) -> str:
-    """Return the assumed noise of the sensors, and the model error if one is assumed, in words."""
-    assumptions = f"a noise of {_assumed_noise(run)}"
-    error = assumed_model_error(run)
-    if error:
-        assumptions += f" and an error of its model of {error} of the predicted value"
-    if run.scenario.learning is not None:
-        assumptions += ", corrected by what it has learnt about it"
-    return assumptions
 
 
 def _assumed_noise(run: Run) -> str:

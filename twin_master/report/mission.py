@@ -297,14 +297,6 @@ def _quantity_course(run: Run, sensor: int, now: int) -> Course:
     )
 
 
-def _reward_course(run: Run, reward: int, now: int) -> Course:
-    """Return a reward with 95 % intervals, as if it were normally distributed."""
-    mean = _past_and_predicted(run, "reward_mean", reward, now)
-    deviation = _past_and_predicted(run, "reward_standard_deviation", reward, now)
-    half_width = NORMAL_95 * deviation
-    return Course(mean, mean - half_width, mean + half_width)
-
-
 def _state_course(run: Run, index: int, now: int) -> Course:
     """Return the mean of a factor and two standard deviations around it, in printed units.
 
@@ -455,7 +447,12 @@ def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
 
 def _draw_reward(reward: int, axes: Axes, run: Run, now: int) -> str:
     """Draw a reward, and return the title of the panel."""
-    _draw_course(axes, run, now, _reward_course(run, reward, now), None)
+    # The 95 % interval is that of a normal distribution.
+    mean = _past_and_predicted(run, "reward_mean", reward, now)
+    deviation = _past_and_predicted(run, "reward_standard_deviation", reward, now)
+    half_width = NORMAL_95 * deviation
+    course = Course(mean, mean - half_width, mean + half_width)
+    _draw_course(axes, run, now, course, None)
     axes.margins(y=0.15)
     low, high = axes.get_ylim()
     if high - low < 1e-6:  # the reward is constant but for rounding

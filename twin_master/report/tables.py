@@ -92,7 +92,16 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
         columns.append(number_column("truth"))
     rows = []
     for quantity in quantities:
-        row = _learnt_row(quantity)
+        prior = moments_of(quantity.prior)
+        last_moments = moments_of(quantity.posterior[-1])
+        row = [
+            quantity.label,
+            number(float(prior.mean)),
+            number(float(prior.standard_deviation)),
+            number(float(last_moments.mean)),
+            number(float(last_moments.standard_deviation)),
+            between(float(last_moments.lower), float(last_moments.upper)),
+        ]
         if has_truth:
             truth = None if quantity.truth is None else float(quantity.truth)
             row.append(number(truth))
@@ -105,20 +114,6 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
         step=run.step_word,
         transition_factor=_transition_factor_sentence(run, quantities),
     )
-
-
-def _learnt_row(quantity: LearntQuantity) -> list[str]:
-    """Return the cells of a learnt quantity: title, prior, and posterior after the last step."""
-    prior = moments_of(quantity.prior)
-    last_moments = moments_of(quantity.posterior[-1])
-    return [
-        quantity.label,
-        number(float(prior.mean)),
-        number(float(prior.standard_deviation)),
-        number(float(last_moments.mean)),
-        number(float(last_moments.standard_deviation)),
-        between(float(last_moments.lower), float(last_moments.upper)),
-    ]
 
 
 def _transition_factor_sentence(run: Run, quantities: Sequence[LearntQuantity]) -> str:

@@ -55,18 +55,7 @@ def from_format_1(table: Mapping[str, object]) -> Table:
         return {**table, "format": 2, "belief": {"kind": "asset"}}
     # An empty value means the same as a missing key.
     asset = {key: value for key, value in former_asset.items() if value not in (None, [], (), {})}
-    belief = _belief_of_format_1(asset)
-    # These keys name the believed model, which is in `belief` now.
-    for key in ("observation_model", "library", "model_patch"):
-        asset.pop(key, None)
-    return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
-
-
-def _belief_of_format_1(asset: Mapping[str, object]) -> Table:
-    """Return the table `belief` of format 2 from the table `asset` of format 1.
-
-    The twin believes a library or a design if the keys name one, and otherwise the asset itself.
-    """
+    # The twin believes a library or a design if the keys name one, and otherwise the asset itself.
     model = asset.get("observation_model")
     library = asset.get("library")
     design = asset.get("design")
@@ -77,7 +66,10 @@ def _belief_of_format_1(asset: Mapping[str, object]) -> Table:
         belief = _table_of_design(design)
     if "model_patch" in asset:
         belief["patch"] = asset["model_patch"]
-    return belief
+    # These keys name the believed model, which is in `belief` now.
+    for key in ("observation_model", "library", "model_patch"):
+        asset.pop(key, None)
+    return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
 
 
 def _asset_of_format_1(former_table: Mapping[str, object]) -> Table:

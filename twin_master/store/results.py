@@ -67,7 +67,14 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     if result.learnt:
         groups["learnt"] = builder.group("learnt", _learnt_entries(result))
     if result.flight.suspicion:
-        groups["notice"] = builder.group("notice", _notice_entries(result))
+        # The variables of the group `notice`: the suspicion of each step
+        suspicions = result.flight.suspicion
+        values = {}
+        for name in SCHEMA["notice"]:
+            values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
+        values["left_out"] = values["left_out"].astype(np.int8)
+        notice_entries = _plain_entries(values)
+        groups["notice"] = builder.group("notice", notice_entries)
     if result.truth is not None:
         groups["truth"] = builder.group("truth", _truth_entries(result, result.truth))
     return groups
@@ -264,16 +271,6 @@ def _learnt_entries(result: MissionResult) -> Iterator[Entry]:
             fields = {**quantity.schema_fields, "moment": moment, "moment_title": title}
             yield Entry("{quantity}_{moment}", quantity.posterior[..., index], fields)
             yield Entry("{quantity}_prior_{moment}", quantity.prior[..., index], fields)
-
-
-def _notice_entries(result: MissionResult) -> list[Entry]:
-    """Return the variables of the group `notice`: the suspicion of each step."""
-    suspicions = result.flight.suspicion
-    values = {}
-    for name in SCHEMA["notice"]:
-        values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
-    values["left_out"] = values["left_out"].astype(np.int8)
-    return _plain_entries(values)
 
 
 def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:

@@ -315,7 +315,11 @@ class Watch:
                 if twin is not self.twin:  # a patched model was adopted meanwhile
                     break
             if self.intake.stream.has_refusals_to_report:
-                yield self._report_refusals()
+                decision = self._last_decision_with(
+                    self.intake.stream.report_refusals(self.twin.steps)
+                )
+                self.write_event(notices=decision["notices"], refused=decision)
+                yield decision
             elif twin is self.twin:
                 return
 
@@ -417,18 +421,6 @@ class Watch:
         self.write_event(notices=decision["notices"], quiet=decision)
         self.is_quiet = True
         send(decision)
-
-    def _report_refusals(self) -> JsonObject:
-        """Write a notice that messages are refused into the journal.
-
-        Returns
-        -------
-        dict
-            The last decision, with this notice.
-        """
-        decision = self._last_decision_with(self.intake.stream.report_refusals(self.twin.steps))
-        self.write_event(notices=decision["notices"], refused=decision)
-        return decision
 
     def _last_decision_with(self, notice: Notice) -> JsonObject:
         """Return the last decision, its notices replaced by one notice.

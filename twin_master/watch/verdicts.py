@@ -1,6 +1,5 @@
 """Verdicts of searches for the cause of an alarm: which patch is tried, and which is adopted."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from fe.runtime.patch import SensorSaturation
@@ -112,7 +111,8 @@ def caveats_of(verdict: VerdictJson) -> list[str]:
     """
     gates = verdict["gates"]
     caveats = [str(gate["reason"]) for gate in gates if gate["passed"] is False]
-    if not _has_tested_absolute_fit(gates):
+    # A gate that was not tested has null as `passed`.
+    if not any(gate["name"] == ABSOLUTE_FIT and gate["passed"] is not None for gate in gates):
         caveats.append("It was not tested whether the residuals are noise.")
     if verdict["kind"] == GROUP and has_some_saturating_members(verdict):
         caveats.append(
@@ -120,11 +120,6 @@ def caveats_of(verdict: VerdictJson) -> list[str]:
             "these steps do not tell them apart; more steps at more than one load may."
         )
     return caveats
-
-
-def _has_tested_absolute_fit(gates: Sequence[VerdictJson]) -> bool:
-    """Return whether the gate of the absolute fit was tested; if not, its `passed` is null."""
-    return any(gate["name"] == ABSOLUTE_FIT and gate["passed"] is not None for gate in gates)
 
 
 def has_some_saturating_members(verdict: VerdictJson) -> bool:

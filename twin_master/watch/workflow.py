@@ -389,7 +389,8 @@ def watch(
     with serve_metrics(metrics) as metrics_server, opened as watched:
         try:
             begun(watched)
-            decide = _also_for_monitoring(decide, metrics_server, line_protocol, watched)
+            decide = _also_as_metrics(decide, metrics_server, watched)
+            decide = _also_as_lines(decide, line_protocol, watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, reading_scenario)
             teacher = cause_search if teach else None
@@ -399,17 +400,6 @@ def watch(
             error.add_note(_advice_after_error(watched))
             raise
     return watched.folder
-
-
-def _also_for_monitoring(
-    decide: DecisionSink,
-    server: MetricsServer | None,
-    line_protocol: Path | str | None,
-    watched: Watch,
-) -> DecisionSink:
-    """Return a function that also serves each decision as metrics, and appends it to a file."""
-    served = _also_as_metrics(decide, server, watched)
-    return _also_as_lines(served, line_protocol, watched)
 
 
 def _also_as_metrics(

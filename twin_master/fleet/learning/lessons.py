@@ -76,7 +76,16 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> JsonObje
         The scenario of the group, with the assumed noise.
     """
     tables: JsonObject = {}
-    probability = _mean_probabilities(group, means)
+    # Probabilities to worsen by control, or by control and factor. For a control that was never
+    # flown nothing was learnt: its probability is the assumed one.
+    probability: JsonObject = {}
+    for name, learnt in group["probability"].items():
+        mean = means[name]["mean"] if learnt["flown"] else learnt["assumed"]
+        control, _, factor = name.partition(", ")
+        if factor:
+            probability.setdefault(control, {})[factor] = mean
+        else:
+            probability[control] = mean
     if probability:
         tables["transition"] = {"probability": probability}
     assumed_noise = np.asarray(scenario["observation"]["standard_deviation"])
@@ -84,46 +93,25 @@ def _scenario_tables(group: Record, means: Record, scenario: Record) -> JsonObje
     tables["observation"] = {"standard_deviation": noise.tolist()}
     population = group.get("population")
     if population:
+        # The predictive variance of an asset without observations is a sum: that of the population
+        # (the square of its posterior mean, plus its posterior variance), and the posterior
+        # variance of the mean.
+        deviation = population["spread"]
+        deviation_of_new_asset = float(
+            np.linalg.norm(
+                [
+                    deviation["mean"],
+                    deviation["standard_deviation"],
+                    population["mean"]["standard_deviation"],
+                ]
+            )
+        )
         tables["calibration"] = {
             "parameter": population["parameter"],
             "mean": population["mean"]["mean"],
-            "standard_deviation": _deviation_of_new_asset(population),
+            "standard_deviation": deviation_of_new_asset,
         }
     return tables
-
-
-def _mean_probabilities(group: Record, means: Record) -> JsonObject:
-    """Return the mean probabilities to worsen by control, or by control and factor.
-
-    For a control that was never flown nothing was learnt: its assumed probability is returned.
-    """
-    probabilities: JsonObject = {}
-    for name, learnt in group["probability"].items():
-        mean = means[name]["mean"] if learnt["flown"] else learnt["assumed"]
-        control, _, factor = name.partition(", ")
-        if factor:
-            probabilities.setdefault(control, {})[factor] = mean
-        else:
-            probabilities[control] = mean
-    return probabilities
-
-
-def _deviation_of_new_asset(population: Record) -> float:
-    """Return the predictive standard deviation of the parameter of an asset without observations.
-
-    The variances of three sources are added: the spread of the population (the square of its
-    posterior mean, plus its posterior variance), and the posterior variance of the mean.
-    """
-    deviation = population["spread"]
-    return float(
-        np.linalg.norm(
-            [
-                deviation["mean"],
-                deviation["standard_deviation"],
-                population["mean"]["standard_deviation"],
-            ]
-        )
-    )
 
 
 class LessonRow(NamedTuple):
@@ -151,7 +139,10 @@ def lesson_rows(record: Record) -> list[LessonRow]:
     rows = []
     for name, group in record["groups"].items():
         first_row, *other_rows = _group_rows(group)
-        rows.append(first_row._replace(group=_group_heading(name, group)))
+        heading = f"{name}, {counted(group['twins'], 'twin')}"
+        if group["alarmed"]:
+            heading += f", {group['alarmed']} with an alarm"
+        rows.append(first_row._replace(group=heading))
         rows += other_rows
     for control, mean_over_groups in record.get("shared", {}).items():
         mean = mean_over_groups["mean"]
@@ -159,14 +150,6 @@ def lesson_rows(record: Record) -> list[LessonRow]:
         title = f"mean over groups, {control}"
         rows.append(LessonRow("all groups", title, "", f"{mean:.4f} ± {deviation:.2g}", ""))
     return rows
-
-
-def _group_heading(name: str, group: Record) -> str:
-    """Return the name of a group with its numbers of twins and of twins with an alarm."""
-    heading = f"{name}, {counted(group['twins'], 'twin')}"
-    if group["alarmed"]:
-        heading += f", {group['alarmed']} with an alarm"
-    return heading
 
 
 def _group_rows(group: Record) -> Iterator[LessonRow]:

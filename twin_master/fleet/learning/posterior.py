@@ -399,8 +399,18 @@ def shared_posterior(grids: Sequence[LikelihoodGrid]) -> SharedPosterior:
     marginals = marginal_distributions(
         hyper_weight, (mean_axis, concentration_axis) * count, (logistic, np.asarray) * count
     )
+    records = []
+    for mean, concentration in zip(marginals[::2], marginals[1::2], strict=True):
+        records.append(
+            {
+                "mean": mean.mean,
+                "standard_deviation": mean.standard_deviation,
+                "log10_concentration": concentration.mean,
+                "log10_concentration_standard_deviation": concentration.standard_deviation,
+            }
+        )
     return SharedPosterior(
-        hyperparameters=_hyperparameter_records(marginals),
+        hyperparameters=records,
         groups=[group.posterior(weight) for group in groups],
     )
 
@@ -498,21 +508,6 @@ def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
     p = logistic(log_odds)
     log_density = a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None]
     return np.asarray(np.exp(log_density))
-
-
-def _hyperparameter_records(marginals: Sequence[Distribution]) -> list[dict[str, float]]:
-    """Return the records of the hyperparameters, from mean and concentration in turn."""
-    records = []
-    for mean, concentration in zip(marginals[::2], marginals[1::2], strict=True):
-        records.append(
-            {
-                "mean": mean.mean,
-                "standard_deviation": mean.standard_deviation,
-                "log10_concentration": concentration.mean,
-                "log10_concentration_standard_deviation": concentration.standard_deviation,
-            }
-        )
-    return records
 
 
 def _interpolated_likelihood(grid: LikelihoodGrid, axes: Axes) -> Float:

@@ -159,7 +159,10 @@ def _add_flown_group(page: Page, overview: GroupOverview) -> None:
     if drawn.distance > 1:
         sample = f"Of {overview.twin_count} assets, one in {drawn.distance} is drawn."
     _add_map(page, scenario, np.concatenate(drawn.last_mean), drawn.failed_count, sample)
-    _add_courses(page, scenario, np.concatenate(drawn.mean), np.concatenate(drawn.state), sample)
+    mean = np.concatenate(drawn.mean)
+    if not np.isnan(mean).all():
+        figure = course_figure(scenario, mean, np.concatenate(drawn.state))
+        page.add_report_figure(WORDS.figure("course", figure, more=sample))
     has_alarms = overview.alarmed_count > 0
     _add_attention_table(page, overview.urgent, overview.flown_count, has_alarms=has_alarms)
 
@@ -298,25 +301,6 @@ def _add_map(page: Page, scenario: Scenario, mean: Float, failed: int, sample: s
     failed_sentence = f"Grey: {failed} that failed in flight." if failed else ""
     more = f"{failed_sentence} {sample}".strip()
     page.add_report_figure(WORDS.figure("map", figure, more=more))
-
-
-def _add_courses(page: Page, scenario: Scenario, mean: Float, state: Float, sample: str) -> None:
-    """Add the figure of the assets' states over time, if any step has an estimated state.
-
-    Parameters
-    ----------
-    page : Page
-        The page to which content is added.
-    scenario : Scenario
-        The scenario with F factors of the state.
-    mean, state : (B, T, F) array
-        The believed mean states and the true states, in SI units.
-    sample : str
-        A sentence that says which of the assets are drawn, if not all are.
-    """
-    if not np.isnan(mean).all():
-        figure = course_figure(scenario, mean, state)
-        page.add_report_figure(WORDS.figure("course", figure, more=sample))
 
 
 class _AttentionTable(NamedTuple):

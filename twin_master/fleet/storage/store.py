@@ -81,6 +81,10 @@ def stored_variables(
     fallbacks = fallbacks_of(knowledge, flights)
     earned = earnings(knowledge, flights.control_index, flights.filtered, flights.state)
     returns = discounted_return(knowledge.scenario, earned.reward, flights.control_index)
+    # The belief after the last flown step, (B, S); of a failed twin the last row, which is NaN.
+    step_count = flights.control_index.shape[1]
+    last_step = np.where(has_failed, step_count, _steps_flown(flights)) - 1
+    last_belief = flights.filtered[np.arange(len(has_failed)), last_step]
     values: dict[str, object] = {
         "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
@@ -93,7 +97,7 @@ def stored_variables(
         "filtered/standard_deviation": standard_deviation,
         "filtered/log_evidence": flights.log_evidence,
         "notice/none_of_these": flights.unexplained,
-        "filtered/last_probability": _last_belief(flights, has_failed),
+        "filtered/last_probability": last_belief,
         "delay": np.where(has_failed, np.nan, fallbacks.delay),
         "early": np.where(has_failed, _NOT_DEFINED, fallbacks.early),
         **_notice_variables(flights),
@@ -111,16 +115,6 @@ def stored_variables(
 def _steps_flown(flights: Flights) -> Index:
     """Return the number of flown steps of each twin, a (B,) array."""
     return np.asarray((flights.control_index >= 0).sum(axis=1))
-
-
-def _last_belief(flights: Flights, has_failed: NDArray[np.bool_]) -> Float:
-    """Return the belief after the last flown step of each twin, a (B, S) array.
-
-    For a failed twin it is NaN: its row of the last step of the mission is NaN and is returned.
-    """
-    step_count = flights.control_index.shape[1]
-    last_step = np.where(has_failed, step_count, _steps_flown(flights)) - 1
-    return np.asarray(flights.filtered[np.arange(len(has_failed)), last_step])
 
 
 def _credible_fraction(knowledge: Knowledge, flights: Flights) -> Float:

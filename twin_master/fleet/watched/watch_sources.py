@@ -209,7 +209,11 @@ class TopicSource:
         begin = time.monotonic()
         steps = 0
         if not self._topics:
-            self._add_topics_of_folder()
+            # Assets that were watched before may send nothing for a long time, or have decisions
+            # that are not published yet.
+            group_folder = self._watcher.folder / self._group.name
+            for path in sorted(group_folder.glob(f"*/{CONFIG_NAME}")):
+                self._find_topic(path.parent.name)
         if for_new_assets:
             for name in list(self._topics):
                 steps += self._advance(name)
@@ -221,15 +225,6 @@ class TopicSource:
             if time.monotonic() - begin > BUSY_SECONDS:
                 break
         return steps
-
-    def _add_topics_of_folder(self) -> None:
-        """Add the topics of assets that were watched before.
-
-        They may send nothing for a long time, or have decisions that are not published yet.
-        """
-        group_folder = self._watcher.folder / self._group.name
-        for path in sorted(group_folder.glob(f"*/{CONFIG_NAME}")):
-            self._find_topic(path.parent.name)
 
     def _take_in(self, message: BrokerMessage) -> int:
         """Queue a message at its topic and process the topic; return the number of new steps.
