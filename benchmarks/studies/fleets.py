@@ -27,14 +27,9 @@ from twin_master.fleet.learning.evidence import (
     grid_evidence,
     scaled,
 )
+from twin_master.fleet.learning.grid_density import Axes, logistic
 from twin_master.fleet.learning.learn import learn_fleet
-from twin_master.fleet.learning.posterior import (
-    Axes,
-    LikelihoodGrid,
-    likelihood_grid,
-    logistic,
-    shared_posterior,
-)
+from twin_master.fleet.learning.posterior import LikelihoodGrid, likelihood_grid, shared_posterior
 from twin_master.fleet.members import Member
 from twin_master.fleet.storage.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

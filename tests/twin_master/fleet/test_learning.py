@@ -25,14 +25,13 @@ from twin_master.fleet.learning.evidence import (
     reason_transitions_are_fixed,
     transition_evidence,
 )
+from twin_master.fleet.learning.grid_density import Axes, Distribution
 from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.learning.noise import with_noise_factor
 from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.learning.posterior import (
     HIGHEST,
     LOWEST,
-    Axes,
-    Distribution,
     LikelihoodGrid,
     PopulationPosterior,
     likelihood_grid,

@@ -7,13 +7,13 @@ from scipy.stats import norm
 
 from tests.twin_master.fleet.test_learning import tiny
 from twin_master.fleet.learning.evidence import TransitionFamily
+from twin_master.fleet.learning.grid_density import Axes
 from twin_master.fleet.learning.noise import ParameterNodes
 from twin_master.fleet.learning.parameter_evidence import (
     LEAST_POSTERIOR,
     likelihood_at_nodes,
     parameter_evidence,
 )
-from twin_master.fleet.learning.posterior import Axes
 from uav_twin import GaussianSensorModel
 
 TRUTH = {"2g": 0.07, "3g": 0.2}

@@ -20,7 +20,8 @@ from twin_master.fleet.learning.evidence_kernels import (
     evidence_in_lanes,
     evidence_on_grid,
 )
-from twin_master.fleet.learning.posterior import GRID_POINTS, Axes
+from twin_master.fleet.learning.grid_density import Axes
+from twin_master.fleet.learning.posterior import GRID_POINTS
 from twin_master.network.kernels import PredecessorLists
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables

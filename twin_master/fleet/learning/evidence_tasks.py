@@ -21,8 +21,8 @@ from twin_master.errors import FleetError, RunFolderError
 from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.engine import TaskPool
 from twin_master.fleet.learning.evidence import TransitionFamily
+from twin_master.fleet.learning.grid_density import Axes
 from twin_master.fleet.learning.parameter_evidence import likelihood_at_nodes, parameter_evidence
-from twin_master.fleet.learning.posterior import Axes
 from twin_master.fleet.storage.store import open_group
 from twin_master.fleet.storage.store_layout import BLOCK_TWINS, ObservedTwins, StoredObservations
 from twin_master.network.sensor_model import GaussianSensorModel

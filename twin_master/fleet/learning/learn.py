@@ -29,6 +29,7 @@ from twin_master.fleet.learning.evidence_tasks import (
     FlightsOfScenario,
     GroupEvidence,
 )
+from twin_master.fleet.learning.grid_density import Axes, Distribution, logistic
 from twin_master.fleet.learning.lessons import LESSONS_NAME, write_learnt
 from twin_master.fleet.learning.noise import (
     ParameterNodes,
@@ -38,12 +39,9 @@ from twin_master.fleet.learning.noise import (
     with_noise_factor,
 )
 from twin_master.fleet.learning.posterior import (
-    Axes,
-    Distribution,
     LikelihoodGrid,
     PopulationPosterior,
     likelihood_grid,
-    logistic,
     population_posterior,
     shared_posterior,
 )

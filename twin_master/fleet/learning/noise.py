@@ -14,13 +14,13 @@ from twin_master.errors import FleetError
 from twin_master.fleet.checks import source_of
 from twin_master.fleet.learning.evidence import TransitionFamily
 from twin_master.fleet.learning.evidence_tasks import with_all_transitions_possible
-from twin_master.fleet.learning.parameter_evidence import parameter_evidence
-from twin_master.fleet.learning.posterior import (
+from twin_master.fleet.learning.grid_density import (
     Axes,
     Distribution,
     cell_probabilities,
     resolve_density,
 )
+from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.reading import TwinsOfScenario
 from twin_master.fleet.storage.store_layout import ObservedTwins, StoredObservations
 from twin_master.mission.preparation import Knowledge

@@ -19,7 +19,7 @@ from twin_master.fleet.learning.evidence import (
     scaled,
 )
 from twin_master.fleet.learning.evidence_kernels import evidence_in_lanes
-from twin_master.fleet.learning.posterior import Axes
+from twin_master.fleet.learning.grid_density import Axes
 from twin_master.network.sensor_model import GaussianSensorModel
 
 LEAST_POSTERIOR = 1e-4
