@@ -23,13 +23,12 @@ from fe.wing.design import load_design
 from reporting.arrays import Index
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.mission.loop import operate
-from twin_master.mission.plant import Truth
+from twin_master.mission.plant import Plant, Truth
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import (
-    AssetsSideBySide,
     Flights,
     TwinsSideBySide,
+    fly_formation,
     fly_one_by_one,
 )
 from twin_master.mission.steps import Reading, Source
@@ -202,8 +201,8 @@ class FaultyAsset(Asset):
 class FaultyGauges(Source[TwinsSideBySide]):
     """The source of the readings of gauges with a fault."""
 
-    def __init__(self, assets: AssetsSideBySide, gauge_fault: GaugeFault, seeds: Index, sharp: int):
-        self._assets = assets
+    def __init__(self, plant: Plant, gauge_fault: GaugeFault, seeds: Index, sharp: int):
+        self._plant = plant
         self._gauge_fault = gauge_fault
         self._seeds = seeds
         self._sharp = sharp
@@ -212,7 +211,7 @@ class FaultyGauges(Source[TwinsSideBySide]):
         """Fly the next step of all twins; None once all missions are at their ends."""
         is_sharp = np.asarray(twins.proposed_control) == self._sharp
         step = twins.steps
-        reading = self._assets.read(twins)
+        reading = self._plant.read(twins)
         if reading is None or reading.ground_truth is None:
             return None
         strain = reading.ground_truth.observation
@@ -279,14 +278,8 @@ def fly_with_fault(
         seeds_of_formation = seeds[first : first + TOGETHER]
         truth = Truth.stack([knowledge.truth(seed) for seed in seeds_of_formation.tolist()])
         plant = knowledge.plant(truth, *([asset] * len(seeds_of_formation)))
-        flights = Flights.empty(knowledge, len(seeds_of_formation))
-        assets = AssetsSideBySide(scenario, plant, flights)
-        source = FaultyGauges(assets, gauge_fault, seeds_of_formation, sharp)
-        for _ in operate(
-            TwinsSideBySide(scenario, knowledge.twin(), flights), source, flights.store_step
-        ):
-            pass
-        formations.append(flights)
+        source = FaultyGauges(plant, gauge_fault, seeds_of_formation, sharp)
+        formations.append(fly_formation(knowledge, plant, source))
     return Flights.concatenate(formations)
 
 

@@ -132,16 +132,8 @@ def fly(
         for step in operate(twin, plant, *sinks, log_notices):
             history.add(step)
             stage.advance(detail=scenario.control_names[step.twin_step.control_index])
-    if plant.reason_of_end:
-        sentence = early_end_sentence(scenario, twin.steps, plant.reason_of_end)
+    for sentence in plant.endings.values():
         history.sentence_of_early_end = sentence
         history.notices.append((twin.steps - 1, Notice("ended", sentence)))
         _logger.info("%s", sentence)
     return history
-
-
-def early_end_sentence(scenario: Scenario, steps_flown: int, reason: str) -> str:
-    """Return the sentence that the mission ended before its last step."""
-    mission = scenario.mission
-    steps = f"{steps_flown} of {mission.steps} {mission.step_name}s"
-    return f"The asset ended the mission after {steps}: {reason}"

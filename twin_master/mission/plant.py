@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,6 @@ from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.mission.steps import GroundTruth, History, Reading, Source
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -300,12 +299,28 @@ def _draw(states: _NextStates, uniform: Float) -> Index:
     return np.asarray(states.state_indices[position])
 
 
+class FlownTwins(Protocol):
+    """A twin, or several side by side, whose decisions a plant flies."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps so far."""
+
+    @property
+    def proposed_control(self) -> int | Index:
+        """Index of the control for the next step, of each twin."""
+
+    @property
+    def previous_control(self) -> int | Index:
+        """Index of the control in force in the last step, of each twin."""
+
+
 def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
     """Return the sentence that an action of the twin is the reason of an early end."""
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 
-class Plant(Source[Twin]):
+class Plant(Source[FlownTwins]):
     """The simulated asset of a mission, driven by its truth and flown under given controls.
 
     The assets of B missions fly side by side if they have no memory. Then the arrays of controls,
@@ -324,8 +339,10 @@ class Plant(Source[Twin]):
     ----------
     step : int
         The number of steps flown.
-    reason_of_end : str
-        Why a single mission ended before its last step, as a sentence; empty if it did not.
+    is_flying : (...) array of bool
+        Which missions have not ended. Who notes the failure of a twin elsewhere clears its entry.
+    endings : dict of int to str
+        How missions ended before their last step, by the number of the mission.
     failures : dict of int to str
         The errors of assets that flew side by side, by the number of the mission.
     """
@@ -342,20 +359,24 @@ class Plant(Source[Twin]):
         self._sensed: Float | None = None
         # What the assets of several missions show under a control in a state.
         self._known_readings: dict[tuple[int, int, bytes], AssetReading] = {}
+        self._ends_mission = np.array(
+            [scenario.ends(index) for index in range(len(scenario.control))]
+        )
         self.step = 0
-        self.reason_of_end = ""
+        self.is_flying: NDArray[np.bool_] = np.ones(truth.shape, dtype=bool)
+        self.endings: dict[int, str] = {}
         self.failures: dict[int, str] = {}
 
-    def read(self, twin: Twin) -> Reading | None:
-        """Fly the next step of a single mission and return its observation; None at its end.
+    def read(self, twin: FlownTwins) -> Reading | None:
+        """Fly the next step of all missions and return the observation; None at their ends.
 
-        This is `Source.read` of a simulated asset. The mission ends in three cases:
+        This is `Source.read` of simulated assets. A mission ends in three cases:
 
         - All its steps are flown.
         - The twin has decided on an action that ends it.
-        - The FMU has ended its simulation.
+        - The FMU of a single mission has ended its simulation.
 
-        In the last two cases `reason_of_end` becomes a sentence.
+        In the last two cases a sentence is added to `endings`.
 
         Raises
         ------
@@ -364,28 +385,36 @@ class Plant(Source[Twin]):
         MissionInputError
             As `fly_step`.
         """
-        steps_done = twin.steps
-        if steps_done == self._scenario.mission.steps:
+        if twin.steps == self._scenario.mission.steps:
             return None
-        previous_control = twin.control_of(steps_done - 1) if steps_done > 0 else None
-        if previous_control is not None and self._scenario.ends(previous_control):
-            self.reason_of_end = sentence_of_ending_action(self._scenario, previous_control)
+        previous_control = None
+        if twin.steps > 0:
+            previous_control = np.asarray(twin.previous_control)
+            ends_now = self.is_flying & self._ends_mission[previous_control]
+            for mission in np.flatnonzero(ends_now).tolist():
+                control = int(previous_control.flat[mission])
+                self._end(mission, sentence_of_ending_action(self._scenario, control))
+        if not self.is_flying.any():
             return None
         try:
             return self.fly_step(twin.proposed_control, previous_control)
         except FmuEndedError as error:
-            if steps_done == 0:
+            if twin.steps == 0:
                 raise  # a mission without a single step is an error, and no early end
-            self.reason_of_end = error.sentence
+            self._end(0, error.sentence)
             return None
 
+    def _end(self, mission: int, reason: str) -> None:
+        """End a mission before its last step, for a reason in words."""
+        section = self._scenario.mission
+        steps = f"{self.step} of {section.steps} {section.step_name}s"
+        self.endings[mission] = f"The asset ended the mission after {steps}: {reason}"
+        self.is_flying.flat[mission] = False
+
     def fly_step(
-        self,
-        control_index: ArrayLike,
-        previous_control_index: ArrayLike | None,
-        is_flying: ArrayLike = True,
+        self, control_index: ArrayLike, previous_control_index: ArrayLike | None
     ) -> Reading:
-        """Fly one step and return its observation.
+        """Fly one step and return its observation; NaN for missions that have ended.
 
         Parameters
         ----------
@@ -393,8 +422,6 @@ class Plant(Source[Twin]):
             The index of the control in force.
         previous_control_index : int or (B,) array of int, or None
             That of the step before; None in the first step.
-        is_flying : (B,) array of bool, optional
-            Which missions have not ended; the others have NaN as observations.
 
         Raises
         ------
@@ -409,12 +436,12 @@ class Plant(Source[Twin]):
         code = self._asset_of_mission * len(self._scenario.control) + control
         code = code * (1 + state.state_index.max()) + state.state_index
         _, first_missions, group = np.unique(
-            np.where(is_flying, code, -1), return_index=True, return_inverse=True
+            np.where(self.is_flying, code, -1), return_index=True, return_inverse=True
         )
         group = group.reshape(self._truth.shape)
         readings = []
         for number, mission in enumerate(first_missions.tolist()):
-            missions = np.flatnonzero((group == number) & is_flying)
+            missions = np.flatnonzero((group == number) & self.is_flying)
             readings.append(self._read_asset(mission, missions, control, state))
         observation = np.stack([reading.values for reading in readings])[group]
 
@@ -433,8 +460,10 @@ class Plant(Source[Twin]):
         self._state = state
         self._sensed = sensed
         self.step += 1
+        observed = np.concatenate((sensed, inspected), axis=-1)
+        observed[~self.is_flying] = np.nan
         return Reading(
-            np.concatenate((sensed, inspected), axis=-1),
+            observed,
             ground_truth=GroundTruth(state.values, observation, monitors),
         )
 
@@ -465,6 +494,7 @@ class Plant(Source[Twin]):
             if self._truth.shape == ():
                 raise
             self.failures |= dict.fromkeys(missions.tolist(), str(error))
+            self.is_flying[missions] = False
             return no_reading
         if self._truth.shape:  # these assets have no memory
             self._known_readings[key] = reading

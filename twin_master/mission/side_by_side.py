@@ -16,10 +16,10 @@ from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.gauges.monitor import gauge_watch_of
 from twin_master.gauges.watch_state import WatchState
-from twin_master.mission.loop import early_end_sentence, fly, operate
-from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth, sentence_of_ending_action
+from twin_master.mission.loop import fly, operate
+from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, OperatedStep, Reading, Source
+from twin_master.mission.steps import History, OperatedStep, Source
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
 from twin_master.network.planner import BeliefPolicy, ration_controls
@@ -113,11 +113,6 @@ class Flights:
         self.failure[twin] = sentence
         self.is_flying[twin] = False
 
-    def end(self, twin: int, sentence: str) -> None:
-        """Note how the asset of a twin has ended its simulation early."""
-        self.ended[twin] = sentence
-        self.is_flying[twin] = False
-
     def store_step(self, step: "OperatedStep[StepOfTwins]") -> None:
         """Store a step of the twins that are still flying."""
         beliefs = step.twin_step
@@ -143,7 +138,8 @@ class Flights:
         if history.simulated:
             self.state[twin, :steps_flown] = history.state
         if history.sentence_of_early_end:
-            self.end(twin, history.sentence_of_early_end)
+            self.ended[twin] = history.sentence_of_early_end
+            self.is_flying[twin] = False
         self.notices[twin] = history.notices
 
 
@@ -169,7 +165,6 @@ def fly_side_by_side(
     """
     if not all(isinstance(asset, StatelessAsset) for asset in assets):
         return fly_one_by_one(knowledge, truths, lambda twin, _previous_ended_well: assets[twin])
-    scenario = knowledge.scenario
     size = len(truths)
     watch = gauge_watch_of(knowledge.estimator)
     if watch is not None:
@@ -178,57 +173,32 @@ def fly_side_by_side(
     for first in range(0, len(truths), size):
         truth = Truth.stack(truths[first : first + size])
         plant = knowledge.plant(truth, *assets[first : first + size])
-        flights = Flights.empty(knowledge, *truth.shape)
-        twins = TwinsSideBySide(scenario, knowledge.twin(), flights)
-        assets_side_by_side = AssetsSideBySide(scenario, plant, flights)
-        for _ in operate(twins, assets_side_by_side, flights.store_step):
-            pass
-        formations.append(flights)
+        formations.append(fly_formation(knowledge, plant, plant))
     return Flights.concatenate(formations)
 
 
-class AssetsSideBySide(Source["TwinsSideBySide"]):
-    """The source of the observations of B twins: assets without memory, which fly side by side.
+def fly_formation(knowledge: Knowledge, plant: Plant, source: Source["TwinsSideBySide"]) -> Flights:
+    """Fly B missions side by side.
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the missions.
+    knowledge : Knowledge
+        The knowledge of all twins.
     plant : Plant
-        The assets and their truth, at the start of the mission.
-    flights : Flights
-        The record in which the ends of flights are noted.
+        The assets, at the start of the missions.
+    source : Source
+        The source of the observations: the plant, or what changes its readings.
     """
-
-    def __init__(self, scenario: Scenario, plant: Plant, flights: Flights) -> None:
-        self._scenario = scenario
-        self._ends_mission = np.array(
-            [scenario.ends(index) for index in range(len(scenario.control))]
-        )
-        self._plant = plant
-        self._flights = flights
-
-    def read(self, twins: "TwinsSideBySide") -> Reading | None:
-        """Fly the next step of all twins; None once all missions are at their ends."""
-        if twins.steps == self._scenario.mission.steps:
-            return None
-        previous_control = None
-        if twins.steps > 0:
-            previous_control = twins.previous_control
-            self._end_missions(twins)
-        is_flying = self._flights.is_flying
-        reading = self._plant.fly_step(twins.proposed_control, previous_control, is_flying)
-        for twin, sentence in self._plant.failures.items():
-            self._flights.fail(twin, sentence)
-        reading.observed[~is_flying] = np.nan
-        return reading
-
-    def _end_missions(self, twins: "TwinsSideBySide") -> None:
-        """End the missions whose last control was an action that ends them."""
-        ends_now = self._flights.is_flying & self._ends_mission[twins.previous_control]
-        for twin in np.flatnonzero(ends_now).tolist():
-            reason = sentence_of_ending_action(self._scenario, twins.previous_control[twin])
-            self._flights.end(twin, early_end_sentence(self._scenario, twins.steps, reason))
+    flights = Flights.empty(knowledge, len(plant.is_flying))
+    flights.is_flying = plant.is_flying  # a twin that fails stops its asset, and the reverse
+    twins = TwinsSideBySide(knowledge.scenario, knowledge.twin(), flights)
+    for _ in operate(twins, source, flights.store_step):
+        pass
+    for mission, sentence in plant.failures.items():
+        flights.failure[mission] = sentence
+    for mission, sentence in plant.endings.items():
+        flights.ended[mission] = sentence
+    return flights
 
 
 @dataclass(frozen=True)

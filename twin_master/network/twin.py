@@ -34,7 +34,7 @@ from twin_master.network.graphical_model import (
     repaired_table,
     worsening_table,
 )
-from twin_master.network.inference import Predicted, predict
+from twin_master.network.inference import NO_CONTROL, Predicted, predict
 from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy, decision_probability
 from twin_master.network.transition import checked_beliefs, checked_controls
 from twin_master.scenario.schema import Scenario
@@ -264,6 +264,11 @@ class Twin:
     def proposed_control(self) -> int:
         """Index of the control for the next step: that of the last decision, or the first one."""
         return self._proposed
+
+    @property
+    def previous_control(self) -> int:
+        """Index of the control in force in the last step; `NO_CONTROL` before the first one."""
+        return self.control_of(self._steps - 1) if self._steps > 0 else NO_CONTROL
 
     @property
     def first_kept(self) -> int:
