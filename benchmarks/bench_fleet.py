@@ -22,8 +22,8 @@ from twin_master.fleet.plan import Fleet, ensemble
 from twin_master.fleet.storage.store import stored_variables
 from twin_master.fleet.storage.store_address import StoreAddress
 from twin_master.fleet.storage.store_writing import GroupWriter, create_store
+from twin_master.mission.flights import fly_one_by_one, fly_side_by_side
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.side_by_side import fly_one_by_one, fly_side_by_side
 from twin_master.scenario.reading import load_scenario
 
 TWINS = 256

@@ -19,7 +19,7 @@ from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.mission.loop import fly
+from twin_master.mission.flights import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario
 

@@ -21,8 +21,8 @@ from fe.reduction.reduced_basis import reduce_structure
 from fe.structure.operators import load_and_assemble
 from tests.command_line import said
 from tests.twin_master.runs import of_library, text_of, written
+from twin_master.mission.flights import fly_side_by_side
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.side_by_side import fly_side_by_side
 
 
 @dataclass(frozen=True)

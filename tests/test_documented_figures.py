@@ -10,7 +10,7 @@ import pytest
 from fe.reduction.model_cache import reduced_model
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.strain_library_source import load_strain_library
-from twin_master.mission.loop import fly
+from twin_master.mission.flights import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario
 

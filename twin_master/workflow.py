@@ -32,7 +32,7 @@ from twin_master.assets.resolution import (
     scenario_bytes,
 )
 from twin_master.errors import NotResumableError
-from twin_master.mission import loop
+from twin_master.mission import flights
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.knowledge_file import save_knowledge
 from twin_master.mission.parts import GivenEstimator, GivenPolicy, GivenSensorModel, TwinParts
@@ -327,7 +327,7 @@ def _fly(
     ):
         plant = knowledge.plant(truth, asset)
         earlier_steps = restore_flight(journal, knowledge, plant)
-        flight = loop.fly(
+        flight = flights.fly(
             scenario,
             earlier_steps.twin,
             plant,

@@ -23,14 +23,14 @@ from fe.wing.design import load_design
 from reporting.arrays import Index
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.mission.plant import Plant, Truth
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import (
+from twin_master.mission.flights import (
     Flights,
     TwinsSideBySide,
     fly_formation,
     fly_one_by_one,
 )
+from twin_master.mission.plant import Plant, Truth
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.steps import Reading, Source
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario

@@ -32,8 +32,8 @@ from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.learning.posterior import LikelihoodGrid, likelihood_grid, shared_posterior
 from twin_master.fleet.members import Member
 from twin_master.fleet.storage.store import stored_variables
+from twin_master.mission.flights import Flights, fly_side_by_side
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.inference import predict
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from uav_twin import fly_fleet

@@ -55,7 +55,7 @@ from twin_master.assets.resolution import (
     resolve_scenario,
 )
 from twin_master.fleet.storage.store import in_credible_set
-from twin_master.mission.loop import fly
+from twin_master.mission.flights import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.run_folder import create_run_folder
 from twin_master.scenario.reading import load_scenario

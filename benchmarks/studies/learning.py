@@ -30,9 +30,8 @@ from fe.wing.operators import assemble, wing_values
 from twin_master.assets.asset_source import Asset, AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.outcomes import Estimated, Outcomes
-from twin_master.mission.loop import fly
+from twin_master.mission.flights import Flights, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import Flights
 from twin_master.mission.steps import History
 from twin_master.network.estimator import Notice
 from twin_master.scenario.reading import load_scenario

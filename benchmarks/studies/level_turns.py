@@ -35,8 +35,8 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.fleet.outcomes import Estimated, Outcomes
+from twin_master.mission.flights import fly_side_by_side
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario

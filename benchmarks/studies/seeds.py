@@ -7,8 +7,8 @@ from twin_master.errors import FleetError
 from twin_master.fleet.members import Member
 from twin_master.fleet.outcomes import Outcomes
 from twin_master.fleet.storage.store import stored_variables
+from twin_master.mission.flights import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.scenario.schema import Scenario
 
 

@@ -17,9 +17,9 @@ from fe.wing.design import load_design
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.members import Member
 from twin_master.fleet.storage.store import stored_variables
+from twin_master.mission.flights import fly_side_by_side
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.sensor_design import choose_sensors, draw_readings
-from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.tables import SensorFault
 

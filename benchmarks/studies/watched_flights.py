@@ -18,9 +18,9 @@ from fe.reduction.model_cache import reduced_model
 from reporting.arrays import AnyArray
 from twin_master.assets.asset_source import Asset, AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
+from twin_master.mission.flights import Flights, fly_side_by_side
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]

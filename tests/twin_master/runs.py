@@ -22,6 +22,7 @@ from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
+from twin_master.mission.flights import fly
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
@@ -30,7 +31,6 @@ from twin_master.mission.journal import (
     records,
 )
 from twin_master.mission.journal_packing import PROBABILITY_DECIMALS
-from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.recent_parts import RECENT_NAMES, RecentParts
 from twin_master.mission.steps import History, MissionStep

@@ -29,14 +29,13 @@ from twin_master.feeds.message import FeedItem
 from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.members import Member
 from twin_master.fleet.storage.store import FAILED, stored_variables
+from twin_master.mission.flights import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.knowledge_file import load_knowledge
-from twin_master.mission.loop import log_notices, operate
 from twin_master.mission.parts import TwinParts
 from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import BelievedModel, refilter
-from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.steps import History, Reading
+from twin_master.mission.steps import History, Reading, log_notices, operate
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 

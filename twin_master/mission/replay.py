@@ -26,11 +26,10 @@ from twin_master.mission.journal import (
     step_record,
     with_short_truth,
 )
-from twin_master.mission.loop import StepSink, operate
 from twin_master.mission.plant import Plant
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.recent_parts import BLOCK_STEPS, RecentParts, is_whole_step
-from twin_master.mission.steps import History, MissionStep, Reading, Source
+from twin_master.mission.steps import History, MissionStep, Reading, Source, StepSink, operate
 from twin_master.network.twin import Twin
 
 

@@ -1,17 +1,22 @@
-"""The steps of a mission or a watch: readings, estimates and decisions, and their history."""
+"""The steps of a mission or a watch, their history, and the loop that makes them."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Float
-from twin_master.errors import TwinMasterError
+from reporting.log import module_logger
+from twin_master.errors import ImpossibleObservation, InvalidObservationError, TwinMasterError
 from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinStep
+
+_logger = module_logger(__name__)
 
 StepT = TypeVar("StepT", covariant=True)
 """The estimates and decisions of a step: those of one twin, or of several side by side."""
@@ -229,3 +234,70 @@ class History:
         for step in self.steps:
             figures.append([posterior.figures for posterior in step.twin_step.learnt.values()])
         return np.array(figures).reshape(len(self.steps), len(self.learnt_names), 4)
+
+
+class SteppedTwin(Protocol[StepT]):
+    """A `Twin`, or `TwinsSideBySide`: it assimilates an observation and decides."""
+
+    def step(self, observation: ArrayLike, control: int | None = None) -> StepT:
+        """Return estimate and decision after an observation; a control left out is the proposed."""
+
+
+StepSink = Callable[[MissionStep], None]
+"""Stores a step, such as in a journal or in a history."""
+
+
+def operate(
+    twin: SteppedTwin[StepT],
+    source: Source[Any],
+    *sinks: Callable[[OperatedStep[StepT]], None],
+) -> Iterator[OperatedStep[StepT]]:
+    """Let a twin assimilate and decide until its source ends; yield each step once it is stored.
+
+    Parameters
+    ----------
+    twin : Twin or TwinsSideBySide
+        The twin or twins that assimilate and decide.
+    source : Source
+        The source of such a twin. It is asked for an observation after the previous step was
+        stored.
+    *sinks : callable
+        Functions that store each step, called one after the other.
+    """
+    while True:
+        begin = time.perf_counter()
+        reading = source.read(twin)
+        if reading is None:
+            return
+        time_received = time.perf_counter()
+        try:
+            twin_step = _assimilate(twin, reading)
+        except (ImpossibleObservation, InvalidObservationError) as error:
+            reading = source.replace_impossible(reading, error)
+            twin_step = _assimilate(twin, reading)
+        time_decided = time.perf_counter()
+        step = OperatedStep(reading, twin_step)
+        for sink in sinks:
+            sink(step)
+        time_stored = time.perf_counter()
+        yield replace(
+            step,
+            seconds=(
+                time_received - begin,
+                time_decided - time_received,
+                time_stored - time_decided,
+            ),
+        )
+
+
+def _assimilate(twin: SteppedTwin[StepT], reading: Reading) -> StepT:
+    """Let the twin take in a reading, as its next step or as the revision of an earlier one."""
+    if reading.revises is not None and isinstance(twin, Twin):
+        return twin.revise(reading.revises, reading.observed, reading.control)
+    return twin.step(reading.observed, reading.control)
+
+
+def log_notices(step: MissionStep) -> None:
+    """Write the notices of a step to the log."""
+    for notice in step.twin_step.notices:
+        _logger.info("%s", notice.sentence)

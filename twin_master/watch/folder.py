@@ -32,11 +32,10 @@ from twin_master.mission.journal import (
     short_record,
 )
 from twin_master.mission.knowledge_file import link_knowledge, save_knowledge
-from twin_master.mission.loop import log_notices, operate
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.recent_parts import RecentParts, is_whole_step
 from twin_master.mission.replay import BelievedModel, replay
-from twin_master.mission.steps import MissionStep
+from twin_master.mission.steps import MissionStep, log_notices, operate
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import (

@@ -41,11 +41,10 @@ from twin_master.fleet.shard import result_of_unflown
 from twin_master.fleet.storage.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
 from twin_master.fleet.storage.store_address import STORE_NAME
 from twin_master.fleet.storage.store_layout import FORMER_DIMENSIONS, FORMER_PATHS
+from twin_master.mission.flights import Flights, fly, fly_one_by_one, fly_side_by_side
 from twin_master.mission.journal import JournalFile
-from twin_master.mission.loop import fly
 from twin_master.mission.plant import DamageGrowth
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_fleet, open_run, prepare_twin
 

@@ -10,11 +10,11 @@ from tests.twin_master.runs import of_library
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.gauges.monitor import gauge_watch_of
-from twin_master.mission import side_by_side
+from twin_master.mission import flights as flights_of_missions
+from twin_master.mission.flights import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.parts import TwinParts
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.tables import Noticing, SensorFault
@@ -125,7 +125,7 @@ def test_twins_fly_the_same_in_several_formations(library_file, monkeypatch):
     fleet = watched_fleet("level_turns", library_file)
     whole = fleet.fly_together()
     size = gauge_watch_of(fleet.knowledge.estimator).faults.belief_size
-    monkeypatch.setattr(side_by_side, "_MOST_NUMBERS_TOGETHER", 3 * size)
+    monkeypatch.setattr(flights_of_missions, "_MOST_NUMBERS_TOGETHER", 3 * size)
     parts = fleet.fly_together()
     np.testing.assert_array_equal(parts.filtered, whole.filtered)
     assert parts.notices == whole.notices

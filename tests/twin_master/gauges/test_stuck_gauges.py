@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from tests.twin_master.runs import changed_scenario, of_wing
 from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
-from twin_master.mission.loop import fly
+from twin_master.mission.flights import fly
 from twin_master.mission.steps import History
 from twin_master.scenario.tables import Noticing
 

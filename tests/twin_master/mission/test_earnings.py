@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from tests.costs import once
 from tests.twin_master.runs import of_wing, table_of
 from twin_master.mission.earnings import discounted_return, earnings, promised_return
+from twin_master.mission.flights import Flights, fly_side_by_side
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.graphical_model import Factor, StateSpace
 from twin_master.report.reading import NORMAL_95
 from twin_master.scenario.reading import parse_scenario

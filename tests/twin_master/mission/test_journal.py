@@ -14,9 +14,9 @@ from tests.own_process import ended_by
 from tests.twin_master.runs import journal, of_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import NotResumableError
+from twin_master.mission.flights import fly
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line, record_of_line, records
 from twin_master.mission.journal_packing import full_record, pack_numbers, unpack_numbers
-from twin_master.mission.loop import fly
 from twin_master.mission.plant import Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.recent_parts import BLOCK_STEPS, RECENT_NAMES, RecentPartsFile, is_whole_step

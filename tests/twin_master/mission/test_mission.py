@@ -35,9 +35,9 @@ from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import ensemble
 from twin_master.fleet.storage.store import ENDED
 from twin_master.mission import replay
+from twin_master.mission.flights import fly
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, encode_line
 from twin_master.mission.journal_packing import pack_numbers
-from twin_master.mission.loop import fly
 from twin_master.mission.plant import Plant, SensorStatus, Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import journal_sink, restore_flight
@@ -140,7 +140,7 @@ def test_failing_gauges_are_noticed(whole_flight):
 def test_notices_are_records_of_the_log_as_they_are_given(whole_flight, tmp_path, caplog):
     with caplog.at_level("INFO", logger="uav_twin"):
         flight = part(whole_flight.known, tmp_path)
-    messages = [record.message for record in caplog.records if record.name.endswith("mission.loop")]
+    messages = [record.message for record in caplog.records if "twin_master.mission" in record.name]
     assert messages
     assert messages == [notice.sentence for _, notice in flight.notices]
 

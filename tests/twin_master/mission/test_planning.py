@@ -21,8 +21,8 @@ from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.plan import load_fleet
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.earnings import discounted_return, earnings, promised_return
+from twin_master.mission.flights import Flights, fly, fly_side_by_side
 from twin_master.mission.knowledge_file import load_knowledge
-from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     compare_simple_rules,
     encode_policy,
@@ -31,7 +31,6 @@ from twin_master.mission.planning import (
     simulate_policy,
 )
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Estimator
 from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.transition import TransitionModel

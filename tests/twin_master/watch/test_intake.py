@@ -20,8 +20,8 @@ from twin_master.feeds.csv_feed import CsvFeed
 from twin_master.feeds.feed import Feed
 from twin_master.feeds.intake import Intake
 from twin_master.feeds.message import LARGEST_MESSAGE, Message, MessageReader, Refused
-from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
+from twin_master.mission.steps import operate
 from twin_master.scenario.tables import WatchSection
 from uav_twin import Twin, load_scenario
 

@@ -26,8 +26,8 @@ from twin_master.fleet.storage.store_layout import (
     stored_layout,
 )
 from twin_master.mission.earnings import discounted_return, earnings
+from twin_master.mission.flights import Flights
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
 from twin_master.store.schema import SCHEMA

@@ -1,4 +1,4 @@
-"""Many twins of one scenario, flown together; each gives the results of `fly`, to the last bit.
+"""The flight of a mission, and of many side by side, which give the same results to the last bit.
 
 The results of a twin do not depend on the number of twins: sums run over the states, sensors and
 draws of one twin, never over twins.
@@ -12,22 +12,85 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
+from reporting.log import module_logger
+from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.gauges.monitor import gauge_watch_of
 from twin_master.gauges.watch_state import WatchState
-from twin_master.mission.loop import fly, operate
 from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.steps import History, OperatedStep, Source
+from twin_master.mission.steps import (
+    History,
+    OperatedStep,
+    Source,
+    StepSink,
+    log_notices,
+    operate,
+)
 from twin_master.network.estimator import ExactFilter, Notice
 from twin_master.network.inference import NO_CONTROL, Filtered
 from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, Twin, unbelievable_observation
 from twin_master.scenario.schema import Scenario
 
+_logger = module_logger(__name__)
+
 _MOST_NUMBERS_TOGETHER = 10_000_000
 """Numbers of four bytes in the beliefs about gauges of the twins that fly together."""
+
+
+def fly(
+    scenario: Scenario,
+    twin: Twin,
+    plant: Plant,
+    *sinks: StepSink,
+    history: History | None = None,
+    progress: Progress | None = None,
+) -> History:
+    """Fly a mission to its end, from the step that twin and plant have reached.
+
+    An asset that ends its simulation early ends the mission; this is a notice to the operator.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of the mission.
+    twin : Twin
+        The twin that assimilates and decides.
+    plant : Plant
+        The asset and its truth, at the same step as the twin.
+    *sinks : callable
+        The functions that store each step, see `operate`.
+    history : History, optional
+        The steps flown so far; the new ones are added to it, also if an error ends the flight.
+    progress : Progress, optional
+        The display of the progress in steps.
+
+    Returns
+    -------
+    History
+        All steps.
+
+    Raises
+    ------
+    MissionInputError, ImpossibleObservation, FmuError, FiniteElementError
+        If the mission cannot go on.
+    """
+    history = history or History(twin, scenario.observation.count)
+    history.resumed_at = twin.steps
+    progress = progress or SilentProgress()
+    unit = f"{scenario.mission.step_name}s"
+    with progress.stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
+        stage.advance(twin.steps)
+        for step in operate(twin, plant, *sinks, log_notices):
+            history.add(step)
+            stage.advance(detail=scenario.control_names[step.twin_step.control_index])
+    for sentence in plant.endings.values():
+        history.sentence_of_early_end = sentence
+        history.notices.append((twin.steps - 1, Notice("ended", sentence)))
+        _logger.info("%s", sentence)
+    return history
 
 
 @dataclass
