@@ -389,8 +389,7 @@ def watch(
     with serve_metrics(metrics) as metrics_server, opened as watched:
         try:
             begun(watched)
-            decide = _also_as_metrics(decide, metrics_server, watched)
-            decide = _also_as_lines(decide, line_protocol, watched)
+            decide = _also_for_monitoring(decide, metrics_server, line_protocol, watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, reading_scenario)
             teacher = cause_search if teach else None
@@ -402,33 +401,27 @@ def watch(
     return watched.folder
 
 
-def _also_as_metrics(
-    decide: DecisionSink, server: MetricsServer | None, watched: Watch
+def _also_for_monitoring(
+    decide: DecisionSink,
+    server: MetricsServer | None,
+    line_protocol: Path | str | None,
+    watched: Watch,
 ) -> DecisionSink:
-    """Return a function that also hands each decision to the server of metrics, if there is one."""
-    if server is None:
-        return decide
-    metrics = server.attach(watched.scenario.mission.name, watched)
-    watched.progress.note(f"Metrics: {server.address}")
+    """Return a function that also serves each decision as metrics, and appends it to a file."""
+    name = watched.scenario.mission.name
+    sinks = [decide]
+    if server is not None:
+        metrics = server.attach(name, watched)
+        watched.progress.note(f"Metrics: {server.address}")
+        sinks.insert(0, metrics.note_decision)
+    if line_protocol is not None:
+        sinks.insert(0, DecisionLines(Path(line_protocol), name).write)
 
-    def decide_and_count(decision: Decision) -> None:
-        metrics.note_decision(decision)
-        decide(decision)
+    def send(decision: Decision) -> None:
+        for sink in sinks:
+            sink(decision)
 
-    return decide_and_count
-
-
-def _also_as_lines(decide: DecisionSink, path: Path | str | None, watched: Watch) -> DecisionSink:
-    """Return a function that also appends each decision to a file of line protocol, if any."""
-    if path is None:
-        return decide
-    lines = DecisionLines(Path(path), watched.scenario.mission.name)
-
-    def decide_and_append(decision: Decision) -> None:
-        lines.write(decision)
-        decide(decision)
-
-    return decide_and_append
+    return send
 
 
 def _given_patch(
