@@ -33,7 +33,6 @@ from twin_master.fleet.learning.grid_density import Axes, Distribution, logistic
 from twin_master.fleet.learning.lessons import LESSONS_NAME, write_learnt
 from twin_master.fleet.learning.noise import (
     ParameterNodes,
-    flights_by_scenario,
     noise_factor,
     parameter_nodes,
     with_noise_factor,
@@ -49,7 +48,7 @@ from twin_master.fleet.learning.row_file import RowFile
 from twin_master.fleet.members import RecordedMembers
 from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.storage.store import check_installed, flown_rows, open_group
-from twin_master.fleet.storage.store_layout import row_blocks, stored_values
+from twin_master.fleet.storage.store_layout import StoredObservations, row_blocks, stored_values
 from twin_master.run_folder import to_json
 from twin_master.scenario.schema import Scenario
 
@@ -327,9 +326,8 @@ class _FlownGroup:
             nodes = parameter_nodes(self.twins_by_scenario[0], is_real="recordings" in self.record)
         name = self.record["name"]
         with progress.stage(f"Learning the noise of {name}"):
-            noise = noise_factor(
-                flights_by_scenario(self.group, self.twins_by_scenario), family, nodes
-            )
+            store = StoredObservations(self.group, scenario)
+            noise = noise_factor(store, self.twins_by_scenario, family, nodes)
         population_evidence = self._evidence(family, noise.mean, nodes, pool, progress)
         growth_evidence = population_evidence
         if nodes is not None:  # growth changes so little with the parameter that half of them do

@@ -1,13 +1,13 @@
 """The noise of the sensors of a fleet, learnt from some of its twins."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fe.runtime.errors import OutsideModelError
-from reporting.arrays import Float, Index
+from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
@@ -22,12 +22,11 @@ from twin_master.fleet.learning.grid_density import (
 )
 from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.reading import TwinsOfScenario
-from twin_master.fleet.storage.store_layout import ObservedTwins, StoredObservations
-from twin_master.mission.preparation import Knowledge
+from twin_master.fleet.storage.store_layout import StoredObservations
 from twin_master.network.sensor_model import GaussianSensorModel
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 NOISE_TWINS = 100
 """Largest number of twins of a group from which the noise is learnt.
@@ -107,40 +106,6 @@ def parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> ParameterNodes 
     return ParameterNodes(values, prior / prior.sum(), predicted_readings)
 
 
-class _Flights(NamedTuple):
-    """The flights of B twins of one scenario, whose observations are in the store.
-
-    Attributes
-    ----------
-    knowledge : Knowledge
-        The knowledge that the twins share: model, policy and calibration draws.
-    store : StoredObservations
-        The observations of their group.
-    rows : (B,) array
-        The rows of the twins in the store, in ascending order.
-    """
-
-    knowledge: Knowledge
-    store: StoredObservations
-    rows: Index
-
-    def first_twins(self, count: int) -> "_Flights":
-        """Return the flights of the first twins."""
-        return self._replace(rows=self.rows[:count])
-
-    def blocks(self) -> Iterator[ObservedTwins]:
-        """Yield the observations of the twins, some twins at a time."""
-        return self.store.blocks(self.rows)
-
-
-def flights_by_scenario(
-    group: "xr.DataTree", twins_by_scenario: Sequence[TwinsOfScenario]
-) -> list[_Flights]:
-    """Return the flights of the twins of a group that have flown, for each scenario."""
-    store = StoredObservations(group, twins_by_scenario[0].knowledge.scenario)
-    return [_Flights(twins.knowledge, store, twins.rows) for twins in twins_by_scenario]
-
-
 def with_noise_factor(
     model: GaussianSensorModel, factor: float, value_per_draw: Float | None = None
 ) -> GaussianSensorModel:
@@ -166,7 +131,8 @@ def with_noise_factor(
 
 
 def noise_factor(
-    flights_by_scenario: Sequence[_Flights],
+    store: StoredObservations,
+    twins_by_scenario: Sequence[TwinsOfScenario],
     family: TransitionFamily,
     nodes: ParameterNodes | None,
 ) -> Distribution:
@@ -177,13 +143,13 @@ def noise_factor(
     of all steps is computed at each value first and averaged over the values then: over the nodes
     or, if there are none, over the draws of the calibration.
     """
-    flights_of_first_twins = [
-        flights.first_twins(NOISE_TWINS) for flights in flights_by_scenario[:NOISE_TWINS]
+    first_twins = [
+        twins._replace(rows=twins.rows[:NOISE_TWINS]) for twins in twins_by_scenario[:NOISE_TWINS]
     ]
 
     def log_likelihood(axes: Axes) -> Float:
         log_evidence = [
-            _evidence_of_noise(flights_of_first_twins, family, nodes, factor)
+            _evidence_of_noise(store, first_twins, family, nodes, factor)
             for factor in np.exp(axes[0]).tolist()
         ]
         return np.array(log_evidence)
@@ -195,7 +161,8 @@ def noise_factor(
 
 
 def _evidence_of_noise(
-    flights_by_scenario: Sequence[_Flights],
+    store: StoredObservations,
+    twins_by_scenario: Sequence[TwinsOfScenario],
     family: TransitionFamily,
     nodes: ParameterNodes | None,
     factor: float,
@@ -208,11 +175,11 @@ def _evidence_of_noise(
 
     probability = with_all_transitions_possible(family.assumed)
     total_log_evidence = 0.0
-    for flights in flights_by_scenario:
+    for twins in twins_by_scenario:
         value_per_draw = None if nodes is None else nodes.predicted
-        model = with_noise_factor(flights.knowledge.sensor_model, factor, value_per_draw)
+        model = with_noise_factor(twins.knowledge.sensor_model, factor, value_per_draw)
         prior = model.draw_weight if nodes is None else nodes.prior
-        for observed, control in flights.blocks():
+        for observed, control in store.blocks(twins.rows):
             at_nodes = parameter_evidence(family, probability, model, observed, control)
             log_evidence = logsumexp(at_nodes, b=prior, axis=1)
             total_log_evidence += float(log_evidence[np.isfinite(log_evidence)].sum())
