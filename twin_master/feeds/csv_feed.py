@@ -9,9 +9,9 @@ from typing import BinaryIO
 
 from reporting.former_names import warn_of_former_names
 from twin_master.errors import MissionInputError
+from twin_master.feeds.feed import RecordedFeed
 from twin_master.feeds.lines import Position, first_line, rotated_files
 from twin_master.feeds.message import OTHER_KEYS, PRESENT_NAMES, MessageContent, Refused
-from twin_master.feeds.recorded_feeds import RecordedFeed
 from twin_master.scenario.schema import Scenario
 
 _MISSING_VALUES = ("nan", "null", "none")

@@ -11,12 +11,11 @@ import numpy as np
 from twin_master.errors import MissionInputError
 from twin_master.feeds.broker_address import Broker, is_broker, parse_broker
 from twin_master.feeds.csv_feed import CsvFeed
-from twin_master.feeds.feed import Feed
+from twin_master.feeds.feed import Feed, FolderFeed, LinesFeed, RunFeed, beginning_of
 from twin_master.feeds.line_protocol import looks_like_line_protocol
 from twin_master.feeds.lines import Pipe, first_line
 from twin_master.feeds.message import FeedItem, Refused
 from twin_master.feeds.payload import PayloadReader
-from twin_master.feeds.recorded_feeds import FolderFeed, LinesFeed, RunFeed, beginning_of
 from twin_master.scenario.schema import Scenario
 
 Observations = Iterable[Mapping[str, object]] | str | Path

@@ -14,10 +14,9 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError
 from twin_master.feeds.clock import Clock
-from twin_master.feeds.feed import Feed
+from twin_master.feeds.feed import Feed, StepStatus
 from twin_master.feeds.lines import Position
 from twin_master.feeds.message import FeedItem, Message, Refused
-from twin_master.feeds.recorded_feeds import StepStatus
 from twin_master.feeds.rejected import RejectedFile
 from twin_master.feeds.stream import REFUSALS_IN_A_ROW, StreamNotices
 from twin_master.mission.journal import encode_state, step_record

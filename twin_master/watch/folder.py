@@ -17,9 +17,8 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
-from twin_master.feeds.feed import Decision, DecisionSink, Feed
+from twin_master.feeds.feed import Decision, DecisionSink, Feed, JournalLine
 from twin_master.feeds.intake import KEPT_SNAPSHOT_STEPS, Counts, Intake
-from twin_master.feeds.recorded_feeds import JournalLine
 from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (

@@ -9,12 +9,11 @@ from pathlib import Path
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import JsonObject
 from twin_master.feeds.broker_address import Broker
-from twin_master.feeds.feed import Decision, Feed
+from twin_master.feeds.feed import Decision, Feed, beginning_of
 from twin_master.feeds.lines import Position
 from twin_master.feeds.message import FeedItem, Message, Refused
 from twin_master.feeds.mqtt_session import LONGEST_RETRY_SECONDS, Session
 from twin_master.feeds.payload import PayloadReader
-from twin_master.feeds.recorded_feeds import beginning_of
 from twin_master.mission.journal import JOURNAL_NAME, last_step, records
 from twin_master.mission.recent_parts import RecentParts
 from twin_master.scenario.schema import Scenario

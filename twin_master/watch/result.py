@@ -6,8 +6,8 @@ from itertools import takewhile
 
 from reporting.json_file import JsonObject
 from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.feeds.feed import JournalLine
 from twin_master.feeds.intake import Counts
-from twin_master.feeds.recorded_feeds import JournalLine
 from twin_master.feeds.rejected import REJECTED_NAME
 from twin_master.mission.journal import last_step, records_backwards
 from twin_master.mission.replay import replay

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from reporting.json_file import JsonObject
 from twin_master.errors import MissionInputError
-from twin_master.feeds.recorded_feeds import JournalLine
+from twin_master.feeds.feed import JournalLine
 from twin_master.mission.journal import damaged_line_error, records_backwards
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.records import ModelRecord, VerdictRecord

@@ -23,11 +23,10 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.feeds.broker_address import Broker
-from twin_master.feeds.feed import Decision, DecisionSink, Feed
+from twin_master.feeds.feed import Decision, DecisionSink, Feed, RecordedFeed
 from twin_master.feeds.feed_choice import Observations, choose_feed
 from twin_master.feeds.intake import Counts
 from twin_master.feeds.mqtt_session import CLIENT_SUFFIX, DISCARD_SESSION
-from twin_master.feeds.recorded_feeds import RecordedFeed
 from twin_master.mission.journal import JOURNAL_NAME, last_step
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario

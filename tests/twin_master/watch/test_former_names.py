@@ -13,8 +13,8 @@ from tests.twin_master.runs import journal, with_former_names
 from tests.twin_master.watch.conftest import begun, ran, viewed, watchful, write_csv
 from tests.twin_master.watch.test_teaching import tutor
 from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import FolderFeed
 from twin_master.feeds.message import Message, MessageReader, Refused
-from twin_master.feeds.recorded_feeds import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME
 
 SENTENCE = "`turn` is now called `step`"

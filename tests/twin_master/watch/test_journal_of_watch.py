@@ -25,7 +25,7 @@ from tests.twin_master.watch.conftest import (
 )
 from tests.twin_master.watch.test_brokers import TOPIC, heard_at, run_over, where_of
 from twin_master.feeds.csv_feed import CsvFeed
-from twin_master.feeds.recorded_feeds import FolderFeed
+from twin_master.feeds.feed import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.recent_parts import RECENT_NAMES
 from twin_master.mission.replay import BelievedModel, replay

@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from tests.refusals import Inputs
 from tests.twin_master.runs import belief_in_journal, journal
 from tests.twin_master.watch.conftest import HANGS, begun, ran
+from twin_master.feeds.feed import LinesFeed
 from twin_master.feeds.feed_choice import feed_of_lines, feed_of_mappings, file_feed
 from twin_master.feeds.line_protocol import write_line
 from twin_master.feeds.message import Message, Refused
 from twin_master.feeds.payload import PayloadReader
 from twin_master.feeds.points import Point, seconds_since_1970
-from twin_master.feeds.recorded_feeds import LinesFeed
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.folder import Watch
 

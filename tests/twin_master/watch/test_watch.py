@@ -28,8 +28,8 @@ from tests.twin_master.watch.conftest import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.feeds.csv_feed import CsvFeed
+from twin_master.feeds.feed import FolderFeed
 from twin_master.feeds.feed_choice import feed_of_lines, file_feed
-from twin_master.feeds.recorded_feeds import FolderFeed
 from twin_master.mission.journal import JOURNAL_NAME, record_of_line
 from twin_master.mission.recent_parts import BLOCK_STEPS
 from twin_master.mission.replay import BelievedModel
