@@ -170,11 +170,9 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         content = np.load(path, allow_pickle=False)
         if isinstance(content, np.ndarray):  # NPY: a policy by states (S, U)
             return model.policy(content)  # refuses another shape
-        # The policy on the belief in an NPZ archive, and close the archive
         with content:
             policy = BeliefPolicy.from_arrays(content)
             controls = tuple(content["controls"].tolist())
-        stored_policy = _StoredBeliefPolicy(policy, policy.vectors.shape[1], controls)
     except FileNotFoundError:
         raise PlanningError(
             f"there is no file {path} with a policy: give a file of `uav-twin plan --out`, or a "
@@ -191,21 +189,13 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
             f"{path} is not a policy such as `uav-twin plan --out` writes ({reason}): give such a "
             "file; if it is the copy in a run folder, fly the run again"
         ) from None
-    if stored_policy.controls != model.controls or stored_policy.state_count != model.states.size:
+    state_count = policy.vectors.shape[1]
+    if controls != model.controls or state_count != model.states.size:
         raise PlanningError(
-            f"{path} is for {stored_policy.state_count} states and the controls "
-            f"{comma_list(stored_policy.controls)}, and the scenario has {model.states.size} and "
-            f"{comma_list(model.controls)}: plan it anew"
+            f"{path} is for {state_count} states and the controls {comma_list(controls)}, and the "
+            f"scenario has {model.states.size} and {comma_list(model.controls)}: plan it anew"
         )
-    return stored_policy.policy
-
-
-class _StoredBeliefPolicy(NamedTuple):
-    """A policy on the belief, and the states and controls that it was planned for."""
-
-    policy: BeliefPolicy
-    state_count: int
-    controls: tuple[str, ...]
+    return policy
 
 
 @dataclass(frozen=True)

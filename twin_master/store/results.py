@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,21 +18,14 @@ from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, MissionResult
 from twin_master.store.schema import (
-    FIELDS_OF_BELIEFS,
     SCHEMA,
     Entry,
     coordinate_variables,
-    coordinates_of_axes,
-    described_variable,
+    described_variables,
+    in_groups,
     observed_entries,
-    rows_of_group,
     scenario_fields,
 )
-
-SchemaFields = Mapping[str, str]
-"""The words that take the place of the fields in braces of the schema, the file `run.toml`."""
-_NO_FIELDS: SchemaFields = MappingProxyType({})
-
 
 _BELIEF_OF_DECISION = {
     "filtered": "the filtered belief of the step",
@@ -45,102 +37,67 @@ _MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     """Return the groups of `run.nc` of a mission; every variable has its unit and a description."""
-    builder = _GroupBuilder(result)
+    scenario = result.scenario
+    flight = result.flight
     plan = result.knowledge.plan
-    groups = {"observed": builder.group("observed", _observed_entries(result))}
-    groups["filtered"] = _filtered_group(result, builder)
-    groups["smoothed"] = _smoothed_group(result, builder)
-    groups["predicted"] = _predicted_group(result, builder)
-    earned = {**vars(result.earned), "return": result.discounted_return}
-    groups["earned"] = builder.group("earned", _plain_entries(earned))
-    policy = {
-        "control_index": plan.control_index,
-        "action_value": plan.action_value,
-        "value": plan.value,
+    entries: dict[str, Iterable[Entry]] = {
+        "observed": _observed_entries(result),
+        "filtered": _plain_entries(_filtered_variables(result)),
+        "smoothed": _plain_entries(_smoothed_variables(result)),
+        "predicted": _plain_entries(_predicted_variables(result)),
+        "earned": _plain_entries({**vars(result.earned), "return": result.discounted_return}),
+        "policy": _plain_entries(
+            {
+                "control_index": plan.control_index,
+                "action_value": plan.action_value,
+                "value": plan.value,
+            }
+        ),
+        "calibration": _plain_entries({"draw_value": result.knowledge.draws.values}),
     }
-    groups["policy"] = builder.group("policy", _plain_entries(policy))
-    groups["calibration"] = builder.group(
-        "calibration",
-        _plain_entries({"draw_value": result.knowledge.draws.values}),
-        attributes={"parameter": result.scenario.calibration.parameter},
-    )
     if result.learnt:
-        groups["learnt"] = builder.group("learnt", _learnt_entries(result))
-    if result.flight.suspicion:
-        # The variables of the group `notice`: the suspicion of each step
-        suspicions = result.flight.suspicion
-        values = {}
-        for name in SCHEMA["notice"]:
-            values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
-        values["left_out"] = values["left_out"].astype(np.int8)
-        notice_entries = _plain_entries(values)
-        groups["notice"] = builder.group("notice", notice_entries)
+        entries["learnt"] = _learnt_entries(result)
+    if flight.suspicion:
+        entries["notice"] = _plain_entries(_notice_variables(result))
     if result.truth is not None:
-        groups["truth"] = builder.group("truth", _truth_entries(result, result.truth))
+        entries["truth"] = _truth_entries(result, result.truth)
+    fields = scenario_fields(scenario) | _fields_of_decisions(result)
+    fields["parameter_unit"] = result.parameter_unit
+    variables: dict[str, Variable] = {}
+    for group, entries_of_group in entries.items():
+        variables |= described_variables(group, entries_of_group, fields)
+    labels: dict[str, ArrayLike] = {
+        "control": scenario.control_names,
+        "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
+        "reward": REWARD_NAMES,
+        "draw": np.arange(len(result.knowledge.draws.values)),
+    }
+    steps = flight.first_step + np.arange(len(flight.steps))
+    groups = in_groups(variables, coordinate_variables(scenario, steps, labels))
+    parameter = {"parameter": scenario.calibration.parameter}
+    groups["calibration"] = replace(groups["calibration"], attrs=parameter)
     return groups
+
+
+def _fields_of_decisions(result: MissionResult) -> dict[str, str]:
+    """Return the words for `decided_on` and `how` in descriptions of the filtered group.
+
+    They are "policy averaged over {decided_on}; its mode is the control of the next step", and
+    "observation minus its filtered mean, in the standard deviations {how}".
+    """
+    belief_of_decision = result.scenario.planner.decide_on
+    if isinstance(result.knowledge.plan.on_belief, BeliefPolicy):
+        belief_of_decision = "predicted"  # such a plan always decides by the predicted belief
+    learns = result.knowledge.learning is not None
+    return {
+        "decided_on": _BELIEF_OF_DECISION[belief_of_decision],
+        "how": "that the twin has learnt" if learns else "that the twin assumes",
+    }
 
 
 def _plain_entries(values: Mapping[str, ArrayLike]) -> list[Entry]:
     """Return an entry for each variable whose name in the schema has no fields in braces."""
     return [Entry(name, np.asarray(array)) for name, array in values.items()]
-
-
-class _GroupBuilder:
-    """Builds groups by the schema, each with the coordinates of its axes."""
-
-    def __init__(self, result: MissionResult) -> None:
-        scenario = result.scenario
-        self._fields = scenario_fields(scenario) | {"parameter_unit": result.parameter_unit}
-        steps = result.flight.first_step + np.arange(len(result.flight.steps))
-        labels: dict[str, ArrayLike] = {
-            "control": scenario.control_names,
-            "horizon": np.arange(1, scenario.mission.prediction_steps + 1),
-            "reward": REWARD_NAMES,
-            "draw": np.arange(len(result.knowledge.draws.values)),
-        }
-        self._coordinates = coordinate_variables(scenario, steps, labels)
-
-    def _variables(
-        self, group: str, entries: Iterable[Entry], fields: SchemaFields
-    ) -> Iterator[tuple[str, Variable]]:
-        """Yield the name and the variable of each entry.
-
-        The schema gives axes, unit and description of an entry as templates. Their fields are
-        filled with those of the mission, of the group, and of the entry; a later one replaces an
-        earlier one of the same name.
-        """
-        rows = rows_of_group(group)
-        fields_of_group = {**self._fields, **FIELDS_OF_BELIEFS.get(group, {}), **fields}
-        for entry in entries:
-            all_fields = {**fields_of_group, **entry.fields}
-            variable = described_variable(rows[entry.name], entry.values, all_fields)
-            yield entry.name.format(**all_fields), variable
-
-    def group(
-        self,
-        name: str,
-        entries: Iterable[Entry],
-        fields: SchemaFields = _NO_FIELDS,
-        attributes: SchemaFields = _NO_FIELDS,
-    ) -> NetcdfGroup:
-        """Return a group of variables, with the coordinates whose axes they have.
-
-        Parameters
-        ----------
-        name : str
-            The name of the group.
-        entries : iterable of Entry
-            Its variables.
-        fields : mapping of str to str
-            The values of fields that all entries share.
-        attributes : mapping of str to str
-            The attributes of the group.
-        """
-        variables = dict(self._variables(name, entries, fields))
-        axes: set[str] = set()
-        for variable in variables.values():
-            axes.update(variable.dims)
-        return NetcdfGroup(variables, coordinates_of_axes(self._coordinates, axes), attributes)
 
 
 def _observed_entries(result: MissionResult) -> Iterator[Entry]:
@@ -155,43 +112,30 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
         yield Entry("{input}", value_of_control[control_index], fields)
 
 
-def _filtered_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
-    """Return the group of the filtered belief, with decisions, evidence and residuals."""
+def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
+    """Return the filtered belief, with decisions, evidence and residuals."""
     flight = result.flight
     expectation = _expected_in_flight(result, flight.filtered, is_smoothed=False)
-    values = _belief_variables(result, flight.filtered, expectation)
-    values["noise_standard_deviation"] = expectation.noise_standard_deviation
-    values["decision_probability"] = flight.decision_probability
-    values["log_evidence"] = flight.log_evidence
     residual = flight.observed - expectation.mean
-    values["residual"] = residual / expectation.noise_standard_deviation
-    values["sensors_received"] = np.isfinite(flight.observed).sum(axis=1)
-    # The fields complete descriptions of the schema, such as
-    #   "policy averaged over {decided_on}; its mode is the control of the next step",
-    #   "observation minus its filtered mean, in the standard deviations {how}".
-    belief_of_decision = result.scenario.planner.decide_on
-    if isinstance(
-        result.knowledge.plan.on_belief, BeliefPolicy
-    ):  # such a plan always decides by the predicted belief
-        belief_of_decision = "predicted"
-    learns = result.knowledge.learning is not None
-    fields = {
-        "decided_on": _BELIEF_OF_DECISION[belief_of_decision],
-        "how": "that the twin has learnt" if learns else "that the twin assumes",
+    return {
+        **_belief_variables(result, flight.filtered, expectation),
+        "noise_standard_deviation": expectation.noise_standard_deviation,
+        "decision_probability": flight.decision_probability,
+        "log_evidence": flight.log_evidence,
+        "residual": residual / expectation.noise_standard_deviation,
+        "sensors_received": np.isfinite(flight.observed).sum(axis=1),
     }
-    return builder.group("filtered", _plain_entries(values), fields)
 
 
-def _smoothed_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
-    """Return the group of the smoothed belief."""
+def _smoothed_variables(result: MissionResult) -> dict[str, ArrayLike]:
+    """Return the smoothed belief."""
     smoothed_belief = result.flight.smoothed
     expectation = _expected_in_flight(result, smoothed_belief, is_smoothed=True)
-    values = _belief_variables(result, smoothed_belief, expectation)
-    return builder.group("smoothed", _plain_entries(values))
+    return _belief_variables(result, smoothed_belief, expectation)
 
 
-def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGroup:
-    """Return the group of the predicted belief, whose leading axes are step and horizon.
+def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
+    """Return the predicted belief, whose leading axes are step and horizon.
 
     A twin that adopts a patched model has different knowledge in different spans of its steps: the
     expectations are computed for each span and concatenated.
@@ -209,7 +153,7 @@ def _predicted_group(result: MissionResult, builder: _GroupBuilder) -> NetcdfGro
         control_probabilities.append(control_probability)
     values = _belief_variables(result, predicted_belief, concatenate_expectations(expected_parts))
     values["control_probability"] = np.concatenate(control_probabilities)
-    return builder.group("predicted", _plain_entries(values))
+    return values
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
@@ -271,6 +215,16 @@ def _learnt_entries(result: MissionResult) -> Iterator[Entry]:
             fields = {**quantity.schema_fields, "moment": moment, "moment_title": title}
             yield Entry("{quantity}_{moment}", quantity.posterior[..., index], fields)
             yield Entry("{quantity}_prior_{moment}", quantity.prior[..., index], fields)
+
+
+def _notice_variables(result: MissionResult) -> Mapping[str, ArrayLike]:
+    """Return how well the model explained the sensors in each step."""
+    suspicions = result.flight.suspicion
+    values = {}
+    for name in SCHEMA["notice"]:
+        values[name] = np.array([getattr(suspicion, name) for suspicion in suspicions])
+    values["left_out"] = values["left_out"].astype(np.int8)
+    return values
 
 
 def _truth_entries(result: MissionResult, truth: Truth) -> Iterator[Entry]:

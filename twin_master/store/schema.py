@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Index
-from reporting.netcdf import Variable
+from reporting.netcdf import NetcdfGroup, Variable
 from twin_master.scenario.schema import Scenario
 
 SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
@@ -104,7 +104,7 @@ class Entry(NamedTuple):
     """
 
     name: str
-    values: AnyArray
+    values: ArrayLike
     fields: Mapping[str, str] = MappingProxyType({})
 
 
@@ -130,6 +130,23 @@ def described_variable(
     axes, unit, title = (template.format(**fields) for template in row)
     units = {"units": unit} if unit else {}
     return Variable(tuple(axes.split()), np.asarray(values), {**units, "long_name": title})
+
+
+def described_variables(
+    group: str, entries: Iterable[Entry], fields: Mapping[str, str]
+) -> dict[str, Variable]:
+    """Return the variables of entries of a group of `run.nc`, by their paths.
+
+    The fields in braces of the schema are filled with those of the mission, of the group, and of
+    the entry; a later one replaces an earlier one of the same name.
+    """
+    rows = rows_of_group(group)
+    variables = {}
+    for entry in entries:
+        all_fields = {**fields, **FIELDS_OF_BELIEFS.get(group, {}), **entry.fields}
+        path = f"{group}/{entry.name.format(**all_fields)}"
+        variables[path] = described_variable(rows[entry.name], entry.values, all_fields)
+    return variables
 
 
 def coordinate_variables(
@@ -169,6 +186,25 @@ def coordinate_variables(
     return coordinates
 
 
-def coordinates_of_axes(coordinates: Mapping[str, Variable], axes: set[str]) -> dict[str, Variable]:
-    """Return the coordinates whose axes are all among some axes."""
-    return {name: entry for name, entry in coordinates.items() if axes.issuperset(entry.dims)}
+def in_groups(
+    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable]
+) -> dict[str, NetcdfGroup]:
+    """Return variables in their groups, each group with the coordinates whose axes it has.
+
+    Parameters
+    ----------
+    variables : mapping of str to Variable
+        The variables by path; one outside of all groups is in the group "".
+    coordinates : mapping of str to Variable
+        All coordinates by name.
+    """
+    variables_of_group: dict[str, dict[str, Variable]] = {}
+    for path, variable in variables.items():
+        group, _, name = path.rpartition("/")
+        variables_of_group.setdefault(group, {})[name] = variable
+    groups = {}
+    for group, variables_by_name in variables_of_group.items():
+        axes = {axis for variable in variables_by_name.values() for axis in variable.dims}
+        labels = {name: entry for name, entry in coordinates.items() if axes.issuperset(entry.dims)}
+        groups[group] = NetcdfGroup(variables_by_name, labels)
+    return groups

@@ -18,9 +18,9 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.schema import (
     SCHEMA,
     coordinate_variables,
-    coordinates_of_axes,
     described_variable,
     fleet_rows,
+    in_groups,
     observed_entries,
     scenario_fields,
 )
@@ -128,30 +128,14 @@ def twin_coordinate(names: Sequence[str]) -> Variable:
 def coordinates_of_groups(
     layout: Mapping[str, Variable], scenario: Scenario
 ) -> dict[str, dict[str, Variable]]:
-    """Return for each group of a store the coordinates of all axes that its variables have.
+    """Return the coordinates of each group of a layout by name; the outermost group is "".
 
     The names of the twins are not among them: the outermost group alone has them, and the groups
     inside it inherit them, so that the store has a million names once.
-
-    Parameters
-    ----------
-    layout : mapping of str to Variable
-        The variables by their paths.
-    scenario : Scenario
-        The scenario of the group of assets.
-
-    Returns
-    -------
-    dict of str to dict
-        The coordinates by name, for each group by its path; the path of the outermost one is empty.
     """
     steps = np.arange(scenario.mission.steps)
     coordinates = coordinate_variables(scenario, steps, {"notice_kind": NOTICE_KINDS})
-    axes_of_group: dict[str, set[str]] = {}
-    for path, variable in layout.items():
-        group, _, _ = path.rpartition("/")
-        axes_of_group.setdefault(group, set()).update(variable.dims)
-    return {group: coordinates_of_axes(coordinates, axes) for group, axes in axes_of_group.items()}
+    return {name: {**group.coords} for name, group in in_groups(layout, coordinates).items()}
 
 
 def observed_variables(scenario: Scenario, rows: AnyArray) -> dict[str, AnyArray]:
@@ -159,7 +143,7 @@ def observed_variables(scenario: Scenario, rows: AnyArray) -> dict[str, AnyArray
     variables = {}
     for entry in observed_entries(scenario, rows):
         name = entry.name.format(role=scenario.observation.role, **entry.fields)
-        variables[f"observed/{name}"] = entry.values
+        variables[f"observed/{name}"] = np.asarray(entry.values)
     return variables
 
 
