@@ -12,7 +12,7 @@ from reporting.arrays import Float
 from reporting.json_file import JsonRecord
 from reporting.words import between, plus_minus, rounded, significant
 from twin_master.fleet.configuration import fleet_config
-from twin_master.fleet.outcomes import EarnedOutcomes, Estimated, Moments, Outcomes
+from twin_master.fleet.outcomes import Estimated, Moments, Outcomes
 from twin_master.fleet.reading import knowledge_of_scenario, notice_counts, open_groups
 from twin_master.fleet.storage.store import ENDED, FAILED, FLOWN, WITHIN, flown_rows
 from twin_master.fleet.storage.store_layout import row_blocks, stored_values
@@ -38,23 +38,51 @@ def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
 
 
 def earned_figures(group: "xr.DataTree") -> dict[str, Figure]:
-    """Return what the flights of a group earned, by title; empty for stores without rewards."""
+    """Return what the flights of a group earned, by title; empty for stores without rewards.
+
+    Figures are means over the flights with their standard errors. Flights that failed are left out.
+    Of a flight that ended early, the flown steps are counted.
+    """
     if "earned" not in group.children:
         return {}
     controls = list(group.attrs["controls"])
-    blocks = (partial(stored_values, group, rows=rows) for rows in row_blocks(group))
-    earned = EarnedOutcomes.from_blocks(blocks, len(controls))
-    figures: dict[str, Figure] = {
-        RETURN: earned.discounted_return,
-        "reward of a step": earned.reward,
+    of_controls = [f"steps with {control}" for control in controls]
+    moments = {
+        key: Moments()
+        for key in (
+            RETURN,
+            "reward of a step",
+            *of_controls,
+            "steps beyond the limit",
+            "needless steps",
+            "steps beyond a health limit",
+            "changes of control",
+        )
     }
-    for control, share in zip(controls, earned.control_share, strict=True):
-        figures[f"steps with {control}"] = share
-    figures["steps beyond the limit"] = earned.beyond_limit
-    figures["needless steps"] = earned.needless
-    figures["steps beyond a health limit"] = earned.beyond_health_limit
-    figures["changes of control"] = earned.changes
-    return figures
+    for block in row_blocks(group):
+        rows = flown_rows(stored_values(group, "status", block))
+        control = stored_values(group, "observed/control_index", block)[rows]
+        is_flown = control >= 0
+        steps_flown = np.maximum(is_flown.sum(axis=1), 1)
+        earned = {
+            name: stored_values(group, f"earned/{name}", block)[rows]
+            for name in ("return", "reward", "beyond_limit", "needless", "health")
+        }
+        # A column for each step; those that were not flown are NaN.
+        values_of_steps = {
+            "reward of a step": earned["reward"],
+            "steps beyond the limit": earned["beyond_limit"],
+            "needless steps": earned["needless"],
+            "steps beyond a health limit": earned["health"] < 0.0,
+        }
+        for index, key in enumerate(of_controls):
+            values_of_steps[key] = control == index
+        moments[RETURN].add(earned["return"])
+        for key, values in values_of_steps.items():
+            moments[key].add(np.nansum(values, axis=1, dtype=np.float64) / steps_flown)
+        is_change = (np.diff(control, axis=1) != 0) & is_flown[:, 1:]
+        moments["changes of control"].add(is_change.sum(axis=1).astype(np.float64))
+    return {key: moments_of_key.mean for key, moments_of_key in moments.items()}
 
 
 def group_figures(group: "xr.DataTree") -> dict[str, Figure]:

@@ -13,6 +13,15 @@ from numpy.typing import NDArray
 from reporting.arrays import AnyArray, Float
 from twin_master.fleet.storage.store import WITHIN, flown_rows
 
+_PATHS_OF_OUTCOMES = (
+    "delay",
+    "early",
+    "credible",
+    "filtered/mean",
+    "filtered/log_evidence",
+    "truth/state",
+)
+"""The variables of the store from which outcomes follow."""
 StoredRows = Callable[[str], AnyArray]
 """Returns a variable of a group of the store by its path, with a row for each twin of a block."""
 
@@ -158,128 +167,41 @@ class Outcomes:
         blocks : iterator of callable
             The variables of successive blocks of twins; at least one.
         """
-        sums = _OutcomeSums()
-        for block in blocks:
-            sums.add(block)
-        return cls(
-            prompt_fallbacks=sums.prompt_fallbacks.estimate,
-            early_fallbacks=sums.early_fallbacks.estimate,
-            rms=tuple(moments.root for moments in sums.mean_squares),
-            bias=tuple(moments.mean for moments in sums.mean_errors),
-            log_evidence=sums.log_evidence.mean,
-            credible_coverage=sums.credible.mean,
-        )
-
-
-@dataclass(frozen=True)
-class EarnedOutcomes:
-    """What N flights with U controls earned: means over the flights with their standard errors.
-
-    Attributes
-    ----------
-    discounted_return : Estimated
-        The sum of the rewards of a flight, discounted.
-    reward : Estimated
-        The reward of a step.
-    control_share : tuple of Estimated
-        For each control, the fraction of the steps that are flown with it.
-    beyond_limit, needless : Estimated
-        The fraction of the steps whose control is harder, or gentler, than the best control of the
-        state.
-    beyond_health_limit : Estimated
-        The fraction of the steps beyond a health limit.
-    changes : Estimated
-        The number of changes of the control in a flight.
-    """
-
-    discounted_return: Estimated
-    reward: Estimated
-    control_share: tuple[Estimated, ...]
-    beyond_limit: Estimated
-    needless: Estimated
-    beyond_health_limit: Estimated
-    changes: Estimated
-
-    @classmethod
-    def from_blocks(cls, blocks: Iterator[StoredRows], controls: int) -> "EarnedOutcomes":
-        """Return what all flights earned, block by block, for a number of controls.
-
-        Flights that failed are left out. Of a flight that ended early, the flown steps are counted.
-        """
-        returns, reward, beyond_limit, needless, beyond_health_limit, changes = (
-            Moments() for _ in range(6)
-        )
-        control_share = [Moments() for _ in range(controls)]
+        prompt_fallbacks = Fraction()
+        early_fallbacks = Fraction()
+        log_evidence = Moments()
+        credible = Moments()
+        mean_squares: list[Moments] = []  # of each factor
+        mean_errors: list[Moments] = []
         for block in blocks:
             rows_flown = flown_rows(np.asarray(block("status")))
-            control = np.asarray(block("observed/control_index"))[rows_flown]
-            is_flown = control >= 0
-            steps_flown = np.maximum(is_flown.sum(axis=1), 1)
+            values = {
+                path: np.asarray(block(path))[rows_flown].astype(np.float64)
+                for path in _PATHS_OF_OUTCOMES
+            }
+            delay = values["delay"]
+            delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for none
+            prompt_fallbacks.add(delays_when_called_for <= WITHIN)
+            early = values["early"]  # 1: early, 0: not early, -1: not defined
+            early_fallbacks.add(early[early >= 0.0] > 0.0)
+            log_evidence.add(np.nanmean(values["filtered/log_evidence"], axis=1))
+            credible.add(values["credible"])
 
-            def mean_of_steps(values: AnyArray, steps_flown: AnyArray = steps_flown) -> Float:
-                """Return the mean over the flown steps of each flight; others have NaN."""
-                return np.asarray(np.nansum(values, axis=1, dtype=np.float64) / steps_flown)
-
-            def stored(name: str, block: StoredRows = block, rows: AnyArray = rows_flown) -> Float:
-                return np.asarray(block(f"earned/{name}"))[rows]
-
-            returns.add(stored("return"))
-            reward.add(mean_of_steps(stored("reward")))
-            beyond_limit.add(mean_of_steps(stored("beyond_limit")))
-            needless.add(mean_of_steps(stored("needless")))
-            beyond_health_limit.add(mean_of_steps(stored("health") < 0.0))
-            for index, share in enumerate(control_share):
-                share.add(mean_of_steps(control == index))
-            is_change = (np.diff(control, axis=1) != 0) & is_flown[:, 1:]
-            changes.add(is_change.sum(axis=1).astype(np.float64))
+            # Means over the flown steps of each mission: (B, T, F) becomes (F, B).
+            error = np.ma.masked_invalid(values["filtered/mean"] - values["truth/state"])
+            mean_square = (error**2).mean(axis=1).filled(np.nan).T
+            mean_error = error.mean(axis=1).filled(np.nan).T
+            if not mean_errors:
+                mean_squares = [Moments() for _ in mean_square]
+                mean_errors = [Moments() for _ in mean_error]
+            for factor, squares in enumerate(mean_squares):
+                squares.add(mean_square[factor])
+                mean_errors[factor].add(mean_error[factor])
         return cls(
-            discounted_return=returns.mean,
-            reward=reward.mean,
-            control_share=tuple(share.mean for share in control_share),
-            beyond_limit=beyond_limit.mean,
-            needless=needless.mean,
-            beyond_health_limit=beyond_health_limit.mean,
-            changes=changes.mean,
+            prompt_fallbacks=prompt_fallbacks.estimate,
+            early_fallbacks=early_fallbacks.estimate,
+            rms=tuple(moments.root for moments in mean_squares),
+            bias=tuple(moments.mean for moments in mean_errors),
+            log_evidence=log_evidence.mean,
+            credible_coverage=credible.mean,
         )
-
-
-class _OutcomeSums:
-    """The sums from which the outcomes of missions follow."""
-
-    def __init__(self) -> None:
-        self.prompt_fallbacks = Fraction()
-        self.early_fallbacks = Fraction()
-        self.mean_squares: list[Moments] = []
-        self.mean_errors: list[Moments] = []
-        self.log_evidence = Moments()
-        self.credible = Moments()
-
-    def add(self, block: StoredRows) -> None:
-        """Add the twins of a block that have flown."""
-        rows_flown = flown_rows(np.asarray(block("status")))
-
-        def values(path: str) -> Float:
-            return np.asarray(block(path))[rows_flown].astype(np.float64)
-
-        delay = values("delay")
-        delays_when_called_for = delay[~np.isnan(delay)]  # NaN: the damage called for no fallback
-        self.prompt_fallbacks.add(delays_when_called_for <= WITHIN)
-        early = values("early")  # 1: early, 0: not early, -1: not defined
-        self.early_fallbacks.add(early[early >= 0.0] > 0.0)
-        error = np.ma.masked_invalid(
-            values("filtered/mean") - values("truth/state")
-        )  # masked: steps not flown
-        if not self.mean_errors:
-            factor_count = error.shape[-1]
-            self.mean_squares = [Moments() for _ in range(factor_count)]
-            self.mean_errors = [Moments() for _ in range(factor_count)]
-        # Means over the steps of each mission: (B, T, F) becomes (F, B).
-        mean_square = (error**2).mean(axis=1).filled(np.nan).T
-        mean_error = error.mean(axis=1).filled(np.nan).T
-        for factor, (squares, errors) in enumerate(
-            zip(self.mean_squares, self.mean_errors, strict=True)
-        ):
-            squares.add(mean_square[factor])
-            errors.add(mean_error[factor])
-        self.log_evidence.add(np.nanmean(values("filtered/log_evidence"), axis=1))
-        self.credible.add(values("credible"))

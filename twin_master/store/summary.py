@@ -273,28 +273,16 @@ def summarise(
         promise = promise_of_return(result.knowledge)
         references = {entry.figure: entry for entry in promise} | references
     for group in groups:
-        for (key, title, unit), value in zip(_schema_of(group), group.values, strict=True):
+        texts = FIGURES[group.name]
+        for (key_template, (title, unit)), value in zip(texts.items(), group.values, strict=True):
+            key = key_template.format(**group.fields)
+            title = title.format(**group.fields)
+            unit = unit.format(**group.fields)
             reference = references.get(key)
             if reference is None:
                 yield Figure(key, title, value, unit)
             else:
                 yield Figure(key, title, value, unit, reference.value, reference.source)
-
-
-class _FigureSchema(NamedTuple):
-    """Key, title and unit of a figure."""
-
-    key: str
-    title: str
-    unit: str
-
-
-def _schema_of(group: FigureGroup) -> Iterator[_FigureSchema]:
-    """Yield the schema of each figure of a group, with its fields filled in."""
-    for key, (title, unit) in FIGURES[group.name].items():
-        yield _FigureSchema(
-            key.format(**group.fields), title.format(**group.fields), unit.format(**group.fields)
-        )
 
 
 def _reward_figures(reward_mean: Float, step_name: str) -> Iterator[FigureGroup]:
