@@ -22,31 +22,11 @@ if TYPE_CHECKING:
     from twin_master.mission.preparation import Knowledge
     from twin_master.mission.sensor_design import SensorDesign
     from twin_master.network.belief_planning import BeliefPlan
-    from twin_master.network.decision_problem import DecisionProblem
     from twin_master.scenario.schema import Scenario
 
 
 Record: TypeAlias = "JsonObject"
 """The result of a command, as it is printed as JSON."""
-
-
-@dataclass(frozen=True)
-class _PlannedMission:
-    """A plan on the belief, and what it brings.
-
-    Attributes
-    ----------
-    problem : DecisionProblem
-        The decision problem.
-    plan : BeliefPlan
-        The plan.
-    simulated : ComparedPolicy
-        Its returns in simulated missions.
-    """
-
-    problem: "DecisionProblem"
-    plan: "BeliefPlan"
-    simulated: "ComparedPolicy"
 
 
 def plan(
@@ -89,31 +69,31 @@ def plan(
     from twin_master.mission.planning import compare_simple_rules, encode_policy, share_beyond_limit
     from twin_master.report.planning import plan_figure
 
-    knowledge = _prepare(scenario, seed, calibration).knowledge
+    knowledge, _ = _prepare(scenario, seed, calibration)
     without_value_of = None
     if value_of is not None:
         without_value_of = _without_information(knowledge, [value_of])
-    planned = _plan_mission(knowledge)
+    belief_plan, simulated = _plan_mission(knowledge)
     if out is not None:
-        atomic_write_bytes(out, encode_policy(planned.plan.policy, knowledge.model))
+        atomic_write_bytes(out, encode_policy(belief_plan.policy, knowledge.model))
     if picture is not None:
-        write_picture(picture, plan_figure(planned.plan.policy, knowledge.model))
+        write_picture(picture, plan_figure(belief_plan.policy, knowledge.model))
     record: Record = {
-        "lower": planned.plan.lower,
-        "upper": planned.plan.upper,
-        "simulated": planned.simulated.mean,
-        "half_width": planned.simulated.half_width,
+        "lower": belief_plan.lower,
+        "upper": belief_plan.upper,
+        "simulated": simulated.mean,
+        "half_width": simulated.half_width,
         "beyond_limit": share_beyond_limit(
-            knowledge.scenario, planned.problem, knowledge.rewards, planned.plan.policy
+            knowledge.scenario, knowledge.problem, knowledge.rewards, belief_plan.policy
         ),
     }
-    rules = [planned.simulated]
+    rules = [simulated]
     if without_value_of is None:
-        rules += compare_simple_rules(knowledge.scenario, planned.problem)
+        rules += compare_simple_rules(knowledge.scenario, knowledge.problem)
     else:
-        simulated_without = _plan_mission(without_value_of).simulated
+        _, simulated_without = _plan_mission(without_value_of)
         rules.append(replace(simulated_without, name=f"planned without {value_of}"))
-        value = planned.simulated.beyond(simulated_without)
+        value = simulated.beyond(simulated_without)
         record["value"] = {"of": value_of, "mean": value.mean, "half_width": value.half_width}
     record["rules"] = {rule.name: [rule.mean, rule.half_width] for rule in rules}
     if json:
@@ -158,21 +138,13 @@ class _GaugePlaces:
     outlines: "list[Float]" = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """What the twin of a scenario knows before any plan on the belief, and where its gauges are."""
-
-    knowledge: "Knowledge"
-    places: _GaugePlaces
-
-
 def _prepare(
     scenario_name: str,
     seed: int | None,
     calibration: Path | None,
     candidates: str | None = None,
-) -> _Prepared:
-    """Return the knowledge of a scenario's twin, perhaps with further gauges.
+) -> "tuple[Knowledge, _GaugePlaces]":
+    """Return the knowledge of a scenario's twin, perhaps with further gauges, and where these are.
 
     Parameters
     ----------
@@ -198,17 +170,17 @@ def _prepare(
             scenario = add_candidate_gauges(scenario, candidates, Path(folder, "candidates"))
         source = believed_source(scenario)
         knowledge = prepare_without_folder(scenario, source, terminal.progress())
-        return _Prepared(knowledge, _find_gauges(scenario))
+        return knowledge, _find_gauges(scenario)
 
 
-def _plan_mission(knowledge: "Knowledge") -> _PlannedMission:
-    """Plan on the belief, and simulate the plan."""
+def _plan_mission(knowledge: "Knowledge") -> "tuple[BeliefPlan, ComparedPolicy]":
+    """Return a plan on the belief, and its returns in simulated missions."""
     from twin_master.mission.planning import plan_within_limit, simulate_policy
 
     scenario = knowledge.scenario
     problem = knowledge.problem
     plan = plan_within_limit(scenario, problem, knowledge.rewards).plan
-    return _PlannedMission(problem, plan, simulate_policy(scenario, problem, plan.policy))
+    return plan, simulate_policy(scenario, problem, plan.policy)
 
 
 _BLIND = 1e6
@@ -326,8 +298,7 @@ def design(
     """
     from twin_master.mission.sensor_design import choose_sensors, draw_readings, level_separations
 
-    prepared = _prepare(scenario, None, calibration, candidates)
-    knowledge = prepared.knowledge
+    knowledge, places = _prepare(scenario, None, calibration, candidates)
     titles = _sensor_titles(knowledge.scenario)
     candidate_titles = _candidate_titles(titles, among)
     candidate_indices = [titles.index(title) for title in candidate_titles]
@@ -348,9 +319,9 @@ def design(
     if worth:
         record["worth"] = _compare_returns(knowledge, chosen_titles, candidate_titles)
     if vtu is not None:
-        _write_vtu(vtu, prepared.places, choice)
+        _write_vtu(vtu, places, choice)
     if picture is not None:
-        _write_design_picture(picture, prepared.places, choice, chosen_titles)
+        _write_design_picture(picture, places, choice, chosen_titles)
     if json:
         terminal.print_json(record)
     else:
@@ -379,8 +350,8 @@ def _compare_returns(
     titles = _sensor_titles(knowledge.scenario)
     not_chosen = [title for title in titles if title not in chosen_sensors]
     no_candidates = [title for title in titles if title not in candidates]
-    with_chosen = _plan_mission(_without_information(knowledge, not_chosen)).simulated
-    with_all = _plan_mission(_without_information(knowledge, no_candidates)).simulated
+    _, with_chosen = _plan_mission(_without_information(knowledge, not_chosen))
+    _, with_all = _plan_mission(_without_information(knowledge, no_candidates))
     compared = {
         "chosen": with_chosen,
         "all": with_all,

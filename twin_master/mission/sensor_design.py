@@ -257,17 +257,9 @@ def _mean_information(readings: Sequence[DrawnReadings], sensors: Sequence[int])
     )
 
 
-class _RatedSet(NamedTuple):
-    """A set of sensors and its information in bits."""
-
-    information: float
-    sensors: list[int]
-
-
-def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> _RatedSet:
+def _best_set(readings: Sequence[DrawnReadings], sets: Sequence[list[int]]) -> list[int]:
     """Return the set of sensors with the most information, the first of equals."""
-    rated = [_RatedSet(_mean_information(readings, sensors), sensors) for sensors in sets]
-    return max(rated, key=lambda rated_set: rated_set.information)
+    return max(sets, key=lambda sensors: _mean_information(readings, sensors))
 
 
 def _add_greedily(
@@ -279,7 +271,7 @@ def _add_greedily(
         extended_sets = [
             [*chosen_sensors, sensor] for sensor in candidates if sensor not in chosen_sensors
         ]
-        chosen_sensors = _best_set(readings, extended_sets).sensors
+        chosen_sensors = _best_set(readings, extended_sets)
     return chosen_sensors
 
 
@@ -300,10 +292,11 @@ def _exchange(
                     [*chosen_sensors[:position], sensor, *chosen_sensors[position + 1 :]]
                 )
         best_set = _best_set(readings, exchanged_sets)
-        if best_set.information <= information + _LEAST_GAIN:
+        information_of_best = _mean_information(readings, best_set)
+        if information_of_best <= information + _LEAST_GAIN:
             break
-        information = best_set.information
-        chosen_sensors = best_set.sensors
+        information = information_of_best
+        chosen_sensors = best_set
     return chosen_sensors
 
 

@@ -340,11 +340,11 @@ class _FlownGroup:
                 f"no state of the twins explains what was observed in group {name}: nothing can be "
                 "learnt from it; check its model and its noise."
             )
-        counts = _counts(self.group, scenario.control_names)
+        alarmed, flown_controls = _counts(self.group, scenario.control_names)
         lessons: JsonObject = {
             "twins": growth.explained_count,
             "left_out": growth_evidence.twin_count - growth.explained_count,
-            "alarmed": counts.alarmed,
+            "alarmed": alarmed,
             "noise_factor": noise.summary,
         }
         if family.reason_fixed:
@@ -355,7 +355,7 @@ class _FlownGroup:
                 "mean": population.mean.summary,
                 "spread": population.deviation.summary,
             }
-        return _GroupLessons(family, growth.grid, counts.followed_controls, lessons)
+        return _GroupLessons(family, growth.grid, flown_controls, lessons)
 
     @property
     def _draws(self) -> ParameterDraws:
@@ -467,23 +467,16 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
     return TransitionFamily.learnable(scenario)
 
 
-class _GroupCounts(NamedTuple):
-    """What is counted of the twins of a group beside what is learnt from them.
+def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> tuple[int, set[str]]:
+    """Count what is not learnt of the flown twins of a group, block by block.
 
-    Attributes
-    ----------
-    alarmed : int
-        The number of flown twins that raised an alarm.
-    followed_controls : set of str
-        The controls under which a flown twin has flown a step before its last one.
+    Returns
+    -------
+    int
+        The number of twins that raised an alarm.
+    set of str
+        The controls under which a twin has flown a step before its last one.
     """
-
-    alarmed: int
-    followed_controls: set[str]
-
-
-def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
-    """Count alarms and controls of the flown twins of a group, block by block."""
     alarmed = 0
     followed_controls: set[str] = set()
     for rows in row_blocks(group):
@@ -493,7 +486,7 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> _GroupCounts:
         is_followed = control[:, 1:] >= 0
         followed = np.unique(control[:, :-1][is_followed]).tolist()
         followed_controls |= {control_names[index] for index in followed}
-    return _GroupCounts(alarmed, followed_controls)
+    return alarmed, followed_controls
 
 
 def _rounds(twin_count: int, *, has_population: bool) -> list[int]:

@@ -58,7 +58,7 @@ def parameter_evidence(
         The log evidence; -inf if the observations of a twin are impossible.
     """
     parts = _twins_at_nodes(family, probability, model, observations, control)
-    return np.concatenate([part.log_evidence for part in parts])
+    return np.concatenate([log_evidence for _, log_evidence in parts])
 
 
 class TwinLikelihood(NamedTuple):
@@ -140,12 +140,13 @@ def likelihood_at_nodes(
     log_weights = []
     node_counts = []
     first_twin = 0
-    for part in _twins_at_nodes(family, probability, model, observations, control):
-        average = logsumexp(part.log_evidence, b=prior, axis=1, keepdims=True)
+    parts = _twins_at_nodes(family, probability, model, observations, control)
+    for log_density, log_evidence in parts:
+        average = logsumexp(log_evidence, b=prior, axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):  # NaN if the observations of a twin are impossible
-            is_probable = prior * np.exp(part.log_evidence - average) > LEAST_POSTERIOR
+            is_probable = prior * np.exp(log_evidence - average) > LEAST_POSTERIOR
         twin, node = np.nonzero(is_probable)
-        likelihood = scaled(part.log_density[twin, :, :, node])
+        likelihood = scaled(log_density[twin, :, :, node])
         values.append(likelihood.values)
         rows_of_nodes.append(first_twin + twin)
         log_weights.append(likelihood.log_scale + np.log(prior[node]))
@@ -161,31 +162,23 @@ def likelihood_at_nodes(
     )
 
 
-class _TwinsAtNodes(NamedTuple):
-    """What the observations of some twins say at each of E nodes.
-
-    Attributes
-    ----------
-    log_density : (B, T, S, E) array
-        log p(o_t | D_t, u_t, e).
-    log_evidence : (B, E) array
-        The log evidence of all steps.
-    """
-
-    log_density: Float
-    log_evidence: Float
-
-
 def _twins_at_nodes(
     family: TransitionFamily,
     probability: Float,
     model: GaussianSensorModel,
     observations: Float,
     control: Index,
-) -> Iterator[_TwinsAtNodes]:
-    """Yield densities and evidence at the nodes, some twins at a time, as many as memory allows.
+) -> Iterator[tuple[Float, Float]]:
+    """Yield what the observations say at each of E nodes, for as many twins as memory allows.
 
     The arguments are those of `parameter_evidence`.
+
+    Yields
+    ------
+    log_density : (B, T, S, E) array
+        log p(o_t | D_t, u_t, e) of B twins.
+    log_evidence : (B, E) array
+        The log evidence of all steps.
     """
     twin_count, step_count = control.shape
     entries = np.repeat(family.entries(probability[None]).T, model.draw_count, axis=1)
@@ -198,4 +191,4 @@ def _twins_at_nodes(
         log_density = log_density.reshape(-1, step_count, model.state_count, model.draw_count)
         evidence = np.empty((len(some_control), model.draw_count))
         evidence_in_lanes(family.prior, family.lists, entries, some_control, log_density, evidence)
-        yield _TwinsAtNodes(log_density, evidence)
+        yield log_density, evidence

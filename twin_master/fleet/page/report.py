@@ -9,7 +9,6 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -303,13 +302,6 @@ def _add_map(page: Page, scenario: Scenario, mean: Float, failed: int, sample: s
     page.add_report_figure(WORDS.figure("map", figure, more=more))
 
 
-class _AttentionTable(NamedTuple):
-    """The columns after name and step of a table of assets, and the rows with all columns."""
-
-    columns: list[PageColumn]
-    rows: list[list[str]]
-
-
 def _add_attention_table(
     page: Page, urgent: AssetStates, asset_count: int, *, has_alarms: bool
 ) -> None:
@@ -324,44 +316,36 @@ def _add_attention_table(
             f"{mission.prediction_steps} {mission.step_name}s."
         )
         return
-    table = _attention_table(urgent, has_alarms=has_alarms)
+    factors = printed_factors(urgent.scenario)
+    columns = [number_column(factor.title, factor.unit) for factor in factors]
+    columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
+    if has_alarms:
+        columns.append(number_column("alarms"))
+    percentage = urgent.leaving_percentage
+    rows = []
+    for number, name in enumerate(urgent.names):
+        is_leaving_known = not np.isnan(urgent.leaving_probability[number])
+        row = [
+            name,
+            str(urgent.step[number]),
+            *_state_cells(urgent, factors, number),
+            urgent.control[number],
+            f"{percentage[number]:.0f}" if is_leaving_known else "",
+        ]
+        if has_alarms:
+            row.append(str(urgent.alarms[number] or ""))
+        rows.append(row)
     WORDS.add_table(
         page,
         "next",
-        table.rows,
-        more=table.columns,
-        shown=len(table.rows),
+        rows,
+        more=columns,
+        shown=len(rows),
         assets=counted(asset_count, "asset"),
         alarms="alarms, then by " if has_alarms else "",
         steps=f"{mission.prediction_steps} {mission.step_name}s",
         step=mission.step_name,
     )
-
-
-def _attention_table(states: AssetStates, *, has_alarms: bool) -> _AttentionTable:
-    """Return the table of some assets, in their order."""
-    factors = printed_factors(states.scenario)
-    columns = []
-    for factor in factors:
-        columns.append(number_column(factor.title, factor.unit))
-    columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
-    if has_alarms:
-        columns.append(number_column("alarms"))
-    percentage = states.leaving_percentage
-    rows = []
-    for number in range(len(states.names)):
-        is_leaving_known = not np.isnan(states.leaving_probability[number])
-        row = [
-            states.names[number],
-            str(states.step[number]),
-            *_state_cells(states, factors, number),
-            states.control[number],
-            f"{percentage[number]:.0f}" if is_leaving_known else "",
-        ]
-        if has_alarms:
-            row.append(str(states.alarms[number] or ""))
-        rows.append(row)
-    return _AttentionTable(columns, rows)
 
 
 def _state_cells(states: AssetStates, factors: Sequence[PrintedFactor], number: int) -> list[str]:
