@@ -343,15 +343,13 @@ def print_outcome(outcome: "RunOutcome") -> None:
 
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    for figure, printed_figure in zip(
-        outcome.figures, printed_figures(outcome.figures), strict=True
-    ):
-        reference = printed_figure.reference
+    texts = printed_figures(outcome.figures)
+    for figure, (value, reference) in zip(outcome.figures, texts, strict=True):
         if reference and not isinstance(figure.reference, str):  # a text has its unit in it
             reference = f"{reference} {figure.unit}".strip()
         if figure.reference_source:
             reference += f" ({numbers_of_sources[figure.reference_source]})"
-        value = "none" if figure.value is None else f"{printed_figure.value} {figure.unit}".strip()
+        value = "none" if figure.value is None else f"{value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
     terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
     terminal.say(f"The twin {outcome.control}.")

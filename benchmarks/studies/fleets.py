@@ -75,7 +75,7 @@ def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     control = flown.control_index
     rows = flown.observation_rows.reshape(control.size, -1)
     log_likelihood_of_states = known.sensor_model.log_likelihood_sequence(rows, control.ravel())
-    likelihood = scaled(log_likelihood_of_states.reshape(flown.filtered.shape)).values
+    likelihood, _ = scaled(log_likelihood_of_states.reshape(flown.filtered.shape))
 
     def log_likelihood(axes: Axes) -> Float:
         probabilities = tuple(logistic(axis) for axis in axes)

@@ -241,25 +241,17 @@ def _note_slow_flights(fleet: Fleet, progress: Progress) -> None:
         )
 
 
-class Endings(NamedTuple):
-    """Reasons of flights that ended before the end of the mission, by GROUP/NAME of the twin.
+def endings_of(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Return why flights of a fleet ended before the end of the mission, by GROUP/NAME of the twin.
 
-    Attributes
-    ----------
+    The reasons are read from the journal or, if the folder has no journal, from `fleet.json`.
+
+    Returns
+    -------
     failures : dict of str to str
         The errors of flights that failed.
     ended : dict of str to str
         The reasons of assets that ended their simulations early.
-    """
-
-    failures: dict[str, str]
-    ended: dict[str, str]
-
-
-def endings_of(folder: Path) -> Endings:
-    """Return the reasons of flights of a fleet that ended early.
-
-    They are read from the journal or, if the folder has no journal, from `fleet.json`.
     """
     journal = folder / JOURNAL_NAME
     result = folder / RESULT_NAME
@@ -272,7 +264,7 @@ def endings_of(folder: Path) -> Endings:
     for record in content:
         failures |= record["failures"]
         early_ends |= record["ended"]
-    return Endings(dict(sorted(failures.items())), dict(sorted(early_ends.items())))
+    return dict(sorted(failures.items())), dict(sorted(early_ends.items()))
 
 
 def prepare_kit(

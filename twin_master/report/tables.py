@@ -66,11 +66,11 @@ def add_figures_table(page: Page, run: Run) -> None:
         # a reference may be a text, such as "at most 2 steps", which has to wrap
         columns += [PageColumn("reference"), PageColumn("source of the reference")]
     rows = []
-    for figure, printed_figure in zip(figures, printed_figures(figures), strict=True):
+    for figure, (value, reference) in zip(figures, printed_figures(figures), strict=True):
         # Only numbers are rounded for print: title and unit are those of the summary.
-        row = [figure.title, printed_figure.value, figure.unit]
+        row = [figure.title, value, figure.unit]
         if has_references:
-            row += [printed_figure.reference, figure.reference_source]
+            row += [reference, figure.reference_source]
         rows.append(row)
     references = ", beside their references" if has_references else ""
     _add_table(page, "figures", columns, rows, references=references)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
@@ -198,15 +198,8 @@ def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int
     }
 
 
-class PrintedFigure(NamedTuple):
-    """The value of a figure and its reference as texts; the latter is empty without a reference."""
-
-    value: str
-    reference: str
-
-
-def printed_figures(figures: Sequence[Figure]) -> list[PrintedFigure]:
-    """Return the printed values of the figures of a mission.
+def printed_figures(figures: Sequence[Figure]) -> list[tuple[str, str]]:
+    """Return value and reference of each figure as texts; the latter is empty without a reference.
 
     A number has three significant digits. A mean whose standard deviation is a figure, too, has the
     decimals of that deviation, so that both can be compared.
@@ -225,7 +218,7 @@ def printed_figures(figures: Sequence[Figure]) -> list[PrintedFigure]:
         reference = ""
         if figure.reference is not None:
             reference = _printed_number(figure.reference, deviation)
-        figures_in_text.append(PrintedFigure(_printed_number(figure.value, deviation), reference))
+        figures_in_text.append((_printed_number(figure.value, deviation), reference))
     return figures_in_text
 
 
@@ -280,8 +273,9 @@ class RunOutcome:
     def _repr_html_(self) -> str:
         """Return the figures of the run with their reference values, for a notebook."""
         rows = []
-        for figure, printed_figure in zip(self.figures, printed_figures(self.figures), strict=True):
-            rows.append([figure.title, printed_figure.value, figure.unit, printed_figure.reference])
+        texts = printed_figures(self.figures)
+        for figure, (value, reference) in zip(self.figures, texts, strict=True):
+            rows.append([figure.title, value, figure.unit, reference])
         headings = ("result", "this run", "unit", "reference")
         return html_table(f"Run in {self.folder}", headings, rows, self.notices)
 

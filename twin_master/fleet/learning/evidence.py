@@ -204,25 +204,23 @@ def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: Predecesso
     return np.repeat(np.array(index_of_rows), entries_of_rows)
 
 
-class ScaledLikelihood(NamedTuple):
-    """The likelihood of the states given the observations of B twins in T steps.
+def scaled(log_likelihood: Float) -> tuple[Float, Float]:
+    """Return the likelihood of the states of B twins in T steps, over the largest of each step.
 
-    Attributes
+    Parameters
     ----------
+    log_likelihood : (B, ..., T, S) array
+        log p(o_t | D_t, u_t).
+
+    Returns
+    -------
     values : (B, ..., T, S) array
         p(o_t | D_t, u_t) divided by its largest value over the S states, for each step t.
     log_scale : (B, ...) array
         The sum over the steps of the logarithms of these largest values.
     """
-
-    values: Float
-    log_scale: Float
-
-
-def scaled(log_likelihood: Float) -> ScaledLikelihood:
-    """Return likelihoods (..., T, S) over the largest of each step, from their logarithms."""
     largest = log_likelihood.max(axis=-1, keepdims=True)
-    return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(-2, -1)))
+    return np.exp(log_likelihood - largest), largest.sum(axis=(-2, -1))
 
 
 def transition_evidence(

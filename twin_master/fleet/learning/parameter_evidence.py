@@ -146,10 +146,10 @@ def likelihood_at_nodes(
         with np.errstate(invalid="ignore"):  # NaN if the observations of a twin are impossible
             is_probable = prior * np.exp(log_evidence - average) > LEAST_POSTERIOR
         twin, node = np.nonzero(is_probable)
-        likelihood = scaled(log_density[twin, :, :, node])
-        values.append(likelihood.values)
+        likelihood, log_scale = scaled(log_density[twin, :, :, node])
+        values.append(likelihood)
         rows_of_nodes.append(first_twin + twin)
-        log_weights.append(likelihood.log_scale + np.log(prior[node]))
+        log_weights.append(log_scale + np.log(prior[node]))
         node_counts.append(is_probable.sum(axis=1))
         first_twin += len(is_probable)
     count = np.concatenate(node_counts)

@@ -117,7 +117,7 @@ def _add_flown_fleet(
     ]
     page.add_paragraph(_opening(overviews))
     asset_count = sum(overview.twin_count for overview in overviews)
-    failures = endings_of(folder).failures
+    failures, _ = endings_of(folder)
     if failures:
         page.add_notice(
             f"{len(failures)} of {asset_count} assets failed in flight; their twins end there."
