@@ -135,7 +135,7 @@ def _do_nothing() -> None:
     """Do nothing; the default for `poll`."""
 
 
-def _is_always_wanted() -> bool:
+def is_always_wanted() -> bool:
     """Return True; the default for `is_wanted`, with which a server runs until interrupted."""
     return True
 
@@ -204,7 +204,7 @@ def serve(
     folder: Path,
     port: int,
     on_ready: Callable[[str], None],
-    is_wanted: Callable[[], bool] = _is_always_wanted,
+    is_wanted: Callable[[], bool] = is_always_wanted,
 ) -> None:
     """Show the flight of a run folder to browsers of this machine.
 

@@ -12,7 +12,12 @@ from twin_master.fleet.page.report import fleet_page
 from twin_master.fleet.watched.watched_asset import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.run_folder import find_config
-from twin_master.viewer.server import ServedText, package_text, serve_texts
+from twin_master.viewer.server import (
+    ServedText,
+    is_always_wanted,
+    package_text,
+    serve_texts,
+)
 
 ATTENTION_ROWS = 50
 """Rows of the table of assets that need attention next, in the browser."""
@@ -23,16 +28,11 @@ def is_fleet(folder: Path) -> bool:
     return find_config(folder, KIND, WATCHED_KIND) is not None
 
 
-def _always() -> bool:
-    """Return True, so that a page is served until the process ends."""
-    return True
-
-
 def serve_fleet(
     folder: Path,
     port: int,
     ready: Callable[[str], None],
-    is_wanted: Callable[[], bool] = _always,
+    is_wanted: Callable[[], bool] = is_always_wanted,
 ) -> None:
     """Serve the report of a fleet to browsers on this machine, and renew it when files change.
 
