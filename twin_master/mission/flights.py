@@ -253,7 +253,7 @@ def fly_formation(knowledge: Knowledge, plant: Plant, source: Source["TwinsSideB
         The source of the observations: the plant, or what changes its readings.
     """
     flights = Flights.empty(knowledge, len(plant.is_flying))
-    flights.is_flying = plant.is_flying  # a twin that fails stops its asset, and the reverse
+    flights.is_flying = plant.is_flying  # one array: a twin that fails stops its asset as well
     twins = TwinsSideBySide(knowledge.scenario, knowledge.twin(), flights)
     for _ in operate(twins, source, flights.store_step):
         pass

@@ -340,7 +340,7 @@ class Plant(Source[FlownTwins]):
     step : int
         The number of steps flown.
     is_flying : (...) array of bool
-        Which missions have not ended. Who notes the failure of a twin elsewhere clears its entry.
+        Which missions have not ended; clearing an entry stops the asset of a twin that failed.
     endings : dict of int to str
         How missions ended before their last step, by the number of the mission.
     failures : dict of int to str
