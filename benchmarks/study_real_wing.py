@@ -17,7 +17,7 @@ from rich.table import Table
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.hypotheses import named_effects
 from discrepancy.sources.measured_rigs import write_rig_campaign
 from discrepancy.sources.real_wing import SIGNAL
 from discrepancy.system.wing_model import WingModel

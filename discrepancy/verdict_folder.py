@@ -8,7 +8,7 @@ from pathlib import Path
 
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.hypotheses import named_effects
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from discrepancy.document import Origin, document_schema, write_document
-from discrepancy.judgement.conclusion import hypothesis_record
+from discrepancy.judgement.hypotheses import hypothesis_record
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import Hypothesis
 from reporting.format_schema import JsonSchema

@@ -27,9 +27,9 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import time_step_error
 from discrepancy.fits.predictive import fit_held_out, residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.conclusion import calibrated_parameters
+from discrepancy.judgement.decide import comparison_of, reach_verdict
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
-from discrepancy.judgement.naming import reach_verdict
+from discrepancy.judgement.hypotheses import calibrated_parameters
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import errors_of_fit, prove_effects
 from discrepancy.judgement.remarks import (
@@ -249,7 +249,7 @@ def investigate(
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
-            experiments = next_experiments(problem, open_hypotheses(search))
+            experiments = next_experiments(problem, comparison_of(search).open_hypotheses())
     verdict = replace(
         verdict,
         sentence=sentence_with_times(verdict, windows),
@@ -428,14 +428,6 @@ def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
     """Return for which channels (C,) of a trial the campaign accepts readings like outliers."""
     word = FaultKind.OUTLIERS.value
     return np.array([word in campaign.accepted_faults(name, trial.name) for name in trial.channels])
-
-
-def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
-    """Return the most probable sets of effects: the best fit and the probability of each."""
-    ranked = list(search.set_probabilities().items())[:count]
-    return [
-        (search.best_fit_of_set(identifiers), probability) for identifiers, probability in ranked
-    ]
 
 
 def patch_draws(

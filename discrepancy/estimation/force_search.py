@@ -459,20 +459,33 @@ class ForceSearch:
         point : Point
             The values of all unknowns of the fit.
         """
-        base = self.estimate_without_effects
+        explained = self.estimate_along_simulation(candidate, point)
+        if explained is not None and explained.leaves_no_force:
+            return explained
+        return self.estimate_effects(self.estimate_without_effects, candidate, point.effect)
+
+    def estimate_along_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
+        """Return the estimate of a hypothesis along its simulated motion, with small forces.
+
+        The result is None if the laws are not possible.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            The effects of the hypothesis, each at its place.
+        point : Point
+            The values of all unknowns, as a simulation was fitted to the readings.
+        """
         trials = self.trial_set.trials_about(point)
         estimator = self.estimator(trials)
         start = replace(
-            start_in_other_trials(base, trials),
+            start_in_other_trials(self.estimate_without_effects, trials),
             effect=point.effect,
             shared=point.shared,
             local=tuple(point.local[number] for number in self.trial_indices),
             processes=estimator.small_processes,
         )
-        explained = estimator.estimate_along_laws(self.laws(candidate, trials), start)
-        if explained is not None and explained.leaves_no_force:
-            return explained
-        return self.estimate_effects(base, candidate, point.effect)
+        return estimator.follow_laws(self.laws(candidate, trials), start)
 
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes

@@ -1,14 +1,13 @@
-"""Comparison of hypotheses if the residuals of none of them are noise alone.
+"""Comparison of the hypotheses of a search: evidence, explained share of the gap, objections.
 
-Hypotheses are then compared by simulations under a noise that is wider than recorded, or by how
-well their force agrees with the *missing force*, which is estimated from the readings without any
-law. In both cases each hypothesis has evidence, and explains a share of the *gap* between the model
-and the readings, in fitted and in held-out trials. The comparison decides which hypotheses may be
-named in the verdict.
+Hypotheses on trials in motion are estimated with the force that they leave missing. Others are
+compared by simulations, under the recorded noise or under a noise as large as their residuals. In
+both cases each hypothesis has evidence, and explains a share of the *gap* between the model and the
+readings, in fitted and in held-out trials. `decide` draws the verdict from them.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Generic, TypeVar
 
@@ -16,11 +15,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.proof_record import ErrorComparison
+from discrepancy.search.fitted_candidates import probabilities_of_sets
 from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -28,7 +28,7 @@ from discrepancy.verdict import Gate
 from reporting.probabilities import probability_of_some
 
 from .closed_share import closed_share_text
-from .conclusion import ComparedHypothesis
+from .hypotheses import ComparedHypothesis
 from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
@@ -36,6 +36,8 @@ CONTRADICTING_SHARE = -0.1
 it."""
 
 HypothesisT = TypeVar("HypothesisT", bound=ComparedHypothesis)
+EffectSet = tuple[str, ...]
+"""The sorted identifiers of a set of effects."""
 EffectPlacePairs = frozenset[tuple[str, str]]
 """Pairs of an effect, or a family of effects, and its place."""
 
@@ -55,8 +57,6 @@ class Comparison(ABC, Generic[HypothesisT]):
         a hypothesis to be named.
     has_held_out : bool
         Whether there are trials that were not fitted.
-    judged_hypothesis : HypothesisT or None
-        The hypothesis that the verdict is about, if there is one.
     """
 
     least_low_end: float
@@ -65,7 +65,6 @@ class Comparison(ABC, Generic[HypothesisT]):
         self.search = search
         self.problem = search.problem
         self.has_held_out = bool(self.problem.campaign.held_out)
-        self.judged_hypothesis: HypothesisT | None = None
         self._subsets: dict[CandidateKey, HypothesisT | None] = {}
         # the methods are cached, so that each result is computed once for a hypothesis
         self.gap_share = cache(self._compute_gap_share)
@@ -77,6 +76,11 @@ class Comparison(ABC, Generic[HypothesisT]):
     @abstractmethod
     def no_effect(self) -> HypothesisT:
         """The hypothesis without an effect."""
+
+    @property
+    @abstractmethod
+    def log_evidence_of_nothing(self) -> float:
+        """The log evidence of the model as it is, which lacks neither effect nor force [nat]."""
 
     @property
     @abstractmethod
@@ -108,12 +112,11 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return the fit of a single law with its shape free; None if that was not compared."""
 
     @abstractmethod
-    def start_point(self, hypothesis: HypothesisT) -> Point:
-        """Return the point from which the simulation of a hypothesis is fitted."""
+    def simulation_of_best_fit(self, hypothesis: HypothesisT) -> CandidateFit:
+        """Return the simulation of a hypothesis, fitted to the readings until it converges.
 
-    @abstractmethod
-    def check_fit(self, hypothesis: HypothesisT) -> Gate:
-        """Test whether the residuals of the simulation of a hypothesis are noise alone."""
+        It is the fit without effect if the hypothesis cannot be simulated.
+        """
 
     @abstractmethod
     def failed_check_reason(self, hypothesis: HypothesisT) -> str:
@@ -127,19 +130,73 @@ class Comparison(ABC, Generic[HypothesisT]):
     def unexplained_text(self, hypothesis: HypothesisT, share: GapShare) -> str:
         """Return in words how much of the gap a hypothesis does not explain."""
 
+    def subsets(self, hypothesis: HypothesisT) -> list[HypothesisT]:
+        """Return the hypotheses with some of the effects of a hypothesis, the fewest first."""
+        full_key = set(hypothesis.candidate.key)
+        subsets = []
+        for ranked_hypothesis in self.ranked_hypotheses:
+            key = set(ranked_hypothesis.candidate.key)
+            if key and key < full_key:
+                subsets.append(ranked_hypothesis)
+        return sorted(subsets, key=lambda subset: len(subset.candidate.terms))
+
     def score(self, hypothesis: HypothesisT) -> float:
         """Return ln (evidence times prior) of a hypothesis [nat]."""
         return hypothesis.log_evidence + self.search.log_prior(hypothesis.candidate)
 
-    def passes_absolute_fit(self, hypothesis: HypothesisT) -> bool:
-        """Return whether the residuals of a hypothesis agree with the noise records."""
-        simulation = self.search.exact_fits.get(hypothesis.candidate.key)
-        if simulation is None:
-            start = self.start_point(hypothesis)
-            simulation = try_fit(self.problem, hypothesis.candidate, start)
-        if simulation is None:
-            return False
-        return not check_absolute_fit(self.problem, simulation).has_failed
+    def log_bayes_factor(self, hypothesis: HypothesisT) -> float:
+        """Return ln of the evidence of a hypothesis over that of the model as it is [nat].
+
+        The evidence is divided by the number of places from which those of the effects were chosen.
+        """
+        setting = self.problem.setting
+        place_counts = [len(term.effect.places(setting)) for term in hypothesis.candidate.terms]
+        log_places = float(np.log(place_counts).sum()) if place_counts else 0.0
+        return hypothesis.log_evidence - log_places - self.log_evidence_of_nothing
+
+    def set_probabilities(self) -> Mapping[EffectSet, float]:
+        """Return the probability of each set of effects over all places, in descending order."""
+        return probabilities_of_sets(self.ranked_hypotheses, self.score)
+
+    def best_of_set(self, identifiers: EffectSet) -> HypothesisT:
+        """Return the most probable hypothesis of a set of effects, whatever their places."""
+        return next(
+            hypothesis
+            for hypothesis in self.ranked_hypotheses
+            if hypothesis.candidate.identifiers == identifiers
+        )
+
+    def hypothesis_of(self, candidate: Candidate) -> HypothesisT | None:
+        """Return the hypothesis of a candidate; None if it was not compared."""
+        for hypothesis in self.ranked_hypotheses:
+            if hypothesis.candidate.key == candidate.key:
+                return hypothesis
+        return None
+
+    def open_hypotheses(self, count: int = 5) -> list[tuple[CandidateFit, float]]:
+        """Return the simulations of the most probable sets of effects, with their probabilities."""
+        probabilities = list(self.set_probabilities().items())[:count]
+        return [
+            (self.simulation_of_best_fit(self.best_of_set(identifiers)), probability)
+            for identifiers, probability in probabilities
+        ]
+
+    def absolute_fit(self, hypothesis: HypothesisT) -> Gate:
+        """Test whether the residuals of the simulation of a hypothesis are noise as recorded."""
+        return check_absolute_fit(self.problem, self.simulation_of_best_fit(hypothesis))
+
+    def fit_probable_sets(self) -> None:
+        """Fit the most probable sets until they converge, if the comparison has others."""
+
+    def admit_remainder(self) -> None:
+        """Compare the hypotheses with what each leaves unexplained, if they are not yet."""
+
+    def admit_no_remainder(self) -> None:
+        """Compare the hypotheses again as before `admit_remainder`."""
+
+    def record_values(self, hypothesis: HypothesisT) -> ComparedHypothesis:
+        """Return the hypothesis with the values that a verdict lists of it."""
+        return hypothesis
 
     def errors(self, hypothesis: HypothesisT) -> ErrorComparison:
         """Return the errors of simulations without and with a hypothesis.
@@ -292,9 +349,9 @@ class Comparison(ABC, Generic[HypothesisT]):
             term_indices, hypothesis.effect
         )
         key = candidate.key
-        for ranked_hypothesis in self.ranked_hypotheses:
-            if ranked_hypothesis.candidate.key == key:
-                return ranked_hypothesis
+        compared_hypothesis = self.hypothesis_of(candidate)
+        if compared_hypothesis is not None:
+            return compared_hypothesis
         if key not in self._subsets:
             self._subsets[key] = self.fit_candidate(candidate, effect_values)
         return self._subsets[key]
@@ -380,6 +437,15 @@ class Comparison(ABC, Generic[HypothesisT]):
             return True
         return self.has_held_out and not self._survives_held_out(hypothesis, 0.0)
 
+    def probability_of_family(self, family: str) -> float:
+        """Return the probability that one effect of a family, with any shape, is missing alone."""
+        scores = np.array([self.score(hypothesis) for hypothesis in self.ranked_hypotheses])
+        is_member = []
+        for hypothesis in self.ranked_hypotheses:
+            terms = hypothesis.candidate.terms
+            is_member.append(len(terms) == 1 and terms[0].effect.family == family)
+        return probability_of_some(scores, np.array(is_member))
+
     def competing_hypotheses(self, best_hypothesis: HypothesisT) -> list[HypothesisT]:
         """Return the hypotheses that could be named instead of the best one.
 
@@ -430,3 +496,16 @@ def _complexity(hypothesis: ComparedHypothesis) -> tuple[int, int]:
     """Return how many effects a hypothesis has, and how many of them have a free shape."""
     terms = hypothesis.candidate.terms
     return len(terms), sum(term.free_shape for term in terms)
+
+
+def most_probable_sets(probabilities: Mapping[EffectSet, float]) -> list[EffectSet]:
+    """Return the most probable sets whose probabilities add up to that which a name needs.
+
+    Parameters
+    ----------
+    probabilities : mapping of tuple of str to float
+        The probability of each set of effects, in descending order.
+    """
+    cumulative_probabilities = np.cumsum(list(probabilities.values()))
+    last_set = int(np.searchsorted(cumulative_probabilities, SEARCH.name_probability))
+    return list(probabilities)[: last_set + 1]

@@ -1,7 +1,4 @@
-"""Comparison of hypotheses by how well their force agrees with the missing force.
-
-The missing force is estimated from the readings without any law.
-"""
+"""Comparison of hypotheses that were estimated with the force that they leave missing."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,21 +9,20 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.estimation.estimate import Estimate
 from discrepancy.estimation.force_search import ForceSearch
-from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.gates import check_absolute_fit
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.missing_force.port_force import missing_force
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Gate
 
 from .comparison import Comparison
+from .hypotheses import ComparedHypothesis
 
 
 class ForceComparison(Comparison[Estimate]):
-    """A comparison of hypotheses by how well their force agrees with the missing force.
+    """A comparison of hypotheses by the force that they leave missing.
 
     Parameters
     ----------
@@ -46,8 +42,13 @@ class ForceComparison(Comparison[Estimate]):
 
     @property
     def no_effect(self) -> Estimate:
-        """The hypothesis of free missing forces without any law."""
-        return self.force_search.estimate_without_effects
+        """The hypothesis of free missing forces without any effect."""
+        return self.best_of_set(())
+
+    @property
+    def log_evidence_of_nothing(self) -> float:
+        """The log evidence of the model as it is, without a missing force [nat]."""
+        return self.no_effect.log_evidence_without_force
 
     @property
     def ranked_hypotheses(self) -> Sequence[Estimate]:
@@ -59,9 +60,9 @@ class ForceComparison(Comparison[Estimate]):
         return self._force_shares.gap_share(hypothesis, held_out=held_out)
 
     def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> Estimate | None:
-        """Return the fit of a further candidate, from scaled effect parameters (E,).
+        """Return the estimate of a further candidate, from scaled effect parameters (E,).
 
-        None if the candidate cannot be fitted.
+        None if the candidate is not possible.
         """
         return self.force_search.estimate_effects(
             self.force_search.estimate_without_effects, candidate, effect
@@ -70,40 +71,49 @@ class ForceComparison(Comparison[Estimate]):
     def fit_with_free_shape(self, hypothesis: Estimate) -> Estimate | None:
         """Return the hypothesis of a single law with its shape free; None if there is none."""
         (term,) = hypothesis.candidate.terms
-        key = Candidate((replace(term, free_shape=True),)).key
-        return next(
-            (
-                ranked_hypothesis
-                for ranked_hypothesis in self.ranked_hypotheses
-                if ranked_hypothesis.candidate.key == key
-            ),
-            None,
-        )
+        return self.hypothesis_of(Candidate((replace(term, free_shape=True),)))
 
-    def start_point(self, hypothesis: Estimate) -> Point:
-        """Return the values of all unknowns of a hypothesis as fitted to the missing force."""
-        return self.force_search.point(hypothesis)
+    def simulation_of_best_fit(self, hypothesis: Estimate) -> CandidateFit:
+        """Return the simulation of a hypothesis, fitted to the readings from its estimate.
+
+        It is the fit without effect if the hypothesis cannot be simulated.
+        """
+        candidate = hypothesis.candidate
+        if candidate.key not in self.search.exact_fits:
+            simulation = try_fit(self.problem, candidate, self.force_search.point(hypothesis))
+            if simulation is None:
+                return self.search.no_effect
+            self.search.record_fit(simulation, exact=True)
+        return self.search.exact_fits[candidate.key]
 
     def failed_check_reason(self, hypothesis: Estimate) -> str:
         """Return an empty reason, as there are no further tests with a missing force."""
         return ""
 
-    def check_fit(self, hypothesis: Estimate) -> Gate:
-        """Test whether the residuals of the best simulation are noise as in the noise records."""
-        return check_absolute_fit(self.problem, self.search.best())
-
     def _compute_simulation(self, hypothesis: Estimate) -> CandidateFit:
         """Return the simulation with the parameters of a hypothesis, and their covariance.
 
-        Only the trials' own unknowns are fitted. It is the fit without effect if the hypothesis
-        cannot be simulated.
+        If the hypothesis leaves no force, it is fitted to the readings. Else its force is not all
+        of the gap, and only the trials' own unknowns are fitted.
         """
-        start = self.start_point(hypothesis)
+        if hypothesis.leaves_no_force:
+            return self.simulation_of_best_fit(hypothesis)
+        start = self.force_search.point(hypothesis)
         try:
             simulation = fit(self.problem, hypothesis.candidate, start, local_only=True)
         except (DiscrepancyError, np.linalg.LinAlgError):
             return self.search.no_effect
         return replace(simulation, covariance=hypothesis.covariance)
+
+    def record_values(self, hypothesis: Estimate) -> ComparedHypothesis:
+        """Return the hypothesis with the values of its fit to the readings if it leaves no force.
+
+        The steps of the estimate integrate dry friction to first order only.
+        """
+        simulation = self.search.exact_fits.get(hypothesis.candidate.key)
+        if simulation is None or not hypothesis.leaves_no_force:
+            return hypothesis
+        return replace(simulation, log_evidence=hypothesis.log_evidence)
 
     def unexplained_text(self, hypothesis: Estimate, share: GapShare) -> str:
         """Return in words how much of the missing force a hypothesis does not explain."""

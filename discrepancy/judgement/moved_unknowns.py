@@ -17,7 +17,7 @@ from discrepancy.fits.trial_data import TrialData
 from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue
 from reporting.words import listing, plus_minus
 
-from .conclusion import calibrated_parameters
+from .hypotheses import calibrated_parameters
 from .sensor_estimates import sensor_estimates
 
 MOVED_DEVIATIONS = 2.0

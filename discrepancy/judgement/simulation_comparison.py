@@ -1,4 +1,7 @@
-"""Comparison of hypotheses by simulations, under a noise as large as the best one's residuals."""
+"""Comparison of hypotheses by simulations, under the recorded noise or a wider one.
+
+The wider noise is as large as the residuals of the best hypothesis, see `search.wide_noise`.
+"""
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -9,17 +12,20 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, CandidateKey, Point
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
-from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN
 from discrepancy.location.residuals import FittedTrial
 from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
 from discrepancy.missing_force.shares import LEAST_BLOCK_SAMPLES, MOST_BLOCKS
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
-from discrepancy.search.wide_noise import refit_under_wide_noise, unrecorded_noise_levels
+from discrepancy.search.wide_noise import (
+    compare_under_wide_noise,
+    refit_under_wide_noise,
+    unrecorded_noise_levels,
+)
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Gate
 
-from .comparison import Comparison
+from .comparison import Comparison, most_probable_sets
 from .consistency_gate import check_consistency
 from .proof import check_held_out
 
@@ -41,10 +47,7 @@ class _BlockSums(NamedTuple):
 
 
 class SimulationComparison(Comparison[CandidateFit]):
-    """A comparison of hypotheses by simulations that were fitted under the wider noise.
-
-    The wider noise is as large as the residuals of the best hypothesis, see `search.wide_noise`.
-    """
+    """A comparison of hypotheses by simulations that were fitted to the readings."""
 
     least_low_end = SEARCH.least_gap_share
 
@@ -54,8 +57,13 @@ class SimulationComparison(Comparison[CandidateFit]):
 
     @property
     def no_effect(self) -> CandidateFit:
-        """The model without an effect, under the wider noise."""
+        """The model without an effect."""
         return self.search.compared_no_effect
+
+    @property
+    def log_evidence_of_nothing(self) -> float:
+        """The log evidence of the model as it is [nat]."""
+        return self.no_effect.log_evidence
 
     @property
     def ranked_hypotheses(self) -> Sequence[CandidateFit]:
@@ -138,22 +146,57 @@ class SimulationComparison(Comparison[CandidateFit]):
             for block in np.array_split(np.arange(sample_count), block_count)
         ]
 
+    def subsets(self, hypothesis: CandidateFit) -> list[CandidateFit]:
+        """Return the fits with some of the effects of a hypothesis that converged."""
+        return [fit for fit in super().subsets(hypothesis) if fit.candidate.key in self._exact_fits]
+
+    @property
+    def _exact_fits(self) -> dict[CandidateKey, CandidateFit]:
+        """The fits that converged under the recorded noise."""
+        return self.search.exact_fits
+
     def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
-        It is that under the wider noise; None if the candidate cannot be fitted.
+        None if the candidate cannot be fitted.
         """
         no_effect = self.search.no_effect
-        exact_fit = self.search.exact_fits.get(candidate.key)
+        exact_fit = self._exact_fits.get(candidate.key)
         if exact_fit is None:
             start = Point(no_effect.point.shared, no_effect.point.local, effect)
             exact_fit = try_fit(self.problem, candidate, start)
-        return None if exact_fit is None else self._fit_under_wide_noise(exact_fit)
+        return None if exact_fit is None else self._fit_under_compared_noise(exact_fit)
 
-    def _fit_under_wide_noise(self, exact_fit: CandidateFit) -> CandidateFit | None:
-        """Return the fit of a hypothesis under the wider noise; None if it cannot be fitted."""
+    def _fit_under_compared_noise(self, exact_fit: CandidateFit) -> CandidateFit | None:
+        """Return a hypothesis fitted under the compared noise; None if it cannot be fitted."""
         wide_problem = self.search.wide_problem or self.problem
         return refit_under_wide_noise(self.problem, wide_problem, exact_fit)
+
+    def simulation_of_best_fit(self, hypothesis: CandidateFit) -> CandidateFit:
+        """Return the hypothesis, fitted until it converges."""
+        return self.search.fit_to_convergence(hypothesis)
+
+    def fit_probable_sets(self) -> None:
+        """Fit the most probable sets to convergence, as a fit by few steps is only approximate."""
+        for _ in range(SEARCH.largest_group):
+            converged_sets = {fit.candidate.identifiers for fit in self._exact_fits.values()}
+            rough_sets = [
+                identifiers
+                for identifiers in most_probable_sets(self.set_probabilities())
+                if identifiers not in converged_sets
+            ]
+            if not rough_sets:
+                break
+            self.search.fit_to_convergence(self.best_of_set(rough_sets[0]))
+
+    def admit_remainder(self) -> None:
+        """Compare the hypotheses under a noise as large as the residuals of the best one."""
+        compare_under_wide_noise(self.search)
+
+    def admit_no_remainder(self) -> None:
+        """Compare the hypotheses under the recorded noise again."""
+        self.search.wide_problem = None
+        self.search.wide_fits = {}
 
     def add_free_shape_families(self) -> None:
         """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
@@ -170,7 +213,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         for single_fit in self._single_laws_like(best_fit):
             free_shape_fit = fit_free_shape(self.problem, single_fit, 0)
             wide_free_shape_fit = (
-                None if free_shape_fit is None else self._fit_under_wide_noise(free_shape_fit)
+                None if free_shape_fit is None else self._fit_under_compared_noise(free_shape_fit)
             )
             if wide_free_shape_fit is None:
                 continue
@@ -206,14 +249,6 @@ class SimulationComparison(Comparison[CandidateFit]):
         if hypothesis.candidate.has_free_shape:
             return hypothesis
         return self._free_shape_fits.get(hypothesis.candidate.key)
-
-    def start_point(self, hypothesis: CandidateFit) -> Point:
-        """Return the values of all unknowns of a hypothesis, at which the simulation was fitted."""
-        return hypothesis.point
-
-    def check_fit(self, hypothesis: CandidateFit) -> Gate:
-        """Test whether the residuals of a hypothesis are noise as in the noise records."""
-        return check_absolute_fit(self.problem, hypothesis)
 
     def failed_check_reason(self, hypothesis: CandidateFit) -> str:
         """Return the reason why a hypothesis fails the test of consistency or of held-out trials.

@@ -17,7 +17,7 @@ from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
 from .closed_share import NOMINAL_UNIT, closed_share_text, rms_by_channel
-from .conclusion import VerdictOutcome, effects_text
+from .hypotheses import VerdictOutcome, effects_text
 from .proof import errors_of_fit
 from .remarks import KINDS_WITHOUT_GAP
 

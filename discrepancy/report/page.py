@@ -6,8 +6,8 @@ from math import isfinite, isnan
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.closed_share import percent_with_interval
-from discrepancy.judgement.conclusion import effects_text, named_effects, probability_text
 from discrepancy.judgement.curve_words import curve_in_words, curve_of, followed_variable
+from discrepancy.judgement.hypotheses import effects_text, named_effects, probability_text
 from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.location.locate import Location
 from discrepancy.report import tables, verdict_tables

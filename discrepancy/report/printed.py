@@ -7,7 +7,7 @@ from math import isfinite
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Effect
 from discrepancy.checks.fault import DataFault
-from discrepancy.judgement.conclusion import probability_text
+from discrepancy.judgement.hypotheses import probability_text
 from discrepancy.judgement.remarks import gap_times_sentence
 from discrepancy.judgement.separability import Separability
 from discrepancy.report import tables, verdict_tables

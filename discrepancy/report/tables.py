@@ -7,7 +7,7 @@ from discrepancy.campaign.records import Campaign, Channel, Trial
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import Origin
 from discrepancy.judgement.closed_share import NOMINAL_UNIT, percent_with_interval
-from discrepancy.judgement.conclusion import calibrated_parameters
+from discrepancy.judgement.hypotheses import calibrated_parameters
 from discrepancy.judgement.separability import Detectability, Separability
 from discrepancy.location.locate import Location
 from discrepancy.location.omnibus_tests import OmnibusTest

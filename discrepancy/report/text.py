@@ -71,7 +71,7 @@ def _effects_label(effects: Iterable[tuple[str, str, bool]]) -> str:
 def hypothesis_name(hypothesis: Hypothesis) -> str:
     """Return the effects of a hypothesis in words."""
     effects = [(effect.name, effect.place, bool(effect.shape)) for effect in hypothesis.effects]
-    return _effects_label(effects) or "nothing missing"
+    return _effects_label(effects) or "no effect"
 
 
 def added_label(investigation: Investigation) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from math import isnan
 
 from discrepancy.judgement.closed_share import closed_share_text
-from discrepancy.judgement.conclusion import effects_text, probability_text
+from discrepancy.judgement.hypotheses import effects_text, probability_text
 from discrepancy.proof_record import ErrorComparison, Proof, Scores
 from discrepancy.report.text import (
     NAMING,

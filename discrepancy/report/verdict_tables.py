@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import isfinite, isnan
 from typing import NamedTuple
 
-from discrepancy.judgement.conclusion import probability_text
+from discrepancy.judgement.hypotheses import probability_text
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import (
     NAMING,
@@ -272,7 +272,9 @@ def evidence_table(verdict: Verdict) -> TitledTable:
         )
     caption = (
         "The best hypotheses among those compared; ln B is the logarithm of the evidence over that "
-        "of nothing missing (for the best place of the effect, before prior probabilities)."
+        "of no effect (for the best place of the effect, before prior probabilities). In trials in "
+        "motion, a force of unknown cause may be missing beside each hypothesis, and beside no "
+        "effect."
     )
     return TitledTable(
         table_of_records(columns, _rank_hypotheses(verdict)),

@@ -1,6 +1,8 @@
 """The candidates that a search has fitted, with their scores and probabilities."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
 
 from scipy.special import logsumexp
 
@@ -16,6 +18,17 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.proof_record import ErrorComparison
 from discrepancy.search_settings import SEARCH
 from reporting.probabilities import normalised_probabilities
+
+
+class HasCandidate(Protocol):
+    """A hypothesis: a simulation (`CandidateFit`), or an estimate with the missing force."""
+
+    @property
+    def candidate(self) -> Candidate:
+        """The effects."""
+
+
+HypothesisT = TypeVar("HypothesisT", bound=HasCandidate)
 
 
 @dataclass
@@ -110,17 +123,7 @@ class FittedCandidates:
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
         """Return the probability of each set of effects over all places, in descending order."""
-        scores_by_set: dict[tuple[str, ...], list[float]] = {}
-        for fit in self.compared_fits().values():
-            scores_by_set.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
-        log_weights = {
-            identifiers: float(logsumexp(set_scores))
-            for identifiers, set_scores in scores_by_set.items()
-        }
-        sets_in_order = sorted(log_weights, key=lambda identifiers: -log_weights[identifiers])
-        log_weights_in_order = [log_weights[identifiers] for identifiers in sets_in_order]
-        probabilities = normalised_probabilities(log_weights_in_order).tolist()
-        return dict(zip(sets_in_order, probabilities, strict=True))
+        return probabilities_of_sets(self.compared_fits().values(), self.score)
 
     def record_fit(self, fit: CandidateFit, *, exact: bool) -> CandidateFit:
         """Store a fit unless an earlier fit of the same candidate has more evidence.
@@ -166,3 +169,29 @@ class FittedCandidates:
         converged_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
         # the rough fit may be at a point from which the model cannot be fitted further
         return self.record_fit(converged_fit or rough_fit, exact=True)
+
+
+def probabilities_of_sets(
+    hypotheses: Iterable[HypothesisT], score: Callable[[HypothesisT], float]
+) -> dict[tuple[str, ...], float]:
+    """Return the probability of each set of effects over all places, in descending order.
+
+    Parameters
+    ----------
+    hypotheses : iterable of CandidateFit or Estimate
+        The hypotheses that are compared.
+    score : callable
+        Returns ln (evidence times prior) of a hypothesis [nat].
+    """
+    scores_by_set: dict[tuple[str, ...], list[float]] = {}
+    for hypothesis in hypotheses:
+        identifiers = hypothesis.candidate.identifiers
+        scores_by_set.setdefault(identifiers, []).append(score(hypothesis))
+    log_weights = {
+        identifiers: float(logsumexp(set_scores))
+        for identifiers, set_scores in scores_by_set.items()
+    }
+    sets_in_order = sorted(log_weights, key=lambda identifiers: -log_weights[identifiers])
+    log_weights_in_order = [log_weights[identifiers] for identifiers in sets_in_order]
+    probabilities = normalised_probabilities(log_weights_in_order).tolist()
+    return dict(zip(sets_in_order, probabilities, strict=True))

@@ -10,10 +10,10 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.judgement.in_part import not_named_sentence
-from discrepancy.judgement.naming import reach_verdict
+from discrepancy.judgement.decide import reach_verdict
+from discrepancy.judgement.noise_verdict import NoiseCase, common_effects_verdict, undecided_verdict
+from discrepancy.judgement.remainder_verdict import not_named_sentence
 from discrepancy.judgement.remarks import look_alike_remark, verdict_with_untested_effects
-from discrepancy.judgement.rules import VerdictCase
 from discrepancy.judgement.simulation_comparison import SimulationComparison
 from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
 from discrepancy.search_settings import SEARCH
@@ -400,6 +400,11 @@ def friction_search(terms):
     return search
 
 
+def case_of(search, probabilities):
+    """Return the fits of a search with given probabilities of their sets."""
+    return NoiseCase(SimulationComparison(search), probabilities)
+
+
 def identifiers(terms, *names):
     """Return the identifiers of a set of terms, in the order of a candidate."""
     return Candidate(tuple(terms[name] for name in names)).identifiers
@@ -408,7 +413,7 @@ def identifiers(terms, *names):
 def test_what_all_probable_sets_hold_is_named(friction_search, terms):
     """Which further effect stands beside it stays open."""
     with_a_gain = identifiers(terms, "coulomb_friction", "gauge_gain")
-    outcome = VerdictCase(friction_search, {with_a_gain: 0.7, FRICTION_ALONE: 0.3}).common_effects_verdict()
+    outcome = common_effects_verdict(case_of(friction_search, {with_a_gain: 0.7, FRICTION_ALONE: 0.3}))
     verdict = outcome[0]
     assert verdict.kind is VerdictKind.NAMED
     assert [effect.identifier for effect in verdict.effects] == list(FRICTION_ALONE)
@@ -418,18 +423,18 @@ def test_what_all_probable_sets_hold_is_named(friction_search, terms):
 def test_what_does_not_fit_alone_is_not_named_though_all_probable_sets_hold_it(friction_search, terms):
     cell_and_gain = identifiers(terms, "load_cell", "gauge_gain")
     probabilities = {cell_and_gain: 0.6, ("load_cell",): 0.4}
-    assert VerdictCase(friction_search, probabilities).common_effects_verdict() is None
+    assert common_effects_verdict(case_of(friction_search, probabilities)) is None
 
 
 def test_nothing_is_named_where_the_model_without_effects_is_probable(friction_search):
-    assert VerdictCase(friction_search, {FRICTION_ALONE: 0.8, (): 0.2}).common_effects_verdict() is None
+    assert common_effects_verdict(case_of(friction_search, {FRICTION_ALONE: 0.8, (): 0.2})) is None
 
 
 @pytest.fixture(scope="module")
 def undecided(friction_search):
     """Verdict, search and nearest fit where most of the probability is that of a set that does not fit."""
     probabilities = {("load_cell",): 0.6, FRICTION_ALONE: 0.38, (): 0.02}
-    return VerdictCase(friction_search, probabilities).undecided_verdict()
+    return undecided_verdict(case_of(friction_search, probabilities))
 
 
 def test_what_does_not_fit_is_no_part_of_a_group(undecided):

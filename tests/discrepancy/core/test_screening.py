@@ -20,7 +20,7 @@ from discrepancy.fits.gates import (
 )
 from discrepancy.fits.predictive import importance_draws, residual_set, with_draws
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.hypotheses import named_effects
 from discrepancy.location.locate import locate
 from discrepancy.search.starts import best_pairs
 from discrepancy.search.wide_noise import estimate_residual_process, refit_under_wide_noise, with_wide_noise

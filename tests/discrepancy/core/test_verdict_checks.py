@@ -13,7 +13,7 @@ from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.judgement.closed_share import percent_with_interval, rms_errors_text
-from discrepancy.judgement.conclusion import VerdictOutcome
+from discrepancy.judgement.hypotheses import VerdictOutcome
 from discrepancy.judgement.moved_unknowns import moved_sentence, moved_unknowns
 from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.judgement.verdict_checks import check_against_trials, far_held_out_records, unfitted_records

@@ -13,6 +13,7 @@ from discrepancy.catalogue.library import library, variants_in_events
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import fit
+from discrepancy.judgement.decide import comparison_of
 from discrepancy.judgement.separability import campaign_as_predicted
 from discrepancy.sources.examples import example_campaign, plan_from_scales
 from discrepancy.system.lumped_model import LumpedModel
@@ -20,7 +21,7 @@ from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_remarks import missing_port_remark
-from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error
+from discrepancy.workflow import investigate, patch_draws, time_step_error
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
 from tests.costs import once
 from tests.discrepancy.rigs import FEW, drag_found, measured, one_mass, setting_of
@@ -68,7 +69,7 @@ def test_the_time_steps_of_a_search_are_short_enough():
 
 
 def test_open_hypotheses_are_sets_each_once_with_the_most_probable_first():
-    hypotheses = open_hypotheses(drag_found().search, count=4)
+    hypotheses = comparison_of(drag_found().search).open_hypotheses(count=4)
     sets = [fit_of_set.candidate.identifiers for fit_of_set, _ in hypotheses]
     probabilities = [probability for _, probability in hypotheses]
     assert len(set(sets)) == len(sets) > 0

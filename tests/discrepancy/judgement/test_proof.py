@@ -15,7 +15,7 @@ from discrepancy.errors import FitError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.judgement.closed_share import closed_share
 from discrepancy.judgement.consistency_gate import check_consistency, directions_by_test, score_tests
-from discrepancy.judgement.naming import reach_verdict
+from discrepancy.judgement.decide import reach_verdict
 from discrepancy.judgement.proof import (
     check_held_out,
     compute_scores,

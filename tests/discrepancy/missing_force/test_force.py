@@ -27,7 +27,7 @@ from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.hypotheses import named_effects
 from discrepancy.missing_force.port_force import (
     TrialForce,
     explained_variance,

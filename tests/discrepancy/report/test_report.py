@@ -20,7 +20,7 @@ from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
 from discrepancy.judgement import proof
 from discrepancy.judgement.closed_share import percent_with_interval
-from discrepancy.judgement.conclusion import probability_text
+from discrepancy.judgement.hypotheses import probability_text
 from discrepancy.judgement.proof import errors_of_fit
 from discrepancy.judgement.separability import (
     CONFUSION_DISTANCE,

@@ -1,17 +1,13 @@
-"""What all verdicts on a search have in common: records of hypotheses, and sentences.
+"""Hypotheses in the words and records of a verdict: effects, values with intervals, outcome."""
 
-The module also decides which errors of instruments are too small to be named.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from math import isnan, nan
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, TrialKind
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import (
     NINETY_PERCENT_QUANTILE,
     EffectParameter,
@@ -20,21 +16,17 @@ from discrepancy.catalogue.entry import (
 )
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
     FREE_SHAPE,
     CalibratedParameter,
-    Gate,
     Hypothesis,
     NamedEffect,
     ParameterEstimate,
     RemainderEstimate,
     Verdict,
-    VerdictKind,
 )
-from fe.runtime.patch import Clock, LoadGain, ModelPatch, Primitive, SensorGain
 from reporting.words import listing
 
 from .curve_words import curve_in_words, curve_of, followed_variable
@@ -89,180 +81,23 @@ class WeightedHypothesis(NamedTuple):
     probability: float
 
 
-@dataclass(frozen=True)
-class Conclusion:
-    """The hypotheses of a search with their probabilities, from which a verdict is made.
+def list_hypotheses(
+    search: Search, verdict: Verdict, hypotheses: Sequence[WeightedHypothesis]
+) -> Verdict:
+    """Return a verdict that lists the hypotheses of a search with their probabilities.
 
-    Attributes
-    ----------
-    search : Search
-        The search with all of its fits.
-    log_bayes_factor : float
-        ln of the evidence of the best hypothesis over that of the model without effect.
-    hypotheses : sequence of WeightedHypothesis
-        The hypotheses that the verdict lists, in their order.
+    The probability of each effect of the catalogue to be one of the missing ones is added, too.
     """
-
-    search: Search
-    log_bayes_factor: float
-    hypotheses: Sequence[WeightedHypothesis]
-
-    @classmethod
-    def from_probabilities(
-        cls, search: Search, best_fit: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
-    ) -> "Conclusion":
-        """Return the conclusion on the sets of effects of a search.
-
-        Parameters
-        ----------
-        search : Search
-            The search with all of its fits.
-        best_fit : CandidateFit
-            The best set of effects. For the Bayes factor its evidence is divided by the number of
-            places from which its places were chosen.
-        probabilities : mapping of tuple of str to float
-            The probability of each set of identifiers, the most probable first.
-        """
-        setting = search.problem.setting
-        log_places = sum(
-            np.log(len(term.effect.places(setting))) for term in best_fit.candidate.terms
-        )
-        no_effect = search.compared_no_effect
-        log_bayes_factor = float(best_fit.log_evidence - log_places - no_effect.log_evidence)
-        hypotheses = [
-            WeightedHypothesis(search.best_fit_of_set(names), probability)
-            for names, probability in probabilities.items()
-        ]
-        return cls(search, log_bayes_factor, hypotheses)
-
-    @cached_property
-    def inclusion_probabilities(self) -> dict[str, float]:
-        """The probability of each effect to be one of the missing effects, by its identifier."""
-        inclusion = {}
-        for effect in self.search.effects:
-            total_probability: float = 0
-            for hypothesis, probability in self.hypotheses:
-                if effect.identifier in names_without_free_shape(hypothesis.candidate.identifiers):
-                    total_probability += probability
-            inclusion[effect.identifier] = total_probability
-        return inclusion
-
-    def build_outcome(
-        self,
-        kind: VerdictKind,
-        sentence: str,
-        probability: float,
-        fit: CandidateFit | None = None,
-        *,
-        effects: tuple[NamedEffect, ...] = (),
-        group: tuple[str, ...] = (),
-        family: str = "",
-        gates: tuple[Gate, ...] = (),
-        resembles: tuple[str, ...] = (),
-        remainders: tuple[RemainderEstimate, ...] = (),
-    ) -> VerdictOutcome:
-        """Return a verdict with the fit that represents it.
-
-        Parameters
-        ----------
-        kind, sentence, probability
-            What is concluded, see `Verdict`.
-        fit : CandidateFit, optional
-            The fit that represents the verdict; the one without effect if left out.
-        effects, group, family, gates, resembles, remainders
-            Further attributes of the `Verdict`.
-        """
-        records = [
-            hypothesis_record(self.search.problem, hypothesis, hypothesis_probability)
-            for hypothesis, hypothesis_probability in self.hypotheses
-        ]
-        verdict = Verdict(
-            kind,
-            sentence,
-            probability,
-            self.log_bayes_factor,
-            effects=effects,
-            group=group,
-            family=family,
-            gates=gates,
-            hypotheses=tuple(records),
-            inclusion=self.inclusion_probabilities,
-            resembles=resembles,
-            remainders=remainders,
-        )
-        return VerdictOutcome(verdict, self.search, self.search.no_effect if fit is None else fit)
-
-    def build_named_outcome(
-        self,
-        fit: CandidateFit,
-        probability: float,
-        gates: tuple[Gate, ...],
-        remainders: tuple[RemainderEstimate, ...] = (),
-    ) -> VerdictOutcome:
-        """Return the verdict that names the effects of a fit.
-
-        Parameters
-        ----------
-        fit : CandidateFit
-            The fit of a hypothesis to all trials.
-        probability : float
-            The probability of the set.
-        gates : tuple of Gate
-            The outcomes of the tests, that of absolute fit first.
-        remainders : tuple of RemainderEstimate
-            The residual processes of the fit, by channel.
-        """
-        effects = named_effects(self.search.problem, fit)
-        probability_clause = f"probability {probability_text(probability)}"
-        sentence = f"The model lacks {effects_text(effects)} ({probability_clause})."
-        absolute_fit = gates[0]
-        if not absolute_fit.passed:
-            sentence += f" {absolute_fit.reason}"
-        return self.build_outcome(
-            VerdictKind.NAMED,
-            sentence,
-            probability,
-            fit,
-            effects=effects,
-            gates=gates,
-            remainders=remainders,
-        )
-
-    def build_family_outcome(
-        self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
-    ) -> VerdictOutcome:
-        """Return the verdict that names the family of a law that was fitted with a free shape.
-
-        Parameters
-        ----------
-        fit : CandidateFit
-            The fit of a hypothesis to all trials.
-        probability : float
-            The probability of the set.
-        gates : tuple of Gate
-            The outcomes of the tests.
-        """
-        fit_with_draws = with_draws(self.search.problem, fit)
-        effects = named_effects(self.search.problem, fit_with_draws)
-        free_terms = [term for term in fit.candidate.terms if term.free_shape]
-        family = ", ".join(sorted({term.effect.family for term in free_terms}))
-        sentence = curve_sentence(self.search.problem, effects, probability)
-        if not sentence:
-            other_names = ", ".join(effect.name for effect in effects if not effect.shape)
-            beside_clause = f", beside {other_names}" if other_names else ""
-            sentence = (
-                f"An effect of the family {family} is missing, with a fitted shape{beside_clause} "
-                f"(probability {probability_text(probability)})."
-            )
-        return self.build_outcome(
-            VerdictKind.FAMILY,
-            sentence,
-            probability,
-            fit_with_draws,
-            effects=effects,
-            family=family,
-            gates=gates,
-        )
+    inclusion = {effect.identifier: 0.0 for effect in search.effects}
+    for hypothesis, probability in hypotheses:
+        for identifier in set(names_without_free_shape(hypothesis.candidate.identifiers)):
+            if identifier in inclusion:
+                inclusion[identifier] += probability
+    records = [
+        hypothesis_record(search.problem, hypothesis, probability)
+        for hypothesis, probability in hypotheses
+    ]
+    return replace(verdict, hypotheses=tuple(records), inclusion=inclusion)
 
 
 def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability: float) -> str:
@@ -471,6 +306,21 @@ def calibrated_parameters(
     return tuple(parameter_records)
 
 
+def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
+    """Return the residual process of each channel whose residuals are more than noise."""
+    process = fit.residual_process
+    if process is None:
+        return ()
+    estimates = []
+    for channel, name in enumerate(problem.channel_names):
+        amplitude = float(process.amplitude[channel])
+        if amplitude > 0.0:
+            correlation_time = float(process.correlation_time[channel])
+            frequency = float(process.frequency[channel])
+            estimates.append(RemainderEstimate(name, amplitude, correlation_time, frequency))
+    return tuple(estimates)
+
+
 # ---------------------------------------------------------------- words
 
 
@@ -500,84 +350,3 @@ def probability_text(probability: float) -> str:
     if probability < 5e-4:
         return f"{probability:.0e}" if probability > 1e-99 else "< 1e-99"
     return f"{probability:.3f}"
-
-
-def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
-    """Return the sentence that effects may be missing, but are too small to be detected.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The identifiers of the effects. The first four are mentioned in the sentence.
-    noise_clause : str
-        A clause on the noise, such as " that is coloured".
-    """
-    nearest_clause = f"; the nearest are {', '.join(names[:4])}" if names else ""
-    return (
-        "Something may be missing, but it is too small for these data to distinguish from "
-        f"noise{noise_clause}{nearest_clause}."
-    )
-
-
-LEAST_INSTRUMENT_ERROR = 1e-3
-"""Relative size of a gain, tare or clock error below which it is not named, as any instrument has
-errors of this size."""
-LEAST_UNSTATED_GAIN = 1e-2
-"""The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
-gain is never exact, even if the campaign states no deviation."""
-
-
-def has_one_driven_channel(problem: Problem) -> bool:
-    """Return whether all trials of a campaign have a recorded drive, and there is only one channel.
-
-    An error of that channel cannot then be told from a change of the model's parameters.
-    """
-    driven_kinds = (TrialKind.DRIVEN, TrialKind.FORCED)
-    is_driven = all(trial.kind in driven_kinds for trial in problem.campaign.trials)
-    return is_driven and len(problem.channel_names) == 1
-
-
-def is_negligible_instrument_error(
-    problem: Problem, patch: ModelPatch, *, least_unstated_gain: float = LEAST_INSTRUMENT_ERROR
-) -> bool:
-    """Return whether a change consists of errors of instruments that are too small to be named.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and model, whose scales make the sizes relative.
-    patch : ModelPatch
-        The change of the model by an effect.
-    least_unstated_gain : float
-        The least size of a gain of a channel without a stated deviation.
-    """
-    ratios = []
-    for primitive in patch:
-        size = _instrument_error(problem, primitive)
-        if size is None:
-            return False
-        least_named_size = LEAST_INSTRUMENT_ERROR
-        if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
-            least_named_size = least_unstated_gain
-        ratios.append(size / least_named_size)
-    # an empty change is not an error of instruments
-    return max(ratios, default=1.0) < 1.0
-
-
-def _has_exact_gain(problem: Problem, gain: SensorGain) -> bool:
-    """Return whether a campaign states no uncertainty of the gain of a channel."""
-    channel = problem.campaign.channels.get(gain.channel)
-    return channel is not None and channel.gain_deviation == 0.0
-
-
-def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
-    """Return the relative size of an error of an instrument; None for other primitives."""
-    scales = problem.setting.scales
-    if isinstance(primitive, LoadGain):
-        tare = abs(primitive.tare) / scales.force if scales.force > 0.0 else 0.0
-        return max(abs(primitive.gain), tare)
-    if isinstance(primitive, SensorGain):
-        return abs(primitive.gain)
-    if isinstance(primitive, Clock):
-        return max(abs(primitive.rate), abs(primitive.zero) * scales.angular_frequency)
-    return None

@@ -1,190 +1,40 @@
-"""Verdicts if the residuals of every simulation are more than noise.
+"""Verdicts on hypotheses that leave more than noise.
 
 A verdict then names a set of effects *in part*, or a group of hypotheses that cannot be told apart,
 or says that the gap between model and readings is unexplained. A set is named in part if it is
 probable and explains most of the gap, in fitted and in held-out trials, with calibrated values that
-are consistent with priors of twice the stated deviations. Hypotheses are compared by the missing
-force if it can be estimated, else by simulations under a noise as large as their residuals.
+are consistent with priors of twice the stated deviations.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from discrepancy.fits.fitting import CandidateFit
-from discrepancy.search.strategy import Search
-from discrepancy.search.wide_noise import compare_under_wide_noise
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from reporting.probabilities import normalised_probabilities
 from reporting.words import capital, listing, small
 
 from .closed_share import compared_trials_text, percent_with_interval
-from .coloured_noise import remainder_estimates, verdict_under_coloured_noise
-from .comparison import Comparison, HypothesisT, effect_place_pairs
-from .conclusion import (
-    LEAST_UNSTATED_GAIN,
-    Conclusion,
+from .comparison import Comparison, HypothesisT, effect_place_pairs, family_place_pairs
+from .hypotheses import (
     VerdictOutcome,
     WeightedHypothesis,
     curve_sentence,
     effects_text,
-    has_one_driven_channel,
-    is_negligible_instrument_error,
+    list_hypotheses,
     named_effects,
     names_without_free_shape,
     probability_text,
+    remainder_estimates,
 )
-from .force_comparison import ForceComparison
-from .part_sentences import shape_sentence, unproved_addition_sentence
-from .simulation_comparison import SimulationComparison
 
 LEAST_MENTIONED_SHARE = 0.1
 """Least share of the gap for a hypothesis to be mentioned as the best one if none is named."""
 
 
-def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutcome:
-    """Return the verdict if the residuals of the best simulation are more than the recorded noise.
-
-    Parameters
-    ----------
-    search : Search
-        The candidates as fitted under the recorded noise, and the hypotheses that were fitted to
-        the missing force, if there is any.
-    simulation_verdict : Verdict
-        The verdict on the simulations.
-
-    Returns
-    -------
-    VerdictOutcome
-        The verdict. If the gap is unexplained, its fit is that of the best hypothesis that the
-        sentence mentions.
-    """
-    force_search = search.force_search if search.force_estimates else None
-    if force_search is not None and not search.force_estimates[0].leaves_no_force:
-        return _verdict_by_comparison(ForceComparison(search, force_search), simulation_verdict)
-    compare_under_wide_noise(search)
-    comparison = SimulationComparison(search)
-    outcome = verdict_under_coloured_noise(comparison)
-    if outcome is not None:
-        return outcome
-    comparison.add_free_shape_families()
-    return _verdict_by_comparison(comparison, simulation_verdict)
-
-
-def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:
-    """Return the verdict that names laws in part, and no errors of readings.
-
-    Errors of readings are not needed if the laws explain nearly all of the missing force.
-
-    Parameters
-    ----------
-    search : Search
-        The search, with hypotheses that were fitted to the missing force.
-    simulation_verdict : Verdict
-        The verdict on the simulations.
-
-    Returns
-    -------
-    VerdictOutcome or None
-        None if no law is named, or if laws leave more than a tenth of the missing force unexplained
-        (`SEARCH.nearly_complete_share`).
-    """
-    assert search.force_search is not None
-    comparison = ForceComparison(search, search.force_search)
-    outcome = _verdict_by_comparison(comparison, simulation_verdict)
-    if (
-        outcome.verdict.kind is not VerdictKind.NAMED_IN_PART
-        or comparison.judged_hypothesis is None
-    ):
-        return None
-    share = comparison.held_out_or_fitted_share(comparison.judged_hypothesis)
-    return outcome if share.value > SEARCH.nearly_complete_share else None
-
-
-def verdict_without_negligible_effect(
-    search: Search, naming_verdict: Verdict, fit: CandidateFit
-) -> VerdictOutcome:
-    """Return the verdict on a named set, without an effect that explains hardly anything.
-
-    If the residuals are nearly noise, a slightly wider noise explains them as well as such an
-    effect does. So the subsets of the set are compared with it under the wider noise. The effect
-    remains if the evidence of the whole set is far above that of the set without it.
-
-    Parameters
-    ----------
-    search : Search
-        The candidates as fitted under the recorded noise.
-    naming_verdict : Verdict
-        The verdict that names the set.
-    fit : CandidateFit
-        The fit of the set.
-    """
-    # nothing is dropped if each effect is notable and no subset explains as much
-    comparison = SimulationComparison(search)
-    full_set_key = set(fit.candidate.key)
-    notable_key = _key_of_notable_terms(comparison, fit)
-    least_share = comparison.held_out_or_fitted_share(fit).value - SEARCH.negligible_share
-    is_each_notable = notable_key == full_set_key
-    if is_each_notable and not _has_equal_subset(comparison, full_set_key, least_share):
-        return VerdictOutcome(naming_verdict, search, fit)
-    # compare the subsets under the wider noise, those of the fewest effects first
-    compare_under_wide_noise(search)
-    full_set = search.wide_fits.get(fit.candidate.key, fit)
-    for subset in sorted(search.wide_fits.values(), key=lambda fit: len(fit.candidate.terms)):
-        subset_key = set(subset.candidate.key)
-        if not subset_key or not subset_key < full_set_key:
-            continue
-        if comparison.held_out_or_fitted_share(subset).value < least_share:
-            continue
-        least_score = search.score(full_set) - SEARCH.least_gain_of_negligible_effect
-        if subset_key == notable_key or search.score(subset) > least_score:
-            probability = comparison.probability(subset)
-            if comparison.objection_to_naming(subset) or probability < SEARCH.name_probability:
-                return _unexplained_outcome(comparison, naming_verdict, subset)
-            return _named_in_part_outcome(comparison, subset, probability)
-    # the whole set is needed: the verdict remains, and so does the comparison under recorded noise
-    search.wide_fits = {}
-    return VerdictOutcome(naming_verdict, search, fit)
-
-
-def _has_equal_subset(
-    comparison: SimulationComparison, full_set_key: set[tuple[str, str]], least_share: float
-) -> bool:
-    """Return whether a subset of a set of effects explains at least some share of the gap."""
-    for key, subset in comparison.search.exact_fits.items():
-        is_subset = bool(key) and set(key) < full_set_key
-        if is_subset and comparison.held_out_or_fitted_share(subset).value > least_share:
-            return True
-    return False
-
-
-def _key_of_notable_terms(
-    comparison: SimulationComparison, fit: CandidateFit
-) -> set[tuple[str, str]]:
-    """Return the pairs (label, place) of the effects of a fit that are worth a name of their own.
-
-    Errors of instruments that are too small to be named are left out. So are all errors of readings
-    if the campaign has only one channel, under a recorded drive: such an error could not be told
-    from a change of the model's parameters.
-    """
-    problem = comparison.problem
-    one_channel = has_one_driven_channel(problem)
-    patches = fit.candidate.patches(problem.setting, fit.effect)
-    notable_key = set()
-    for term, patch in zip(fit.candidate.terms, patches, strict=True):
-        if is_negligible_instrument_error(problem, patch, least_unstated_gain=LEAST_UNSTATED_GAIN):
-            continue
-        if comparison.acts_on_structure(term) or not one_channel:
-            notable_key.add((term.label, term.place))
-    return notable_key
-
-
-# ---------------------------------------------------------------- verdicts of a comparison
-
-
-def _verdict_by_comparison(
-    comparison: Comparison[HypothesisT], simulation_verdict: Verdict
+def decide_on_remainder(
+    comparison: Comparison[HypothesisT], noise_verdict: Verdict
 ) -> VerdictOutcome:
     """Return the verdict of a comparison: named in part, a group, or an unexplained gap.
 
@@ -192,24 +42,24 @@ def _verdict_by_comparison(
     ----------
     comparison : Comparison
         The comparison of all hypotheses.
-    simulation_verdict : Verdict
-        The verdict on the simulations, with the tests that they failed.
+    noise_verdict : Verdict
+        The verdict if only noise may remain, with the tests that the simulations failed.
     """
     if not comparison.nameable_hypotheses:
-        return _unexplained_outcome(comparison, simulation_verdict)
+        return unexplained_outcome(comparison, noise_verdict)
     # the best hypothesis, and those that the data do not separate from it
     best_hypothesis = comparison.simplest_equivalent_hypothesis(comparison.nameable_hypotheses[0])
     members = [best_hypothesis, *comparison.competing_hypotheses(best_hypothesis)]
     other_count = len(members) - 1
     if len(members) > SEARCH.largest_group:
         reason = f"{other_count} others explain as much, so that none of them can be named"
-        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
+        return unexplained_outcome(comparison, noise_verdict, best_hypothesis, reason)
     # conditions that a name must fulfil
     if comparison.enlarges_error(best_hypothesis):
-        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis)
+        return unexplained_outcome(comparison, noise_verdict, best_hypothesis)
     probability = comparison.probability(*members)
     if probability < SEARCH.name_probability:
-        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis)
+        return unexplained_outcome(comparison, noise_verdict, best_hypothesis)
     log_bayes_factor = best_hypothesis.log_evidence - comparison.no_effect.log_evidence
     if log_bayes_factor < SEARCH.least_log_bayes_factor:
         reason = (
@@ -217,21 +67,24 @@ def _verdict_by_comparison(
             f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs "
             f"{SEARCH.least_log_bayes_factor:g})"
         )
-        return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
+        return unexplained_outcome(comparison, noise_verdict, best_hypothesis, reason)
     # one hypothesis is named in part; several are a group if all of them pass the absolute test
     if other_count == 0:
-        return _named_in_part_outcome(comparison, best_hypothesis, probability)
-    if all(comparison.passes_absolute_fit(member) for member in members):
+        return named_in_part_outcome(comparison, best_hypothesis, probability)
+    if not any(comparison.absolute_fit(member).has_failed for member in members):
         return _group_outcome(comparison, members, probability)
     names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
     reason = (
         "it leaves more than noise, and these data do not distinguish it from "
         f"{listing(names, 'or')}"
     )
-    return _unexplained_outcome(comparison, simulation_verdict, best_hypothesis, reason)
+    return unexplained_outcome(comparison, noise_verdict, best_hypothesis, reason)
 
 
-def _named_in_part_outcome(
+# ---------------------------------------------------------------- one hypothesis, named in part
+
+
+def named_in_part_outcome(
     comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT, probability: float
 ) -> VerdictOutcome:
     """Return the verdict that names the effects of a hypothesis in part.
@@ -245,7 +98,7 @@ def _named_in_part_outcome(
     probability : float
         The probability of that hypothesis.
     """
-    effects = named_effects(comparison.problem, best_hypothesis)
+    effects = named_effects(comparison.problem, comparison.record_values(best_hypothesis))
     share = comparison.held_out_or_fitted_share(best_hypothesis)
     families = {term.effect.family for term in best_hypothesis.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
@@ -270,9 +123,9 @@ def _named_in_part_outcome(
         sentence += " In the held-out trials it has hardly any force."
     unexplained_text = comparison.unexplained_text(best_hypothesis, share)
     sentence += f" It leaves {unexplained_text}, which is unexplained."
-    sentence += shape_sentence(comparison, best_hypothesis)
-    sentence += unproved_addition_sentence(comparison, best_hypothesis)
-    return _outcome_of_comparison(
+    sentence += _shape_sentence(comparison, best_hypothesis)
+    sentence += _unproved_addition_sentence(comparison, best_hypothesis)
+    return _outcome(
         comparison,
         VerdictKind.NAMED_IN_PART,
         sentence,
@@ -281,8 +134,75 @@ def _named_in_part_outcome(
         members=[best_hypothesis],
         effects=effects,
         family=family,
-        gates=(comparison.check_fit(best_hypothesis),),
+        gates=(comparison.absolute_fit(best_hypothesis),),
     )
+
+
+def _shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT) -> str:
+    """Return the sentence on the shape parameters of a single law that the data determine.
+
+    It is empty if there are none, or if the law explains less with a free shape in the decisive
+    trials.
+    """
+    if len(best_hypothesis.candidate.terms) != 1:
+        return ""
+    (term,) = best_hypothesis.candidate.terms
+    free_shape_hypothesis = comparison.fit_with_free_shape(best_hypothesis)
+    if free_shape_hypothesis is None:
+        return ""
+    least_share = (
+        comparison.held_out_or_fitted_share(best_hypothesis).value - SEARCH.least_added_share
+    )
+    if comparison.held_out_or_fitted_share(free_shape_hypothesis).value < least_share:
+        return ""
+    first_shape = len(free_shape_hypothesis.shared) + len(term.effect.parameters)
+    deviations = np.sqrt(np.diag(free_shape_hypothesis.covariance))[first_shape:]
+    (effect,) = named_effects(comparison.problem, free_shape_hypothesis)
+    texts = []
+    for parameter, deviation in zip(effect.shape, deviations, strict=True):
+        if deviation < SEARCH.determined_shape_deviation:
+            description = parameter.description.split(" (")[0]
+            interval = f"{parameter.low:.2g} to {parameter.high:.2g}"
+            texts.append(f"{description} {parameter.value:.2g} ({interval})")
+    return f" With a fitted shape: {', '.join(texts)}." if texts else ""
+
+
+def _unproved_addition_sentence(
+    comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT
+) -> str:
+    """Return the sentence on a further law that may act too, but has too little evidence.
+
+    It is empty if there is none.
+    """
+    # the most probable set of laws that contains all families of the best hypothesis and more
+    families = family_place_pairs(best_hypothesis)
+    least_score = comparison.score(best_hypothesis) - SEARCH.contender_range
+    larger_hypothesis = None
+    for hypothesis in comparison.ranked_hypotheses:
+        has_more_laws = family_place_pairs(hypothesis) > families
+        only_laws = all(comparison.acts_on_structure(term) for term in hypothesis.candidate.terms)
+        if has_more_laws and only_laws and comparison.score(hypothesis) > least_score:
+            larger_hypothesis = hypothesis
+            break
+    if larger_hypothesis is None:
+        return ""
+    # it must explain notably more of the gap
+    least_share = (
+        comparison.held_out_or_fitted_share(best_hypothesis).value + SEARCH.negligible_share
+    )
+    if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
+        return ""
+    added_effects = []
+    for effect in named_effects(comparison.problem, larger_hypothesis):
+        if (effect.family, effect.place) not in families:
+            added_effects.append(effect)
+    return (
+        f" {capital(effects_text(added_effects))} may be missing, too, but this is not proved: it "
+        "gains less evidence than it costs."
+    )
+
+
+# ---------------------------------------------------------------- several hypotheses
 
 
 def _group_outcome(
@@ -316,7 +236,7 @@ def _group_outcome(
     group = []
     for member in members:
         group.append(" + ".join(sorted(names_without_free_shape(member.candidate.identifiers))))
-    return _outcome_of_comparison(
+    return _outcome(
         comparison,
         VerdictKind.GROUP,
         sentence,
@@ -326,7 +246,7 @@ def _group_outcome(
         members=members,
         effects=tuple(all_effects),
         group=tuple(group),
-        gates=(comparison.check_fit(members[0]),),
+        gates=(comparison.absolute_fit(members[0]),),
     )
 
 
@@ -360,9 +280,12 @@ def _group_sentence(
     )
 
 
-def _unexplained_outcome(
+# ---------------------------------------------------------------- an unexplained gap
+
+
+def unexplained_outcome(
     comparison: Comparison[HypothesisT],
-    simulation_verdict: Verdict,
+    noise_verdict: Verdict,
     considered_hypothesis: HypothesisT | None = None,
     reason: str = "",
 ) -> VerdictOutcome:
@@ -375,7 +298,7 @@ def _unexplained_outcome(
     ----------
     comparison : Comparison
         The comparison of all hypotheses.
-    simulation_verdict : Verdict
+    noise_verdict : Verdict
         The verdict on the simulations.
     considered_hypothesis : HypothesisT, optional
         The hypothesis that was considered for a name; if left out, the one that explains the
@@ -384,7 +307,7 @@ def _unexplained_outcome(
         The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
         or else that its probability is too low.
     """
-    gap_sentences = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
+    gap_sentences = f"{_gap_text(noise_verdict)} {comparison.gap_sentence()}".strip()
     mentioned_hypothesis = (
         _hypothesis_explaining_most(comparison)
         if considered_hypothesis is None
@@ -410,21 +333,21 @@ def _unexplained_outcome(
         )
         judged_hypothesis = mentioned_hypothesis
         resembles = names_without_free_shape(mentioned_hypothesis.candidate.identifiers)
-    return _outcome_of_comparison(
+    return _outcome(
         comparison,
         VerdictKind.UNEXPLAINED,
         sentence,
-        simulation_verdict.probability,
+        noise_verdict.probability,
         judged_hypothesis=judged_hypothesis,
         members=[],
         resembles=resembles,
-        gates=simulation_verdict.gates,
+        gates=noise_verdict.gates,
     )
 
 
-def _gap_text(simulation_verdict: Verdict) -> str:
+def _gap_text(noise_verdict: Verdict) -> str:
     """Return the sentence that there is a gap, with the reason of the first failed test."""
-    reasons = [gate.reason for gate in simulation_verdict.gates if gate.has_failed]
+    reasons = [gate.reason for gate in noise_verdict.gates if gate.has_failed]
     first_reason = reasons[0] if reasons else ""
     return f"There is a gap that no effect of the catalogue fits. {first_reason}".strip()
 
@@ -477,7 +400,10 @@ def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: Hypo
     return f"{opening} {share_clause}: no effect is named, and there is nothing to apply."
 
 
-def _outcome_of_comparison(
+# ---------------------------------------------------------------- the verdict
+
+
+def _outcome(
     comparison: Comparison[HypothesisT],
     kind: VerdictKind,
     sentence: str,
@@ -491,7 +417,7 @@ def _outcome_of_comparison(
     gates: tuple[Gate, ...] = (),
     resembles: tuple[str, ...] = (),
 ) -> VerdictOutcome:
-    """Return a verdict that lists all hypotheses of a comparison with their probabilities.
+    """Return a verdict that lists all hypotheses, its members first, then the most probable ones.
 
     Parameters
     ----------
@@ -506,33 +432,31 @@ def _outcome_of_comparison(
     effects, group, family, gates, resembles
         Further attributes of the `Verdict`.
     """
-    # all hypotheses with their probabilities: the members first, then the others by probability
-    other_hypotheses = []
+    search = comparison.search
+    others = []
     for hypothesis in comparison.ranked_hypotheses:
         if not any(hypothesis is member for member in members):
-            other_hypotheses.append(hypothesis)
-    listed_hypotheses: list[HypothesisT] = [*members, *other_hypotheses]
+            others.append(hypothesis)
+    listed_hypotheses: list[HypothesisT] = [
+        *members,
+        *sorted(others, key=lambda hypothesis: -comparison.score(hypothesis)),
+    ]
     scores = np.array([comparison.score(hypothesis) for hypothesis in listed_hypotheses])
     probabilities = normalised_probabilities(scores).tolist()
-    weighted_hypotheses: list[WeightedHypothesis] = []
+    weighted_hypotheses = []
     for hypothesis, hypothesis_probability in zip(listed_hypotheses, probabilities, strict=True):
-        weighted_hypotheses.append(WeightedHypothesis(hypothesis, hypothesis_probability))
-    weighted_members = weighted_hypotheses[: len(members)]
-    weighted_others = weighted_hypotheses[len(members) :]
-    weighted_others.sort(key=lambda weighted_hypothesis: -weighted_hypothesis.probability)
+        values = comparison.record_values(hypothesis)
+        weighted_hypotheses.append(WeightedHypothesis(values, hypothesis_probability))
     # the simulation that represents the verdict
-    fit = comparison.search.no_effect
+    fit = search.no_effect
     if judged_hypothesis is not None:
         fit = comparison.simulation(judged_hypothesis)
-    comparison.judged_hypothesis = judged_hypothesis
     best_hypothesis = listed_hypotheses[0] if judged_hypothesis is None else judged_hypothesis
-    log_bayes_factor = best_hypothesis.log_evidence - comparison.no_effect.log_evidence
-    conclusion = Conclusion(comparison.search, log_bayes_factor, weighted_members + weighted_others)
-    return conclusion.build_outcome(
+    verdict = Verdict(
         kind,
         sentence,
         probability,
-        fit,
+        comparison.log_bayes_factor(best_hypothesis),
         effects=effects,
         group=group,
         family=family,
@@ -540,3 +464,4 @@ def _outcome_of_comparison(
         resembles=resembles,
         remainders=remainder_estimates(comparison.problem, fit),
     )
+    return VerdictOutcome(list_hypotheses(search, verdict, weighted_hypotheses), search, fit)

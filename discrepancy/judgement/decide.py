@@ -1,0 +1,210 @@
+"""The verdict on a campaign: the search, the rules of a verdict, and what speaks against it.
+
+Is anything missing? Is one set of effects so probable that it has a name, and does its simulation
+leave only noise (`noise_verdict`)? If it leaves more: is it still most of the gap, in trials that
+were not fitted, too (`remainder_verdict`)?
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fits.problem import Problem
+from discrepancy.search.starts import OnProgress, ignore_progress
+from discrepancy.search.strategy import Search
+from discrepancy.search.whole_search import OnSearch, ignore_search, search
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Verdict, VerdictKind
+
+from .comparison import Comparison, HypothesisT
+from .force_comparison import ForceComparison
+from .hypotheses import VerdictOutcome
+from .instrument_errors import notable_terms, verdict_rejecting_instruments
+from .moved_unknowns import (
+    hiding_sentences,
+    moved_sentence,
+    moved_unknowns,
+    unknowns_moved_within_prior,
+)
+from .noise_verdict import NoiseCase, decide_on_noise
+from .proof import check_held_out
+from .remainder_verdict import decide_on_remainder, named_in_part_outcome, unexplained_outcome
+from .remarks import KINDS_WITHOUT_GAP
+from .sensor_estimates import sensor_estimates
+from .simulation_comparison import SimulationComparison
+from .verdict_checks import check_against_trials
+
+KINDS_FOR_NOISE_ALONE = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Kinds of verdicts on effects beside which only noise remains."""
+COLOURED = "which is coloured as its records admit"
+"""What is said of noise that is correlated in time."""
+
+
+def reach_verdict(
+    problem: Problem,
+    effects: Sequence[Effect],
+    on_progress: OnProgress = ignore_progress,
+    on_search: OnSearch = ignore_search,
+) -> VerdictOutcome:
+    """Return the verdict on a campaign: what the model lacks, named if that is possible.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and the model, with the layout of their unknowns.
+    effects : sequence of Effect
+        The effects of the catalogue.
+    on_progress : callable
+        The function that receives a line for the progress display: the fit that runs, and how many
+        remain.
+    on_search : callable
+        The function that receives each search when it begins.
+
+    Returns
+    -------
+    VerdictOutcome
+        The verdict, the search with all candidates, and the fit that represents the verdict. Next
+        experiments and faults of the data are added to the verdict elsewhere.
+    """
+    outcome = check_against_trials(_decide(search(problem, effects, on_progress, on_search)))
+    verdict = outcome.verdict
+    no_effect = outcome.search.no_effect
+    moved = moved_unknowns(problem, no_effect)
+    moved_within_prior = unknowns_moved_within_prior(problem, no_effect)
+    if verdict.kind in KINDS_WITHOUT_GAP:
+        sensors = sensor_estimates(problem, no_effect)
+        sentences = hiding_sentences(moved, moved_within_prior, sensors)
+    else:
+        sentences = moved_sentence(moved)
+    verdict = replace(
+        verdict,
+        sentence=f"{verdict.sentence} {sentences}".strip(),
+        moved=moved,
+        moved_within_prior=moved_within_prior,
+    )
+    return outcome._replace(verdict=verdict)
+
+
+def comparison_of(search: Search) -> ForceComparison | SimulationComparison:
+    """Return the comparison of the hypotheses of a search.
+
+    Hypotheses on trials in motion were estimated with the force that they leave missing; others are
+    compared by their simulations.
+    """
+    if search.force_search is not None and search.force_estimates:
+        return ForceComparison(search, search.force_search)
+    return SimulationComparison(search)
+
+
+def _decide(search: Search) -> VerdictOutcome:
+    """Return the verdict on the hypotheses of a search."""
+    comparison = comparison_of(search)
+    if isinstance(comparison, ForceComparison):
+        return _decide_on_comparison(comparison)
+    return _decide_on_comparison(comparison)
+
+
+def _decide_on_comparison(comparison: Comparison[HypothesisT]) -> VerdictOutcome:
+    """Return the verdict of a comparison: by the rules for noise, or for more than that."""
+    comparison.fit_probable_sets()
+    outcome = _with_test_on_held_out(comparison, decide_on_noise(NoiseCase(comparison)))
+    verdict = outcome.verdict
+    rejection = verdict_rejecting_instruments(comparison, verdict)
+    if rejection is not None:
+        return VerdictOutcome(rejection, comparison.search, comparison.search.no_effect)
+    if not _leaves_more_than_noise(verdict):
+        return _without_superfluous_effect(comparison, outcome)
+    comparison.admit_remainder()
+    if isinstance(comparison, SimulationComparison):
+        coloured_outcome = _decide_on_coloured_noise(comparison)
+        if coloured_outcome is not None:
+            return coloured_outcome
+        comparison.add_free_shape_families()
+    return decide_on_remainder(comparison, verdict)
+
+
+def _with_test_on_held_out(
+    comparison: Comparison[HypothesisT], outcome: VerdictOutcome
+) -> VerdictOutcome:
+    """Return the outcome with the test of its effects on held-out trials, if it has effects."""
+    verdict = outcome.verdict
+    if verdict.kind not in KINDS_FOR_NOISE_ALONE:
+        return outcome
+    # a χ² against the recorded noise, which does not take the residual process as noise
+    gate = check_held_out(
+        comparison.search.residuals(replace(outcome.fit, residual_process=None))
+        if outcome.fit.residual_process is not None
+        else comparison.search.residuals(outcome.fit)
+    )
+    sentence = f"{verdict.sentence} {gate.reason}" if gate.has_failed else verdict.sentence
+    return outcome._replace(
+        verdict=replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
+    )
+
+
+def _leaves_more_than_noise(verdict: Verdict) -> bool:
+    """Return whether the verdict on noise found a gap that no hypothesis reduces to noise."""
+    failed_tests = {gate.name for gate in verdict.gates if gate.has_failed}
+    return verdict.kind is VerdictKind.UNEXPLAINED or bool(
+        failed_tests & {"absolute fit", "held-out trials"}
+    )
+
+
+def _decide_on_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
+    """Return the verdict if what remains is noise of the colour that the noise records have.
+
+    None is returned if more remains than such noise, or if no single set of effects is named.
+    """
+    outcome = decide_on_noise(NoiseCase(comparison, noise=COLOURED))
+    outcome = _with_test_on_held_out(comparison, outcome)
+    verdict = outcome.verdict
+    remaining = comparison.no_effect if verdict.kind in KINDS_WITHOUT_GAP else outcome.fit
+    process = remaining.residual_process
+    has_recorded_colour = process is not None and process.is_all_recorded_colour
+    is_decided = verdict.kind in (*KINDS_WITHOUT_GAP, VerdictKind.NAMED)
+    if not is_decided or not has_recorded_colour or _leaves_more_than_noise(verdict):
+        return None
+    return outcome
+
+
+# ---------------------------------------------------------------- effects that are not needed
+
+
+def _without_superfluous_effect(
+    comparison: Comparison[HypothesisT], outcome: VerdictOutcome
+) -> VerdictOutcome:
+    """Return the verdict on a named set, without effects that explain hardly anything.
+
+    If the residuals are nearly noise, what the smaller set leaves explains them as well as such an
+    effect does. So the subsets of the set are compared with it by what each leaves. An effect
+    remains if the evidence of the whole set is far above that of the set without it.
+    """
+    verdict, fit = outcome.verdict, outcome.fit
+    may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
+    if not may_be_named or len(verdict.effects) < 2:
+        return outcome
+    full_set = comparison.hypothesis_of(fit.candidate)
+    if full_set is None:
+        return outcome
+    notable_key = notable_terms(comparison, fit)
+    least_share = comparison.held_out_or_fitted_share(full_set).value - SEARCH.negligible_share
+    is_each_notable = notable_key == set(fit.candidate.key)
+    has_equal_subset = any(
+        comparison.held_out_or_fitted_share(subset).value > least_share
+        for subset in comparison.subsets(full_set)
+    )
+    if is_each_notable and not has_equal_subset:
+        return outcome
+    comparison.admit_remainder()
+    full_set = comparison.hypothesis_of(fit.candidate) or full_set
+    for subset in comparison.subsets(full_set):
+        if comparison.held_out_or_fitted_share(subset).value < least_share:
+            continue
+        least_score = comparison.score(full_set) - SEARCH.least_gain_of_negligible_effect
+        if set(subset.candidate.key) == notable_key or comparison.score(subset) > least_score:
+            probability = comparison.probability(subset)
+            if comparison.objection_to_naming(subset) or probability < SEARCH.name_probability:
+                return unexplained_outcome(comparison, verdict, subset)
+            return named_in_part_outcome(comparison, subset, probability)
+    comparison.admit_no_remainder()  # the whole set is needed
+    return outcome

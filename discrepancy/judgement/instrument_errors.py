@@ -1,0 +1,169 @@
+"""Errors of instruments that are no name: too small, or no other than a moved parameter."""
+
+from dataclasses import replace
+
+from discrepancy.campaign.records import TrialKind
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.search.strategy import Search
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Verdict, VerdictKind
+from fe.runtime.patch import SENSORS, Clock, LoadGain, ModelPatch, Primitive, SensorGain
+
+from .comparison import Comparison, HypothesisT
+from .proof import check_held_out
+
+INSTRUMENT_PRIMITIVES = (LoadGain, *SENSORS)
+"""Primitives that describe errors of instruments."""
+
+LEAST_INSTRUMENT_ERROR = 1e-3
+"""Relative size of a gain, tare or clock error below which it is not named, as any instrument has
+errors of this size."""
+LEAST_UNSTATED_GAIN = 1e-2
+"""The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
+gain is never exact, even if the campaign states no deviation."""
+
+
+def has_one_driven_channel(problem: Problem) -> bool:
+    """Return whether all trials of a campaign have a recorded drive, and there is only one channel.
+
+    An error of that channel cannot then be told from a change of the model's parameters.
+    """
+    driven_kinds = (TrialKind.DRIVEN, TrialKind.FORCED)
+    is_driven = all(trial.kind in driven_kinds for trial in problem.campaign.trials)
+    return is_driven and len(problem.channel_names) == 1
+
+
+def is_negligible_instrument_error(
+    problem: Problem, patch: ModelPatch, *, least_unstated_gain: float = LEAST_INSTRUMENT_ERROR
+) -> bool:
+    """Return whether a change consists of errors of instruments that are too small to be named.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model, whose scales make the sizes relative.
+    patch : ModelPatch
+        The change of the model by an effect.
+    least_unstated_gain : float
+        The least size of a gain of a channel without a stated deviation.
+    """
+    ratios = []
+    for primitive in patch:
+        size = _instrument_error(problem, primitive)
+        if size is None:
+            return False
+        least_named_size = LEAST_INSTRUMENT_ERROR
+        if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
+            least_named_size = least_unstated_gain
+        ratios.append(size / least_named_size)
+    # an empty change is not an error of instruments
+    return max(ratios, default=1.0) < 1.0
+
+
+def _has_exact_gain(problem: Problem, gain: SensorGain) -> bool:
+    """Return whether a campaign states no uncertainty of the gain of a channel."""
+    channel = problem.campaign.channels.get(gain.channel)
+    return channel is not None and channel.gain_deviation == 0.0
+
+
+def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
+    """Return the relative size of an error of an instrument; None for other primitives."""
+    scales = problem.setting.scales
+    if isinstance(primitive, LoadGain):
+        tare = abs(primitive.tare) / scales.force if scales.force > 0.0 else 0.0
+        return max(abs(primitive.gain), tare)
+    if isinstance(primitive, SensorGain):
+        return abs(primitive.gain)
+    if isinstance(primitive, Clock):
+        return max(abs(primitive.rate), abs(primitive.zero) * scales.angular_frequency)
+    return None
+
+
+def verdict_rejecting_instruments(
+    comparison: Comparison[HypothesisT], verdict: Verdict
+) -> Verdict | None:
+    """Return the verdict that rejects named errors of instruments; None if they may be the cause.
+
+    There are two reasons to reject them. The errors may be so small that any instrument has them.
+    Or they may only serve to keep calibrated parameters within their priors: with one channel and a
+    recorded drive, a gain has the same effect as all parameters of a linear model together. If the
+    model without effect predicts held-out trials, nothing but these priors supports the gain.
+    """
+    if verdict.kind not in (VerdictKind.NAMED, VerdictKind.GROUP):
+        return None
+    problem = comparison.problem
+    search = comparison.search
+    without_name = replace(verdict, effects=(), group=())
+    causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    # reason 1: errors that any instrument has
+    if all(is_negligible_instrument_error(problem, effect.patch) for effect in verdict.effects):
+        sentence = (
+            f"The model explains the data except for {causes} below "
+            f"{100.0 * LEAST_INSTRUMENT_ERROR:g} % of the quantity; an error that small counts as "
+            "a nuisance of the instruments, and is not named."
+        )
+        return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
+    # reason 2: a gain that only keeps calibrated parameters within their priors
+    if not has_one_driven_channel(problem) or not problem.campaign.held_out:
+        return None
+    if not _are_instrument_errors_with_gain(verdict):
+        return None
+    if not check_held_out(search.residuals(search.no_effect)).passed:
+        return None
+    sentence = (
+        "The model predicts held-out trials as it is, but with calibrated parameters outside "
+        f"their priors{_implausible_parameters_clause(search)}. An error of the instruments "
+        f"({causes}) would explain them as well: with one channel, these data cannot distinguish "
+        "the two."
+    )
+    resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
+    return replace(
+        without_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles
+    )
+
+
+def _are_instrument_errors_with_gain(verdict: Verdict) -> bool:
+    """Return whether a verdict names only errors of instruments, and among them a wrong gain."""
+    has_gain = False
+    for effect in verdict.effects:
+        for primitive in effect.patch:
+            if not isinstance(primitive, INSTRUMENT_PRIMITIVES):
+                return False
+            if isinstance(primitive, LoadGain | SensorGain):
+                has_gain = True
+    return has_gain
+
+
+def _implausible_parameters_clause(search: Search) -> str:
+    """Return the parameters that the fit without effect moves far from their priors, in brackets.
+
+    The clause begins with a blank; it is empty if there are no such parameters.
+    """
+    parameters = search.problem.model.parameters
+    # the scaled unknowns are the parameters, in prior deviations, and then the gains of channels
+    scaled_values = search.no_effect.point.shared[: len(parameters)]
+    texts = []
+    for parameter, scaled_value in zip(parameters, scaled_values, strict=True):
+        if abs(scaled_value) > SEARCH.reported_prior_deviations:
+            texts.append(f"{parameter.name!r} {abs(scaled_value):.1f}")
+    return f" ({', '.join(texts)} stated deviations off)" if texts else ""
+
+
+def notable_terms(comparison: Comparison[HypothesisT], fit: CandidateFit) -> set[tuple[str, str]]:
+    """Return the pairs (label, place) of the effects of a fit that are worth a name of their own.
+
+    Errors of instruments that are too small to be named are left out. So are all errors of readings
+    if the campaign has only one channel, under a recorded drive: such an error could not be told
+    from a change of the model's parameters.
+    """
+    problem = comparison.problem
+    one_channel = has_one_driven_channel(problem)
+    patches = fit.candidate.patches(problem.setting, fit.effect)
+    notable_key = set()
+    for term, patch in zip(fit.candidate.terms, patches, strict=True):
+        if is_negligible_instrument_error(problem, patch, least_unstated_gain=LEAST_UNSTATED_GAIN):
+            continue
+        if comparison.acts_on_structure(term) or not one_channel:
+            notable_key.add((term.label, term.place))
+    return notable_key
