@@ -27,7 +27,7 @@ from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .estimate import Estimate
 from .linearisation import Linearisation
-from .linearised import LinearisedTrial
+from .linearised import LinearisedTrial, Simulation
 from .process_search import Processes, prior_log_density
 from .regression import Priors
 
@@ -109,6 +109,26 @@ class HypothesisLaws(Protocol):
         -------
         Trajectory or None
             The motion; None if an effect is not possible at these values.
+        """
+
+
+    def residual_of_simulation(
+        self, arguments: LawArguments, local_values: FloatArray
+    ) -> FloatArray | None:
+        """Return the residuals of a trial that is simulated under all laws.
+
+        Parameters
+        ----------
+        arguments : LawArguments
+            The trial and the values of unknowns.
+        local_values : (L,) array
+            The values of the unknowns of this trial alone.
+
+        Returns
+        -------
+        (N, C) array or None
+            The readings minus the prediction, divided by the noise; None if an effect is not
+            possible at these values.
         """
 
 
@@ -231,14 +251,29 @@ def linearise_along_laws(
         The linear trials; None if the laws are not possible in one of them.
     """
     trajectories = []
+    simulations: list[Simulation | None] = []
     for trial_index, local_values in enumerate(start.local):
         arguments = start.law_arguments(trial_index, speed_window)
         trajectory = laws.motion_under_laws(arguments, local_values)
         if trajectory is None:
             return None
         trajectories.append(trajectory)
+        if trials[trial_index].stride > 1:  # a record that is thinned is compared roughly
+            simulations.append(None)
+            continue
+        residual = laws.residual_of_simulation(arguments, local_values)
+        if residual is None:
+            return None
+        simulations.append(Simulation(local_values, residual))
     start_along_laws = replace(start, trajectories=tuple(trajectories))
-    return linearise_trials(laws, trials, start_along_laws, speed_window, shared_priors)
+    linearisation = linearise_trials(laws, trials, start_along_laws, speed_window, shared_priors)
+    if linearisation is None:
+        return None
+    simulated_trials = [
+        replace(trial, simulation=simulation)
+        for trial, simulation in zip(linearisation.trials, simulations, strict=True)
+    ]
+    return replace(linearisation, trials=tuple(simulated_trials))
 
 
 def _start_after_step(

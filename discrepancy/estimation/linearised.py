@@ -16,10 +16,11 @@ add (see `filtered`).
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.trials_in_motion.trajectory import (
     LinearisedForce,
     LinearisedSensorErrors,
@@ -31,6 +32,21 @@ from .kernel import respond_to_drift, substep_matrices_with_laws
 
 CONSTANT = 0
 """Number of the constant among the weights (1, unknowns)."""
+
+
+class Simulation(NamedTuple):
+    """A trial as simulated under laws alone, without missing forces.
+
+    Attributes
+    ----------
+    local : (L,) ndarray
+        The values of the unknowns of the trial alone.
+    residual : (N, C) ndarray
+        The readings minus the prediction, divided by the noise.
+    """
+
+    local: FloatArray
+    residual: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +73,8 @@ class LinearisedTrial:
         The values of the shared unknowns at which they are linearised.
     model_forces : mapping of int to (F,) ndarray
         The forces of the model's own laws along the trajectory, which are part of `forces`.
+    simulation : Simulation or None
+        The trial as simulated with the values about which it is linear, along whose motion it is.
     """
 
     trial: PortedTrial
@@ -66,6 +84,7 @@ class LinearisedTrial:
     effect: FloatArray
     shared: FloatArray
     model_forces: Mapping[int, FloatArray] = field(default_factory=dict)
+    simulation: Simulation | None = None
 
     # ------------------------------------------------------------ layout
 
@@ -315,7 +334,22 @@ class LinearisedTrial:
         outputs_over_noise = trial.system.outputs / trial.deviation[:, None]
         columns -= np.einsum("cn,knw->kcw", outputs_over_noise, known_states)
         columns += self.direct_readings(self.known_forces[:: trial.substeps])
+        if self.simulation is not None:
+            # The substeps integrate a law to first order. At the values of the simulation the
+            # residual is that of the simulation; the derivatives are those along its motion.
+            weights = np.concatenate(([1.0], self.shared, self.effect, self.simulation.local))
+            error = self.simulation.residual - columns @ weights
+            columns[:, ~self._shows_laws_at_once, CONSTANT] += error[:, ~self._shows_laws_at_once]
         return columns * trial.used[:, :, None]
+
+    @property
+    def _shows_laws_at_once(self) -> BoolArray:
+        """Whether each channel (C,) shows the force of a law at once, as an acceleration does.
+
+        Such a reading jumps where dry friction changes its sign, and at which side of the jump it
+        was taken depends on less than a time step.
+        """
+        return np.asarray(np.any(self.trial.system.through[list(self.law_ports)], axis=0))
 
     @cached_property
     def known_forces(self) -> FloatArray:

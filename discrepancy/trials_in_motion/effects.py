@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point, with_step
 from discrepancy.fits.problem import Problem
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
@@ -112,6 +112,30 @@ class EffectLaws:
             start=arguments.trajectory.added_state[0],
             least_half_widths=0.5 * arguments.speed_window * np.maximum(rms_speeds, LEAST_DIVISOR),
         )
+
+    def residual_of_simulation(
+        self, arguments: LawArguments, local_values: FloatArray
+    ) -> FloatArray | None:
+        """Return the residuals (N, C) of a trial that is simulated under all laws.
+
+        See `HypothesisLaws.residual_of_simulation`.
+        """
+        trial = self.trials[arguments.trial_index]
+        trial_index = self.trial_indices[arguments.trial_index]
+        all_local_values = [np.zeros(0)] * len(self.problem.trials)
+        all_local_values[trial_index] = local_values
+        point = Point(arguments.shared, tuple(all_local_values), arguments.effect)
+        try:
+            patch = self.evaluate_model_laws(arguments.shared)
+            patch = patch + self._patch_in_trial(arguments.trial_index, arguments.effect)
+            response, _ = self.problem.response(
+                trial_index, arguments.shared, local_values, patch
+            )
+        except (DiscrepancyError, InvalidPatchError):
+            return None
+        prediction = self.problem.prediction(trial_index, point, response)
+        readings = self.problem.trials[trial_index].trial.values
+        return np.asarray((readings - prediction) / trial.deviation)[:: trial.stride]
 
     # ------------------------------------------------------------ laws
 
