@@ -106,12 +106,8 @@ class SearchSettings:
     """Chi-squared per sample above which a model counts as far from the data."""
     far_prior_deviations: float = 4.0
     """Prior deviations of a shared unknown above which the model counts as far, too."""
-    most_far_fits: int = 6
-    """Most sets, chosen by their fit to the missing force, that are fitted to the readings."""
 
     # ---------------------------------------------------------------- named by the missing force
-    force_fit_range: float = 25.0
-    """Sets within this log evidence of the best, in fits to the missing force, are fitted."""
     least_low_end: float = 0.25
     """Least lower end of the fraction of the missing force that a partly named set explains."""
     contender_range: float = 12.0

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from discrepancy.document import Origin, document_schema, write_document
+from discrepancy.judgement.decide import comparison_of
 from discrepancy.judgement.hypotheses import hypothesis_record
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import Hypothesis
@@ -66,12 +67,11 @@ class SearchInProgress:
         """
         if self.search is None:
             return ()
-        probabilities = list(self.search.set_probabilities().items())[:MOST_HYPOTHESES]
+        comparison = comparison_of(self.search)
+        probabilities = list(comparison.set_probabilities().items())[:MOST_HYPOTHESES]
         return tuple(
-            hypothesis_record(
-                self.search.problem, self.search.best_fit_of_set(identifiers), probability
-            )
-            for identifiers, probability in probabilities
+            hypothesis_record(self.search.problem, comparison.best_of_set(names), probability)
+            for names, probability in probabilities
         )
 
 

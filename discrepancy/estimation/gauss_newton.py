@@ -111,7 +111,6 @@ class HypothesisLaws(Protocol):
             The motion; None if an effect is not possible at these values.
         """
 
-
     def residual_of_simulation(
         self, arguments: LawArguments, local_values: FloatArray
     ) -> FloatArray | None:

@@ -91,7 +91,7 @@ def comparison_of(search: Search) -> ForceComparison | SimulationComparison:
     Hypotheses on trials in motion were estimated with the force that they leave missing; others are
     compared by their simulations.
     """
-    if search.force_search is not None and search.force_estimates:
+    if search.force_estimates and search.force_search is not None:
         return ForceComparison(search, search.force_search)
     return SimulationComparison(search)
 

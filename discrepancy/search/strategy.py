@@ -335,9 +335,7 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
-        """Fit the sets of effects whose force agrees best with the missing force.
-
-        The missing force is estimated from the readings without a law.
+        """Estimate the sets of effects together with the missing force, and fit the best one.
 
         Parameters
         ----------
@@ -347,25 +345,11 @@ class Search(FittedCandidates):
         self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
         if len(force_search.model_laws):
             self._estimate_along_laws_of_model(force_search)
-        # fit the most probable sets to the readings, each from its estimate by the missing force
-        eligible_hypotheses = []
-        for hypothesis in self.force_estimates:
-            candidate = hypothesis.candidate
-            # a law of free shape together with another law could fit nearly anything
-            is_family_in_set = candidate.has_free_shape and len(candidate.terms) > 1
-            if candidate.terms and not is_family_in_set:
-                eligible_hypotheses.append(hypothesis)
-        probable_hypotheses = []
-        for hypothesis in eligible_hypotheses:
-            if self.score(hypothesis) > self.score(eligible_hypotheses[0]) - SEARCH.force_fit_range:
-                probable_hypotheses.append(hypothesis)
-        for hypothesis in report_each(
-            self.on_progress,
-            probable_hypotheses[: SEARCH.most_far_fits],
-            lambda hypothesis: f"fitting {hypothesis.candidate.description} until it converges",
-        ):
-            start = force_search.point(hypothesis)
-            fit = try_fit(self.problem, hypothesis.candidate, start)
+        best_estimate = self.force_estimates[0]
+        if best_estimate.candidate.terms:
+            self.on_progress(f"fitting {best_estimate.candidate.description} until it converges")
+            start = force_search.point(best_estimate)
+            fit = try_fit(self.problem, best_estimate.candidate, start)
             if fit is not None:
                 self.record_fit(fit, exact=True)
         self.refine_time_steps()

@@ -128,9 +128,7 @@ class EffectLaws:
         try:
             patch = self.evaluate_model_laws(arguments.shared)
             patch = patch + self._patch_in_trial(arguments.trial_index, arguments.effect)
-            response, _ = self.problem.response(
-                trial_index, arguments.shared, local_values, patch
-            )
+            response, _ = self.problem.response(trial_index, arguments.shared, local_values, patch)
         except (DiscrepancyError, InvalidPatchError):
             return None
         prediction = self.problem.prediction(trial_index, point, response)

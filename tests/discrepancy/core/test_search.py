@@ -11,7 +11,7 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.gates import whiteness_tests
-from discrepancy.judgement import in_part
+from discrepancy.judgement import remainder_verdict
 from discrepancy.search.other_optima import points_at_other_stretches
 from discrepancy.search.strategy import Search
 from discrepancy.system.response import Conditions
@@ -159,7 +159,7 @@ def test_an_effect_at_one_place_has_no_other_stretches():
 
 
 class TwoRivals:
-    """Two hypotheses that no data tell apart, as `in_part` asks for them."""
+    """Two hypotheses that no data tell apart, as `remainder_verdict` asks for them."""
 
     def __init__(self, probability, gain, fits):
         self.problem, self.chance, self.fits = None, probability, fits
@@ -180,8 +180,8 @@ class TwoRivals:
     def probability(self, *items):
         return self.chance
 
-    def passes_absolute_fit(self, item):
-        return self.fits
+    def absolute_fit(self, item):
+        return SimpleNamespace(has_failed=not self.fits)
 
 
 @pytest.mark.parametrize(
@@ -192,10 +192,10 @@ class TwoRivals:
     ],
 )  # fmt: skip
 def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, probability, gain, fits, kind):
-    monkeypatch.setattr(in_part, "_group_outcome", lambda *given: "group")
-    monkeypatch.setattr(in_part, "_unexplained_outcome", lambda *given: "unexplained")
-    monkeypatch.setattr(in_part, "named_effects", lambda *given: ())
-    assert in_part._verdict_by_comparison(TwoRivals(probability, gain, fits), None) == kind
+    monkeypatch.setattr(remainder_verdict, "_group_outcome", lambda *given: "group")
+    monkeypatch.setattr(remainder_verdict, "unexplained_outcome", lambda *given: "unexplained")
+    monkeypatch.setattr(remainder_verdict, "named_effects", lambda *given: ())
+    assert remainder_verdict.decide_on_remainder(TwoRivals(probability, gain, fits), None) == kind
 
 
 @pytest.mark.parametrize(
@@ -205,8 +205,10 @@ def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, pr
 def test_what_speaks_against_a_name_is_the_probability_or_the_evidence(
     monkeypatch, probability, gain, reason
 ):
-    monkeypatch.setattr(in_part, "_unexplained_outcome", lambda comparison, first, nearest, reason="": reason)
-    assert in_part._verdict_by_comparison(TwoRivals(probability, gain, True), None).endswith(reason)
+    monkeypatch.setattr(
+        remainder_verdict, "unexplained_outcome", lambda comparison, first, nearest, reason="": reason
+    )
+    assert remainder_verdict.decide_on_remainder(TwoRivals(probability, gain, True), None).endswith(reason)
 
 
 # ---------------------------------------------------------------- whiteness
