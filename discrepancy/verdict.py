@@ -464,7 +464,8 @@ class Verdict:
         if only the shape gate found the family. It has no meaning for an unexplained gap, where no
         set is named, and is nan where the data are at fault [1].
     log_bayes_factor : float
-        Log evidence of the best hypothesis over that of 'none' [nat].
+        Log evidence of the best hypothesis over that of the model as it is, without a missing force
+        [nat].
     effects : tuple of NamedEffect
         The named set of effects; for a group its members; for a family the member of the nearest
         shape.
