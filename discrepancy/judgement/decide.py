@@ -26,7 +26,8 @@ from .moved_unknowns import (
     moved_unknowns,
     unknowns_moved_within_prior,
 )
-from .noise_verdict import NoiseCase, decide_on_noise
+from .noise_case import NoiseCase
+from .noise_verdict import decide_on_noise
 from .proof import check_held_out
 from .remainder_verdict import decide_on_remainder, named_in_part_outcome, unexplained_outcome
 from .remarks import KINDS_WITHOUT_GAP

@@ -11,7 +11,8 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.judgement.decide import reach_verdict
-from discrepancy.judgement.noise_verdict import NoiseCase, common_effects_verdict, undecided_verdict
+from discrepancy.judgement.noise_case import NoiseCase
+from discrepancy.judgement.noise_verdict import common_effects_verdict, undecided_verdict
 from discrepancy.judgement.remainder_verdict import not_named_sentence
 from discrepancy.judgement.remarks import look_alike_remark, verdict_with_untested_effects
 from discrepancy.judgement.simulation_comparison import SimulationComparison
