@@ -25,6 +25,7 @@ from discrepancy.system.sensing import observe
 from discrepancy.system.time_history import RecordedHistory
 from fe.runtime.patch import (
     INTERNAL_FORCES,
+    GaugeOffset,
     InertiaRelief,
     LoadGain,
     LoadOffset,
@@ -180,6 +181,7 @@ class Cantilever(Model):
     support_motions = (("root", "rx"),)
     mass_places = tuple(MASS_PLACES)
     load_changes = (("tip_load", "offset", "y"), ("tip_load", "tilt", "y"))
+    gauge_shifts = tuple((name, "along") for name in GAUGES)
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -229,7 +231,11 @@ class Cantilever(Model):
     ) -> Response:
         """Return the response of a trial."""
         across = ACROSS[0]
-        along = {name: SKIN * curvature_row(place) for name, place in GAUGES.items()}
+        places = dict(GAUGES)
+        for primitive in patch:
+            if isinstance(primitive, GaugeOffset):
+                places[primitive.gauge] += primitive.distance
+        along = {name: SKIN * curvature_row(place) for name, place in places.items()}
         rows = along | {name + across: -POISSON * row for name, row in along.items()}
         chosen = np.array([rows.get(name, TIP) for name, _ in outputs])
         values, rates, torque = _motion(trial, chosen, patch, conditions)

@@ -338,6 +338,7 @@ PICTURES: dict[str, Picture] = {
         {"lost_share": 0.2}, (load_line("g0", change=True), spectrum("g0", 20.0)), "g0"
     ),
     "gauge_misalignment": Picture({"angle": 0.26}, (ratios("up", "flight"), load_line("g1")), "g1"),
+    "gauge_offset": Picture({"offset_ratio": 0.05}, (ratios("up"), load_line("g0"))),
     "high_pass": Picture(
         {"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"
     ),

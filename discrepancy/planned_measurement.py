@@ -27,6 +27,7 @@ SUSPECTS = (
     "load_offset",
     "load_direction",
     "gauge_misalignment",
+    "gauge_offset",
     "gauge_gain",
 )
 """What a structural engineer suspects first."""

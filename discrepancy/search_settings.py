@@ -107,6 +107,9 @@ class SearchSettings:
     far_prior_deviations: float = 4.0
     """Prior deviations of a shared unknown above which the model counts as far, too."""
 
+    mesh_error: float = 0.005
+    """Relative error of a reading by the mesh of a structure, half of that of a frequency."""
+
     # ---------------------------------------------------------------- named by the missing force
     least_low_end: float = 0.25
     """Least lower end of the fraction of the missing force that a partly named set explains."""

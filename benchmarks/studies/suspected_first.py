@@ -82,7 +82,7 @@ CASES: tuple[tuple[str, tuple[Fault, ...]], ...] = (
     ("bracket", (support("CLAMP", "ry", 3e4),)),
     ("bracket", (BRACKET_MASS,)),
     ("bracket", (loss((35.0, 0.0, 0.0), (54.0, 30.0, 8.0), 0.45),)),
-    ("bracket", (Fault("gauge_offset", "g3", value=0.006),)),
+    ("bracket", (Fault("gauge_offset", "g3", "along", 0.006),)),
     ("bracket", (support("CLAMP", "ry", 3e4), GAIN_OF_G2)),
     ("portal", ()),
     ("portal", ()),
@@ -99,7 +99,7 @@ CASES: tuple[tuple[str, tuple[Fault, ...]], ...] = (
     ("plate", (mass(110.0, 85.0, 4.0, 0.05), PLATE_LOSS)),
     ("arm", ()),
     ("arm", ()),
-    ("arm", (Fault("gauge_offset", "g2", value=-0.006),)),
+    ("arm", (Fault("gauge_offset", "g2", "along", -0.006),)),
     ("arm", (Fault("gauge_gain", "g3", value=-0.06),)),
     ("arm", (support("CLAMP", "ry", 2.5e4), mass(120.0, 10.0, 8.0, 0.03))),
 )
@@ -317,7 +317,7 @@ def score(verdict: Verdict, part: Part, faults: Sequence[Fault], model: Changeab
 def _is_at(effect: NamedEffect, fault: Fault) -> bool:
     """Return whether an effect is named at the place of a fault, with its motion."""
     (primitive,) = effect.patch.primitives
-    named = [getattr(primitive, name, "") for name in ("support", "control", "channel")]
+    named = [getattr(primitive, name, "") for name in ("support", "control", "channel", "gauge")]
     motion = getattr(primitive, "motion", getattr(primitive, "axis", fault.motion))
     return fault.place in named and motion == fault.motion
 

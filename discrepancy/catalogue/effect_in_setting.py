@@ -28,7 +28,11 @@ MOTION_WORDS = {
 """Words for each motion of a support in the names of places."""
 MOTION_OF_WORDS = {words: motion for motion, words in MOTION_WORDS.items()}
 """The motion of a support by these words."""
-PREPOSITIONS = {"offsets of loads": "along", "tilts of loads": "towards"}
+PREPOSITIONS = {
+    "offsets of loads": "along",
+    "tilts of loads": "towards",
+    "offsets of gauges": "shifted",
+}
 """Words before the axis in the names of places, such as "pull, along x"."""
 EVERY_PORT = "every port"
 """Place of a law that acts at all ports of states."""

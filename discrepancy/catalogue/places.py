@@ -93,6 +93,17 @@ def _changes_of_loads(effect: EffectInSetting, change: str, places: str) -> Name
     )
 
 
+def _offsets_of_gauges(effect: EffectInSetting) -> Names:
+    """Return the gauges that are read, each with the direction, such as "g1, shifted along"."""
+    outputs = {channel.output for channel in effect.channels}
+    word = PREPOSITIONS["offsets of gauges"]
+    return tuple(
+        f"{gauge}, {word} {axis}"
+        for gauge, axis in effect.setting.model.gauge_shifts
+        if gauge in outputs
+    )
+
+
 def _calibrated_channels(effect: EffectInSetting) -> Names:
     """Return the channels with a known gain, because a free gain absorbs any gain error."""
     return effect.channels_of(lambda channel: not isinf(channel.gain_deviation))
@@ -220,6 +231,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "supports": _supports,
     "offsets of loads": lambda effect: _changes_of_loads(effect, "offset", "offsets of loads"),
     "tilts of loads": lambda effect: _changes_of_loads(effect, "tilt", "tilts of loads"),
+    "offsets of gauges": _offsets_of_gauges,
     "places of masses": lambda effect: effect.setting.model.mass_places,
     "calibrated channels": _calibrated_channels,
     "timed gauges": _gauges_read_repeatedly,
@@ -258,6 +270,7 @@ NO_PLACES = {
     "supports": "The model names no support that could yield.",
     "offsets of loads": "The model says no place of a load that could be wrong.",
     "tilts of loads": "The model says no direction of a load that could be wrong.",
+    "offsets of gauges": "The model knows no strain beside the places of its gauges.",
     "places of masses": "The model names no place where a mass could be added or lost.",
     "calibrated channels": (
         "The campaign has no channel whose gain is known, so no gain can be wrong."

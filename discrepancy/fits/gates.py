@@ -157,6 +157,11 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
             chi2.sf(parameter_deviations @ parameter_deviations, parameter_deviations.size)
         )
         tests.append(NamedTest("calibrated parameters outside their priors", p_value))
+        # at the end of its range a parameter would go on, and the evidence is that of a slope
+        low, high = layout.bounds
+        is_at_end = (fit.point.shared <= low) | (fit.point.shared >= high)
+        if is_at_end[: layout.parameter_count].any():
+            tests.append(NamedTest("a calibrated parameter at the end of its range", 0.0))
     if gain_deviations.size:
         p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
         tests.append(NamedTest("gains outside their priors", p_value))

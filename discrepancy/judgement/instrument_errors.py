@@ -8,12 +8,20 @@ from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Verdict, VerdictKind
-from fe.runtime.patch import SENSORS, Clock, LoadGain, ModelPatch, Primitive, SensorGain
+from fe.runtime.patch import (
+    READ_PLACES,
+    SENSORS,
+    Clock,
+    LoadGain,
+    ModelPatch,
+    Primitive,
+    SensorGain,
+)
 
 from .comparison import Comparison, HypothesisT
 from .proof import check_held_out
 
-INSTRUMENT_PRIMITIVES = (LoadGain, *SENSORS)
+INSTRUMENT_PRIMITIVES = (LoadGain, *READ_PLACES, *SENSORS)
 """Primitives that describe errors of instruments."""
 
 LEAST_INSTRUMENT_ERROR = 1e-3

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol, TypeVar
 
+import numpy as np
 from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
@@ -72,8 +74,28 @@ class FittedCandidates:
         self.exact_fits[()] = self.no_effect
 
     def log_prior(self, candidate: Candidate) -> float:
-        """Return the log prior probability of the effects of a candidate at their places [nat]."""
-        return log_prior(candidate, len(self.effects), self.problem.setting)
+        """Return the log prior probability of the effects of a candidate at their places [nat].
+
+        Each effect beyond the first also has to explain more than errors of a mesh may leave.
+        """
+        further_count = max(len(candidate.terms) - 1, 0)
+        of_effects = log_prior(candidate, len(self.effects), self.problem.setting)
+        return of_effects - further_count * self._mesh_error_misfit
+
+    @cached_property
+    def _mesh_error_misfit(self) -> float:
+        """The misfit by errors of a mesh, `SEARCH.mesh_error` of each reading.
+
+        It is zero without a mesh, and where all trials are at rest.
+
+        A large effect is never exactly as in the model, and what a mesh leaves of it looks like a
+        second effect that is small.
+        """
+        in_motion = any(data.trial.is_dynamic for data in self.problem.trials)
+        if not self.problem.model.nuisance_parameters or not in_motion:
+            return 0.0
+        standardised = [data.trial.values / data.deviation for data in self.problem.trials]
+        return 0.5 * SEARCH.mesh_error**2 * sum(np.nansum(values**2) for values in standardised)
 
     def score(self, fit: CandidateFit | Estimate) -> float:
         """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""

@@ -21,7 +21,7 @@ from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import SENSORS, STRUCTURE, RegionStiffnessLoss
+from fe.runtime.patch import READ_PLACES, SENSORS, STRUCTURE, RegionStiffnessLoss
 
 T = TypeVar("T")
 OnProgress = Callable[[str], None]
@@ -74,7 +74,7 @@ def changes_structure(effect: Effect, setting: Setting) -> bool:
         patch = term.patch(setting, term.start_values() + 1.0)
     except DiscrepancyError:  # only a change of the structure can be too large for the model
         return True
-    return not all(isinstance(primitive, SENSORS) for primitive in patch)
+    return not all(isinstance(primitive, (*SENSORS, *READ_PLACES)) for primitive in patch)
 
 
 def _moves_frequencies(effect: Effect, setting: Setting) -> bool:

@@ -396,9 +396,16 @@ class Search(FittedCandidates):
         """Fit effects that may act at several places at once at more and more places.
 
         At one place such an effect explains little if it acts at two, so that errors of sensors may
-        lead and no set with it would be tried. The places are therefore compared beside each other
-        whatever leads.
+        lead and no set with it would be tried. The places are therefore compared beside each other,
+        unless one change of the structure at one place is enough.
         """
+        leading_terms = self.best().candidate.terms
+        if (
+            len(leading_terms) == 1
+            and leading_terms[0].effect.at_several_places
+            and not self.is_unexplained()
+        ):
+            return
         for effect in self.effects:
             if not effect.at_several_places:
                 continue
@@ -410,8 +417,6 @@ class Search(FittedCandidates):
             if not single_fits:
                 continue
             current_fit = max(single_fits, key=self.score)
-            if current_fit is self.best() and not self.is_unexplained():
-                continue  # one place is enough
             while len(current_fit.candidate.terms) < SEARCH.largest_set:
                 current_score = self.score(current_fit)
                 rough_fits = self.fit_one_more_effect(current_fit, [effect])

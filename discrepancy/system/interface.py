@@ -81,6 +81,8 @@ class Model(ABC):
         Patches that are no damage regions and may lose stiffness.
     load_changes : tuple of (str, str, str)
         Changes of forces: the control, "offset" of its place or "tilt", and the axis.
+    gauge_shifts : tuple of (str, str)
+        Gauges whose place may be wrong, with "along" or "across".
     load_places : tuple of str, optional
         The names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
@@ -110,6 +112,7 @@ class Model(ABC):
     mass_places: tuple[str, ...] = ()
     loss_places: tuple[str, ...] = ()
     load_changes: tuple[tuple[str, str, str], ...] = ()
+    gauge_shifts: tuple[tuple[str, str], ...] = ()
     load_places: tuple[str, ...] | None = None
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False

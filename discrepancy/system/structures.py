@@ -140,16 +140,14 @@ class StructureModel(SystemModel):
                     strict=True,
                 )
             )
+            self.gauge_shifts = tuple(zip(model.shifted_gauges, model.shift_axes, strict=True))
             rows, self._unit_loads = model.whole_output, model.whole_load.T
         else:
             rows = np.concatenate((model.output_rows, model.acceleration_rows))
             self._unit_loads = model.unit_loads
         self._rows = dict(zip(names, rows, strict=True))
         if isinstance(model, ChangeableModel):
-            for ending, strain_rows in zip(ACROSS, model.across_output, strict=True):
-                gauges = model.gauges[: len(strain_rows)]
-                for gauge, row in zip(gauges, strain_rows, strict=True):
-                    self._rows[gauge + ending] = row
+            self._rows |= _strains_near_gauges(model)
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -261,17 +259,24 @@ class StructureModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return the equations of outputs, which are rows of the reduced model."""
+        """Return the equations of outputs, rows of the reduced model at the places of gauges."""
         rows = self._rows_of_changes(self._changes_of(case.state))
-        return [
-            OutputEquation.from_row(rows[output], quantity.order) for output, quantity in outputs
-        ]
+        shifts = [item for item in case.patch if isinstance(item, changes.GaugeOffset)]
+        equations = []
+        for output, quantity in outputs:
+            row = rows[output]
+            for shift in shifts:
+                if shift.gauge == output:
+                    slope, curvature = rows[f"{output}.{shift.axis}"]
+                    row = row + shift.distance * slope + 0.5 * shift.distance**2 * curvature
+            equations.append(OutputEquation.from_row(row, quantity.order))
+        return equations
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
         It carries sensors, laws at its ports, losses of its damage regions and patches, masses at
-        places, supports that yield, and errors of its forces.
+        places, supports that yield, gauges beside their places, and errors of its forces.
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)
@@ -285,6 +290,8 @@ class StructureModel(SystemModel):
             return bool(self.load_changes)
         if primitive is changes.SupportCompliance:
             return bool(self.support_motions)
+        if primitive is changes.GaugeOffset:
+            return bool(self.gauge_shifts)
         return primitive in SENSORS
 
     def force_row(
@@ -420,6 +427,17 @@ def _mesh_errors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
         )
         for number in range(1, 1 + min(model.mode_count, MODES_OF_MESH_ERRORS))
     )
+
+
+def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
+    """Return rows (n,) of strains across gauges and shear, and (2, n) of derivatives by place."""
+    rows = {}
+    for ending, strain_rows in zip(ACROSS, model.across_output, strict=True):
+        for gauge, row in zip(model.gauges[: len(strain_rows)], strain_rows, strict=True):
+            rows[gauge + ending] = row
+    shifts = zip(model.shifted_gauges, model.shift_axes, model.shift_output, strict=True)
+    rows |= {f"{gauge}.{axis}": derivatives for gauge, axis, derivatives in shifts}
+    return rows
 
 
 class _WithMeshErrors:

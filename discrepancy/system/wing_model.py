@@ -178,6 +178,7 @@ class WingModel(SystemModel):
             changes.PlaceMass,
             changes.LoadOffset,
             changes.LoadTilt,
+            changes.GaugeOffset,
         )
         return primitive in PRIMITIVES.values() and primitive not in not_carried
 

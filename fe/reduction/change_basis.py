@@ -26,6 +26,7 @@ from fe.structure.affine import AffineStructure, SupportMotion
 from fe.structure.candidates import (
     LossPlace,
     MassPlace,
+    gauge_shifts,
     load_changes,
     loss_places,
     mass_places,
@@ -261,6 +262,7 @@ class _Columns:
                 (projected,) = _projected((matrix,), columns)
                 parts.append((number, term, projected))
         model = self.reduction.model
+        shifts = gauge_shifts(self.structure)
         return ChangeableModel(
             **{field.name: getattr(model, field.name) for field in fields(ReducedModel)},
             whole_stiffness=_projected(terms.stiffness_terms, columns),
@@ -289,6 +291,11 @@ class _Columns:
             load_changes=np.array(
                 [change.vector @ columns for change in self.load_changes]
             ).reshape(len(self.load_changes), columns.shape[1]),
+            shifted_gauges=tuple(shift.gauge for shift in shifts),
+            shift_axes=tuple(shift.axis for shift in shifts),
+            shift_output=np.array([shift.rows @ columns for shift in shifts]).reshape(
+                len(shifts), 2, columns.shape[1]
+            ),
             across_output=np.array([rows @ columns for rows in strains_across(self.structure)]),
             change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
         )

@@ -126,6 +126,10 @@ class ChangeableModel(ReducedModel):
         Control of a force, "offset" or "tilt", and axis, of D changes of loads.
     load_changes : (D, n) array
         Change of the load per unit of its control, and per metre or radian.
+    shifted_gauges, shift_axes : tuple of str
+        Gauge, and "along" or "across", of E changes of the places of gauges.
+    shift_output : (E, 2, n) array
+        First and second derivative of the strain of each by the distance [1/m and 1/m2].
     across_output : (2, G, n) array
         Strains across the gauges, and shear strains; without gauges if they are not known.
     change_errors : (S + C + R,) array
@@ -155,6 +159,9 @@ class ChangeableModel(ReducedModel):
     load_change_kinds: tuple[str, ...]
     load_change_axes: tuple[str, ...]
     load_changes: Annotated[FloatArray, "changed loads", "whole"]
+    shifted_gauges: tuple[str, ...]
+    shift_axes: tuple[str, ...]
+    shift_output: Annotated[FloatArray, "gauge shifts", 2, "whole"]
     across_output: Annotated[FloatArray, 2, "gauges across", "whole"]
     change_errors: Annotated[FloatArray, "changes"]
 
@@ -164,6 +171,7 @@ class ChangeableModel(ReducedModel):
         return super()._axis_lengths() | {
             "masses added": len(self.mass_places),
             "changed loads": len(self.load_controls),
+            "gauge shifts": len(self.shifted_gauges),
             "triangle": size * (size + 1) // 2,
             "changes": places,
         }

@@ -148,6 +148,18 @@ class LoadTilt(Primitive):
     angle: Annotated[float, "rad"]
 
 
+class GaugeOffset(Primitive):
+    """A strain gauge of a structure lies by `distance` "along" itself or "across" from its place.
+
+    It stays on the surface. "Across" is towards the normal of the surface times the direction of
+    the gauge.
+    """
+
+    gauge: str
+    axis: str
+    distance: Annotated[float, "m"]
+
+
 class LoadGain(Primitive):
     """While a force is applied, (1 + `gain`) times the recorded force plus `tare` [N] acts."""
 
@@ -195,6 +207,8 @@ INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
 LOADS = (LoadPlace, LoadOffset, LoadTilt, LoadGain, Washout, InertiaRelief)
 """Primitives that change the known loads."""
+READ_PLACES = (GaugeOffset,)
+"""Primitives that change where the structure is read."""
 SENSORS = (
     SensorGain,
     SensorSaturation,
@@ -218,6 +232,7 @@ _PRIMITIVE_TYPES: tuple[type[Primitive], ...] = (
     *LAWS,
     *LOADS,
     PortLoad,
+    *READ_PLACES,
     *SENSORS,
 )
 PRIMITIVES = {primitive_type.kind: primitive_type for primitive_type in _PRIMITIVE_TYPES}

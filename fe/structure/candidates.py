@@ -24,12 +24,14 @@ from .mesh import StructureMesh
 from .nodal_loads import force_weights, point_weights, set_weights
 from .operators import Structure
 
-GRID_POINTS = 20
+GRID_POINTS = 36
 """Largest number of points of the grid at which a mass may be."""
 GRID_PATCHES = 12
 """Largest number of patches of the grid that may lose stiffness."""
 LEAST_DISTANCE = 0.1
-"""Least distance of points of a grid, and of middles of its patches, over the size of the mesh."""
+"""Least distance of the middles of patches over the size of the mesh."""
+LEAST_DISTANCE_OF_POINTS = 0.07
+"""Least distance of points of the grid of masses over the size of the mesh."""
 LARGEST_RADIUS = 0.12
 """Radius of a named set of cells, over the size of the mesh, up to which it is a patch."""
 LARGEST_NODE_SHARE = 0.5
@@ -40,6 +42,11 @@ LEAST_SINE = 0.1
 """Sine of the angle between a force and an axis below which it is not tilted towards the axis."""
 OFFSET_STEP = 0.01
 """Step of the place of a force over the size of the mesh, for its derivative."""
+GAUGE_STEP = 0.03
+"""Step of the place of a gauge over the size of the mesh: about as far as a gauge may be off, and
+larger than a cell of an ordinary mesh, whose strains jump from cell to cell."""
+GAUGE_AXES = {"along": (1.0, 0.0), "across": (0.0, 1.0)}
+"""Directions in the surface in which a gauge may lie beside its point, as seen from the gauge."""
 SETS_OF_THE_MESHER = "gmsh:"
 """Begin of the names of sets that a mesher makes, and no engineer."""
 NO_POINTS: IntArray = np.zeros(0, dtype=np.int64)
@@ -104,7 +111,9 @@ def places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
         if is_place and not name.startswith(SETS_OF_THE_MESHER):
             yield name, set_weights(mesh, name, f"the set {name!r}")
     corners = np.unique(mesh.cells[:, list(mesh.kind.corners)])
-    for number in _spread_points(mesh.points[corners], GRID_POINTS, LEAST_DISTANCE * mesh.size):
+    for number in _spread_points(
+        mesh.points[corners], GRID_POINTS, LEAST_DISTANCE_OF_POINTS * mesh.size
+    ):
         node = corners[number]
         weights = np.zeros(len(mesh.points))
         weights[node] = 1.0
@@ -307,3 +316,50 @@ def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
         rows.append((turned @ structure.expansion).tocsr())
     across, halfway = rows
     return [across, (2.0 * halfway - along - across).tocsr()]
+
+
+class GaugeShift(NamedTuple):
+    """How the strain of a gauge changes with its place.
+
+    Attributes
+    ----------
+    gauge : str
+        Name of the gauge.
+    axis : str
+        "along" the gauge or "across" it.
+    rows : csr (2, n)
+        First and second derivative of the strain by the distance [1/m and 1/m2].
+    """
+
+    gauge: str
+    axis: str
+    rows: sparse.csr_array
+
+
+def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
+    """Return how the strains of the gauges of a mesh change with the places of the gauges.
+
+    The derivatives are those of a parabola through three places. Where a gauge would reach over an
+    edge at one side, it is a straight line through the other two.
+    """
+    if not isinstance(structure, Structure):
+        return []
+    mesh = structure.mesh
+    step = GAUGE_STEP * mesh.size
+    shifts = []
+    for gauge in structure.design.gauge:
+        middle, _ = gauge_rows(mesh, (gauge,))
+        for axis, direction in GAUGE_AXES.items():
+            rises = []
+            for distance in (step, -step):
+                offset = (distance * direction[0], distance * direction[1])
+                with suppress(InvalidDesignError):
+                    rows, _ = gauge_rows(mesh, (gauge,), offset=offset)
+                    rises.append((rows - middle) / distance)
+            if not rises:
+                continue
+            slope = (rises[0] + rises[-1]) / 2.0
+            curvature = (rises[0] - rises[-1]) / step
+            derivatives = sparse.vstack((slope, curvature)) @ structure.expansion
+            shifts.append(GaugeShift(gauge.name, axis, derivatives.tocsr()))
+    return shifts

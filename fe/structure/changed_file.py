@@ -9,6 +9,7 @@ import numpy as np
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidDesignError, InvalidPatchError
 from fe.runtime.patch import (
+    GaugeOffset,
     LoadOffset,
     LoadTilt,
     ModelPatch,
@@ -19,13 +20,14 @@ from fe.runtime.patch import (
 from reporting.toml_file import read_toml
 
 from .candidates import AXES, places_of_mesh
-from .design import MeshDesign, load_structure, parse_structure
+from .design import Gauge, MeshDesign, load_structure, parse_structure
+from .gauges import gauge_axes
 from .mesh import StructureMesh
 from .nodal_loads import point_weights, set_weights
 from .operators import structure_mesh
 from .tables import MOTIONS
 
-WRITTEN = (SupportCompliance, PlaceMass, LoadOffset, LoadTilt)
+WRITTEN = (SupportCompliance, PlaceMass, LoadOffset, LoadTilt, GaugeOffset)
 """Kinds of primitives that a structure file of a mesh can state."""
 
 Tables = dict[str, Any]
@@ -71,6 +73,8 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
         elif isinstance(primitive, LoadTilt):
             row = _load_of(tables, primitive.control, "force")
             row["force"] = _tilted(np.array(row["force"], dtype=float), primitive)
+        elif isinstance(primitive, GaugeOffset):
+            _shift_gauge(tables, mesh, primitive)
         else:
             raise _not_stated(primitive, "it has no table for this")
     # parsed only as a check, which raises if the result is not a structure
@@ -128,6 +132,17 @@ def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None
         number += 1
     masses.append({"name": f"added_{number}", "point": list(point), "mass": primitive.mass})
     tables["mass"] = masses
+
+
+def _shift_gauge(tables: Tables, mesh: StructureMesh, primitive: GaugeOffset) -> None:
+    """Move the point of a gauge along itself or across, on the surface."""
+    rows = [row for row in tables.get("gauge", ()) if row["name"] == primitive.gauge]
+    if not rows:
+        raise _not_stated(primitive, f"it has no [[gauge]] {primitive.gauge!r} of its own")
+    (row,) = rows
+    along, across = gauge_axes(mesh, Gauge(**row), f"the gauge {primitive.gauge!r}")
+    axis = along if primitive.axis == "along" else across
+    row["point"] = (np.array(row["point"]) + primitive.distance / mesh.unit * axis).tolist()
 
 
 def _load_of(tables: Tables, control: str, key: str) -> Tables:

@@ -48,7 +48,10 @@ class _GaugeStrain(NamedTuple):
 
 
 def gauge_rows(
-    mesh: StructureMesh, gauges: tuple[Gauge, ...], turn: float = 0.0
+    mesh: StructureMesh,
+    gauges: tuple[Gauge, ...],
+    turn: float = 0.0,
+    offset: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[sparse.csr_array, FloatArray]:
     """Return the strains of gauges as rows on the displacements.
 
@@ -65,6 +68,8 @@ def gauge_rows(
     turn : float
         Angle in the surface from the direction of each gauge to that of the strain, about the
         outward normal [rad].
+    offset : tuple of float
+        Distance in the surface of each gauge from its point, along the gauge and across it [m].
 
     Returns
     -------
@@ -85,6 +90,9 @@ def gauge_rows(
     for number, gauge in enumerate(gauges):
         where = f"gauge[{number + 1}] ({gauge.name})"
         point = mesh.unit * np.asarray(gauge.point)
+        if any(offset):
+            along, across = gauge_axes(mesh, gauge, where)
+            point = point + offset[0] * along + offset[1] * across
         middle = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
         direction = _projected_direction(np.asarray(gauge.direction), middle.normal, where)
         surface_points = [middle]
@@ -115,6 +123,31 @@ def gauge_rows(
         direction=np.array([strain.direction for strain in strains]),
     )
     return rows, np.array(moved)
+
+
+def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors (3,) in the surface along a gauge and across it.
+
+    The second is the outward normal of the surface times the first.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh, with its nodes in metres.
+    gauge : Gauge
+        The strain gauge.
+    where : str
+        The name of the gauge in sentences.
+
+    Raises
+    ------
+    InvalidDesignError
+        If the gauge lies off the surface, or points out of it.
+    """
+    point = mesh.unit * np.asarray(gauge.point)
+    middle = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
+    along = _projected_direction(np.asarray(gauge.direction), middle.normal, where)
+    return along, np.cross(middle.normal, along)
 
 
 def _averaging_points(

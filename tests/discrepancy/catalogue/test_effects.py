@@ -415,7 +415,7 @@ def test_steps_of_sizes_are_straight_in_the_value(u, step):
 # ---------------------------------------------------------------- on lumped models
 
 WITHOUT_STATION = {"local_stiffness_loss", "gauge_misalignment", "washout", "inertia_relief", "added_mass"}
-OF_OTHERS = WITHOUT_STATION | {"load_offset", "load_direction"}
+OF_OTHERS = WITHOUT_STATION | {"load_offset", "load_direction", "gauge_offset"}
 OF_STORES = {"outflow", "overflow"}
 
 

@@ -625,11 +625,13 @@ STATIC_SETTING = kit.chain_bench(amplitudes=()).setting
 @pytest.mark.parametrize("kind", [VerdictKind.NAMED, VerdictKind.GROUP])
 def test_a_verdict_says_last_which_look_alikes_cannot_be_tested(kind):
     verdict = replace(verdict_on("gauge_gain", kind=kind), sentence="A gain is wrong.")
-    untested = kit.chosen("local_stiffness_loss", "region_stiffness_loss", "gauge_misalignment")
-    first, second, third = [effect.name for effect in untested]
-    assert verdict_with_untested_effects(verdict, STATIC_SETTING, kit.CATALOGUE).sentence == (
-        f"A gain is wrong. Not excluded, because they cannot be tested here: {first}, {second} and {third}."
+    untested = kit.chosen(
+        "local_stiffness_loss", "region_stiffness_loss", "gauge_misalignment", "gauge_offset"
     )
+    *others, last = [effect.name for effect in untested]
+    told = f"Not excluded, because they cannot be tested here: {', '.join(others)} and {last}."
+    sentence = verdict_with_untested_effects(verdict, STATIC_SETTING, kit.CATALOGUE).sentence
+    assert sentence == f"A gain is wrong. {told}"
 
 
 def test_what_can_be_tested_was_compared():

@@ -19,6 +19,17 @@ def test_a_gauge_that_is_turned_is_named(beam_model) -> None:
     assert ("gauge_misalignment", "g1") in named
 
 
+def test_a_gauge_beside_its_place_is_named_with_its_distance(beam_model) -> None:
+    """A load along the beam and one across tell it from a wrong gain: their strains fall otherwise."""
+    values, place = {"offset_ratio": 0.04}, "g1, shifted along"
+    campaign = simulated(beam_model, "laboratory", 3, ("gauge_offset", values, place))
+    rivals = chosen("gauge_offset", "gauge_gain", "load_cell")
+    verdict = investigate(campaign, beam_model, rivals, seed=3, thorough=False).verdict
+    assert verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP), verdict.sentence
+    offsets = [effect for effect in verdict.effects if effect.identifier == "gauge_offset"]
+    assert place in [effect.place for effect in offsets]
+
+
 def test_a_force_may_lean_towards_the_axes_across_it(beam_model) -> None:
     (effect,) = chosen("load_direction")
     campaign = simulated(beam_model, "static", 3)

@@ -26,8 +26,9 @@ from fe.runtime.patch import (
     SupportCompliance,
 )
 from fe.structure.affine import AffineStructure
-from fe.structure.candidates import loss_places, mass_places
-from fe.structure.operators import assemble_structure
+from fe.structure.candidates import GAUGE_STEP, gauge_shifts, loss_places, mass_places
+from fe.structure.gauges import gauge_rows
+from fe.structure.operators import Structure, assemble_structure
 
 WriteBeam = Callable[..., Path]
 
@@ -415,6 +416,21 @@ def test_a_load_that_is_moved_or_turned_is_that_of_another_file(
     assert changed[3] == pytest.approx(expected[3], rel=5e-3)
     change = np.abs(expected - plain).max()
     assert np.abs(changed - expected).max() < 0.35 * change  # the first derivative on a coarse mesh
+
+
+def test_a_gauge_beside_its_place_reads_what_one_there_does(beam: Structure) -> None:
+    shifts = {(shift.gauge, shift.axis): shift for shift in gauge_shifts(beam)}
+    slope, curvature = shifts["g2", "along"].rows.toarray()
+    gauge = beam.design.gauge[1]
+    distance = -GAUGE_STEP * beam.mesh.size
+    x, *others = gauge.point
+    moved = gauge.model_copy(update={"point": (x + 1e3 * distance, *others)})
+    rows, _ = gauge_rows(beam.mesh, (gauge, moved))
+    middle, expected = (rows @ beam.expansion).toarray()
+
+    found = middle + distance * slope + 0.5 * distance**2 * curvature
+
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_strain_across_a_gauge_is_that_of_poisson(flanged: Yielding) -> None:

@@ -13,6 +13,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangedStructure
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import (
+    GaugeOffset,
     LoadTilt,
     ModelPatch,
     PlaceMass,
@@ -65,6 +66,13 @@ def test_a_file_states_a_support_that_yields_a_mass_and_a_load_that_leans(
     expected = model.whole_output[: len(outputs)] @ displacements
     assert outputs == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected[:1]).max())
     assert frequencies[:3] == pytest.approx(structure.modes.frequency[:3], rel=2e-3)
+
+
+def test_a_file_states_a_gauge_beside_its_place(write_beam: WriteBeam, tmp_path: Path) -> None:
+    file = write_beam(tmp_path, cells=2)
+    patch = ModelPatch((GaugeOffset("g1", "along", 2e-3),))
+    (gauge, *_) = changed_tables(file, patch, tmp_path)["gauge"]
+    assert gauge["point"] == pytest.approx([22.0, 10.0, 10.0])
 
 
 @pytest.mark.parametrize(
