@@ -131,12 +131,10 @@ def _with_test_on_held_out(
     verdict = outcome.verdict
     if verdict.kind not in KINDS_FOR_NOISE_ALONE:
         return outcome
-    # a χ² against the recorded noise, which does not take the residual process as noise
-    gate = check_held_out(
-        comparison.search.residuals(replace(outcome.fit, residual_process=None))
-        if outcome.fit.residual_process is not None
-        else comparison.search.residuals(outcome.fit)
-    )
+    fit = outcome.fit
+    if fit.residual_process is not None:  # a χ² against the recorded noise alone
+        fit = replace(fit, residual_process=None)
+    gate = check_held_out(comparison.search.residuals(fit))
     sentence = f"{verdict.sentence} {gate.reason}" if gate.has_failed else verdict.sentence
     return outcome._replace(
         verdict=replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
