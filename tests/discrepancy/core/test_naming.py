@@ -288,7 +288,7 @@ def assert_intervals_hold(effect, values):
         assert abs(truth - middle) <= 2.0 * half_width + 0.005 * abs(truth), estimate
 
 
-@pytest.mark.parametrize("slip_ratio", [0.3, 1.5])
+@pytest.mark.parametrize("slip_ratio", [0.3, pytest.param(1.5, marks=pytest.mark.long)])
 def test_a_joint_that_slips_is_named_though_it_has_more_elements(slip_ratio):
     """A joint of 400 elements; with too few of its own the model would take their dents for knowledge."""
     values = {"stiffness_share": 0.3, "slip_ratio": slip_ratio}

@@ -413,7 +413,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     write_drive(tmp_path)
     problem = read(tmp_path)
     search = ForceSearch(problem)
-    rivals = chosen("coulomb_friction", "quadratic_damping", "bouc_wen_hysteresis", "load_cell")
+    rivals = chosen("coulomb_friction", "bouc_wen_hysteresis", "load_cell")
     best, *_ = rank_hypotheses(search, rivals, largest_set=1)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
