@@ -33,6 +33,7 @@ from discrepancy.judgement.hypotheses import calibrated_parameters
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import errors_of_fit, prove_effects
 from discrepancy.judgement.remarks import (
+    KINDS_OF_NOISE_ALONE,
     KINDS_WITH_NAME,
     KINDS_WITHOUT_GAP,
     look_alike_remark,
@@ -70,8 +71,6 @@ if TYPE_CHECKING:  # it takes long to import
 DRAWS = 400
 CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
 """Verdicts after which no experiment is proposed."""
-KINDS_OF_NOISE_ALONE = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
-"""Verdicts on effects whose simulation leaves only noise."""
 
 
 @dataclass(frozen=True)

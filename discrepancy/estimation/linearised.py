@@ -339,7 +339,7 @@ class LinearisedTrial:
             # residual is that of the simulation; the derivatives are those along its motion.
             weights = np.concatenate(([1.0], self.shared, self.effect, self.simulation.local))
             error = self.simulation.residual - columns @ weights
-            columns[:, ~self._shows_laws_at_once, CONSTANT] += error[:, ~self._shows_laws_at_once]
+            columns[:, :, CONSTANT] += np.where(self._shows_laws_at_once, 0.0, error)
         return columns * trial.used[:, :, None]
 
     @property

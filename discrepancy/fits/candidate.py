@@ -161,6 +161,11 @@ class Candidate:
         return any(term.free_shape for term in self.terms)
 
     @property
+    def can_imitate_nearly_anything(self) -> bool:
+        """Whether a law of free shape acts together with another effect."""
+        return self.has_free_shape and len(self.terms) > 1
+
+    @property
     def parameters(self) -> list[EffectParameter | ShapeParameter]:
         """The fitted parameters of all effects, in order."""
         return [parameter for term in self.terms for parameter in term.parameters]

@@ -12,6 +12,7 @@ from functools import cache, cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
+from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
@@ -20,15 +21,14 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.proof_record import ErrorComparison
-from discrepancy.search.fitted_candidates import probabilities_of_sets
+from discrepancy.search.fitted_candidates import ComparedHypothesis
 from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
-from reporting.probabilities import probability_of_some
+from reporting.probabilities import normalised_probabilities, probability_of_some
 
 from .closed_share import closed_share_text
-from .hypotheses import ComparedHypothesis
 from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
@@ -142,7 +142,7 @@ class Comparison(ABC, Generic[HypothesisT]):
 
     def score(self, hypothesis: HypothesisT) -> float:
         """Return ln (evidence times prior) of a hypothesis [nat]."""
-        return hypothesis.log_evidence + self.search.log_prior(hypothesis.candidate)
+        return self.search.score(hypothesis)
 
     def log_bayes_factor(self, hypothesis: HypothesisT) -> float:
         """Return ln of the evidence of a hypothesis over that of the model as it is [nat].
@@ -155,8 +155,19 @@ class Comparison(ABC, Generic[HypothesisT]):
         return hypothesis.log_evidence - log_places - self.log_evidence_of_nothing
 
     def set_probabilities(self) -> Mapping[EffectSet, float]:
-        """Return the probability of each set of effects over all places, in descending order."""
-        return probabilities_of_sets(self.ranked_hypotheses, self.score)
+        """Return the probability of each set of effects over all places, in descending order.
+
+        Sets that can imitate nearly anything are no rivals of a name.
+        """
+        scores_by_set: dict[EffectSet, list[float]] = {}
+        for hypothesis in self.ranked_hypotheses:
+            candidate = hypothesis.candidate
+            if not candidate.can_imitate_nearly_anything:
+                scores_by_set.setdefault(candidate.identifiers, []).append(self.score(hypothesis))
+        log_weights = {names: float(logsumexp(scores)) for names, scores in scores_by_set.items()}
+        sets_in_order = sorted(log_weights, key=lambda names: -log_weights[names])
+        probabilities = normalised_probabilities([log_weights[names] for names in sets_in_order])
+        return dict(zip(sets_in_order, probabilities.tolist(), strict=True))
 
     def best_of_set(self, identifiers: EffectSet) -> HypothesisT:
         """Return the most probable hypothesis of a set of effects, whatever their places."""
@@ -246,7 +257,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
             return "it describes readings but no physical cause, and leaves more than noise"
-        if candidate.has_free_shape and len(candidate.terms) > 1:
+        if candidate.can_imitate_nearly_anything:
             return "beside another law, a law with a free shape can imitate nearly anything"
         fitted_share = self.gap_share(hypothesis, held_out=False)
         if _is_share_too_small(fitted_share, self.least_low_end):

@@ -30,13 +30,11 @@ from .noise_case import NoiseCase
 from .noise_verdict import decide_on_noise
 from .proof import check_held_out
 from .remainder_verdict import decide_on_remainder, named_in_part_outcome, unexplained_outcome
-from .remarks import KINDS_WITHOUT_GAP
+from .remarks import KINDS_OF_NOISE_ALONE, KINDS_WITHOUT_GAP
 from .sensor_estimates import sensor_estimates
 from .simulation_comparison import SimulationComparison
 from .verdict_checks import check_against_trials
 
-KINDS_FOR_NOISE_ALONE = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
-"""Kinds of verdicts on effects beside which only noise remains."""
 COLOURED = "which is coloured as its records admit"
 """What is said of noise that is correlated in time."""
 
@@ -100,6 +98,7 @@ def comparison_of(search: Search) -> ForceComparison | SimulationComparison:
 def _decide(search: Search) -> VerdictOutcome:
     """Return the verdict on the hypotheses of a search."""
     comparison = comparison_of(search)
+    # the two calls are one for the reader: all hypotheses of a comparison have the same type
     if isinstance(comparison, ForceComparison):
         return _decide_on_comparison(comparison)
     return _decide_on_comparison(comparison)
@@ -129,7 +128,7 @@ def _with_test_on_held_out(
 ) -> VerdictOutcome:
     """Return the outcome with the test of its effects on held-out trials, if it has effects."""
     verdict = outcome.verdict
-    if verdict.kind not in KINDS_FOR_NOISE_ALONE:
+    if verdict.kind not in KINDS_OF_NOISE_ALONE:
         return outcome
     fit = outcome.fit
     if fit.residual_process is not None:  # a χ² against the recorded noise alone

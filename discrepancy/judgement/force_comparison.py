@@ -14,11 +14,11 @@ from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.missing_force.port_force import missing_force
 from discrepancy.missing_force.shares import ForceShares
+from discrepancy.search.fitted_candidates import ComparedHypothesis
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 
 from .comparison import Comparison
-from .hypotheses import ComparedHypothesis
 
 
 class ForceComparison(Comparison[Estimate]):
@@ -108,7 +108,8 @@ class ForceComparison(Comparison[Estimate]):
     def record_values(self, hypothesis: Estimate) -> ComparedHypothesis:
         """Return the hypothesis with the values of its fit to the readings if it leaves no force.
 
-        The steps of the estimate integrate dry friction to first order only.
+        These are the values of the name. The estimate of a body that sticks may end before it has
+        converged, and is then wider.
         """
         simulation = self.search.exact_fits.get(hypothesis.candidate.key)
         if simulation is None or not hypothesis.leaves_no_force:

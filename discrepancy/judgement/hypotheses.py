@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import isnan, nan
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from discrepancy.catalogue.entry import (
     ForceTable,
     ShapeParameter,
 )
-from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
+from discrepancy.search.fitted_candidates import ComparedHypothesis
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
     FREE_SHAPE,
@@ -33,33 +33,6 @@ from .curve_words import curve_in_words, curve_of, followed_variable
 
 TOLD_POINT = 6
 """Every how many points of a table of forces one is told."""
-
-
-class ComparedHypothesis(Protocol):
-    """A fitted hypothesis: a simulation (`CandidateFit`), or a fit to the missing force."""
-
-    @property
-    def candidate(self) -> Candidate:
-        """The effects."""
-
-    @property
-    def effect(self) -> FloatArray:
-        """The scaled effect parameters (E,)."""
-
-    @property
-    def shared(self) -> FloatArray:
-        """The scaled shared unknowns (Q,)."""
-
-    @property
-    def covariance(self) -> FloatArray:
-        """The covariance (Q + E, Q + E) of shared unknowns and effect parameters."""
-
-    @property
-    def log_evidence(self) -> float:
-        """The log evidence [nat]."""
-
-    def __hash__(self) -> int:
-        """Return the hash of the object, by its identity: two fits are never equal."""
 
 
 class VerdictOutcome(NamedTuple):
@@ -81,12 +54,23 @@ class WeightedHypothesis(NamedTuple):
     probability: float
 
 
-def list_hypotheses(
-    search: Search, verdict: Verdict, hypotheses: Sequence[WeightedHypothesis]
-) -> Verdict:
-    """Return a verdict that lists the hypotheses of a search with their probabilities.
+def outcome_with_hypotheses(
+    verdict: Verdict, search: Search, fit: CandidateFit, hypotheses: Sequence[WeightedHypothesis]
+) -> VerdictOutcome:
+    """Return a verdict that lists the hypotheses of a search, and what its fit leaves.
 
     The probability of each effect of the catalogue to be one of the missing ones is added, too.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        The verdict without hypotheses.
+    search : Search
+        The search whose hypotheses they are.
+    fit : CandidateFit
+        The fit that represents the verdict.
+    hypotheses : sequence of WeightedHypothesis
+        The hypotheses with their probabilities, in the order in which they are listed.
     """
     inclusion = {effect.identifier: 0.0 for effect in search.effects}
     for hypothesis, probability in hypotheses:
@@ -97,7 +81,13 @@ def list_hypotheses(
         hypothesis_record(search.problem, hypothesis, probability)
         for hypothesis, probability in hypotheses
     ]
-    return replace(verdict, hypotheses=tuple(records), inclusion=inclusion)
+    complete_verdict = replace(
+        verdict,
+        hypotheses=tuple(records),
+        inclusion=inclusion,
+        remainders=_remainder_estimates(search.problem, fit),
+    )
+    return VerdictOutcome(complete_verdict, search, fit)
 
 
 def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability: float) -> str:
@@ -306,7 +296,7 @@ def calibrated_parameters(
     return tuple(parameter_records)
 
 
-def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
+def _remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
     """Return the residual process of each channel whose residuals are more than noise."""
     process = fit.residual_process
     if process is None:

@@ -1,7 +1,6 @@
 """What the rules for noise ask of a comparison of hypotheses."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 from typing import Generic, NamedTuple
 
@@ -16,9 +15,8 @@ from .consistency_gate import check_consistency
 from .hypotheses import (
     VerdictOutcome,
     WeightedHypothesis,
-    list_hypotheses,
     names_without_free_shape,
-    remainder_estimates,
+    outcome_with_hypotheses,
 )
 
 
@@ -221,10 +219,8 @@ class NoiseCase(Generic[HypothesisT]):
         for names, set_probability in self.probabilities.items():
             hypothesis = self.comparison.record_values(self.comparison.best_of_set(names))
             sets.append(WeightedHypothesis(hypothesis, set_probability))
-        search = self.comparison.search
         fit = self.no_effect_fit if fit is None else fit
-        verdict = replace(verdict, remainders=remainder_estimates(self.problem, fit))
-        return VerdictOutcome(list_hypotheses(search, verdict, sets), search, fit)
+        return outcome_with_hypotheses(verdict, self.comparison.search, fit, sets)
 
     def unexplained(
         self, sentence: str, probability: float, gates: tuple[Gate, ...], names: EffectSet

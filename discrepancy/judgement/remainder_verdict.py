@@ -22,11 +22,10 @@ from .hypotheses import (
     WeightedHypothesis,
     curve_sentence,
     effects_text,
-    list_hypotheses,
     named_effects,
     names_without_free_shape,
+    outcome_with_hypotheses,
     probability_text,
-    remainder_estimates,
 )
 
 LEAST_MENTIONED_SHARE = 0.1
@@ -462,6 +461,5 @@ def _outcome(
         family=family,
         gates=gates,
         resembles=resembles,
-        remainders=remainder_estimates(comparison.problem, fit),
     )
-    return VerdictOutcome(list_hypotheses(search, verdict, weighted_hypotheses), search, fit)
+    return outcome_with_hypotheses(verdict, search, fit, weighted_hypotheses)

@@ -19,6 +19,8 @@ from reporting.words import listing
 
 KINDS_WITHOUT_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
 """Kinds of verdicts after which the model remains unchanged: no gap was detected."""
+KINDS_OF_NOISE_ALONE = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Kinds of verdicts on effects whose simulation leaves only noise."""
 KINDS_WITH_NAME = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY)
 """Kinds of verdicts that name one set of effects, or its family."""
 MOST_MENTIONED = 3

@@ -192,6 +192,7 @@ class SimulationComparison(Comparison[CandidateFit]):
     def admit_remainder(self) -> None:
         """Compare the hypotheses under a noise as large as the residuals of the best one."""
         compare_under_wide_noise(self.search)
+        self._subsets.clear()  # they were fitted under the recorded noise
 
     def admit_no_remainder(self) -> None:
         """Compare the hypotheses under the recorded noise again."""

@@ -10,7 +10,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
 from discrepancy.estimation.filtered import SmoothedTrial
-from discrepancy.estimation.force_search import WIDE_WINDOW, ForceSearch, TrialSet
+from discrepancy.estimation.force_search import WIDE_WINDOW, ForceSearch
 from discrepancy.estimation.gauss_newton import (
     EstimatorStart,
     linearise_along_laws,
@@ -18,6 +18,7 @@ from discrepancy.estimation.gauss_newton import (
 )
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
 from discrepancy.estimation.process_search import Processes
+from discrepancy.estimation.trial_set import TrialSet
 from discrepancy.fits.candidate import Point
 from discrepancy.trials_in_motion.trial import PortedTrial
 

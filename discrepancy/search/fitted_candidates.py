@@ -1,15 +1,13 @@
 """The candidates that a search has fitted, with their scores and probabilities."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
-from scipy.special import logsumexp
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.estimation.estimate import Estimate
 from discrepancy.estimation.log_prior import log_prior
 from discrepancy.fits.candidate import Candidate, CandidateKey
 from discrepancy.fits.fitting import CandidateFit, try_fit
@@ -19,18 +17,33 @@ from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.proof_record import ErrorComparison
 from discrepancy.search_settings import SEARCH
-from reporting.probabilities import normalised_probabilities
 
 
-class HasCandidate(Protocol):
-    """A hypothesis: a simulation (`CandidateFit`), or an estimate with the missing force."""
+class ComparedHypothesis(Protocol):
+    """A fitted hypothesis: a simulation (`CandidateFit`), or a fit to the missing force."""
 
     @property
     def candidate(self) -> Candidate:
         """The effects."""
 
+    @property
+    def effect(self) -> FloatArray:
+        """The scaled effect parameters (E,)."""
 
-HypothesisT = TypeVar("HypothesisT", bound=HasCandidate)
+    @property
+    def shared(self) -> FloatArray:
+        """The scaled shared unknowns (Q,)."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The covariance (Q + E, Q + E) of shared unknowns and effect parameters."""
+
+    @property
+    def log_evidence(self) -> float:
+        """The log evidence [nat]."""
+
+    def __hash__(self) -> int:
+        """Return the hash of the object, by its identity: two fits are never equal."""
 
 
 @dataclass
@@ -73,33 +86,30 @@ class FittedCandidates:
     def __post_init__(self) -> None:
         self.exact_fits[()] = self.no_effect
 
-    def log_prior(self, candidate: Candidate) -> float:
-        """Return the log prior probability of the effects of a candidate at their places [nat].
+    def score(self, hypothesis: ComparedHypothesis) -> float:
+        """Return ln (evidence times prior) of a hypothesis, up to a constant [nat].
 
         Each effect beyond the first also has to explain more than errors of a mesh may leave.
         """
+        candidate = hypothesis.candidate
+        prior = log_prior(candidate, len(self.effects), self.problem.setting)
         further_count = max(len(candidate.terms) - 1, 0)
-        of_effects = log_prior(candidate, len(self.effects), self.problem.setting)
-        return of_effects - further_count * self._mesh_error_misfit
+        return hypothesis.log_evidence + prior - further_count * self._mesh_error_misfit
 
     @cached_property
     def _mesh_error_misfit(self) -> float:
-        """The misfit by errors of a mesh, `SEARCH.mesh_error` of each reading.
+        """The misfit by errors of a mesh, `SEARCH.mesh_error` of each reading [nat].
 
-        It is zero without a mesh, and where all trials are at rest.
-
-        A large effect is never exactly as in the model, and what a mesh leaves of it looks like a
-        second effect that is small.
+        It is zero without a mesh, and where all trials are at rest. A large effect is never exactly
+        as in the model, and what a mesh leaves of it looks like a second effect that is small.
         """
         in_motion = any(data.trial.is_dynamic for data in self.problem.trials)
         if not self.problem.model.nuisance_parameters or not in_motion:
             return 0.0
-        standardised = [data.trial.values / data.deviation for data in self.problem.trials]
-        return 0.5 * SEARCH.mesh_error**2 * sum(np.nansum(values**2) for values in standardised)
-
-    def score(self, fit: CandidateFit | Estimate) -> float:
-        """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
-        return fit.log_evidence + self.log_prior(fit.candidate)
+        squares = 0.0
+        for data in self.problem.trials:
+            squares += float(np.nansum((data.trial.values / data.deviation) ** 2))
+        return 0.5 * SEARCH.mesh_error**2 * squares
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
         """Return the fits that the comparison of candidates uses, one for each candidate.
@@ -112,13 +122,6 @@ class FittedCandidates:
     def best(self) -> CandidateFit:
         """Return the fit of the most probable candidate among the compared fits."""
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
-
-    def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the fit with the highest score of a set of effects, whatever their places."""
-        fits = self.compared_fits().values()
-        return max(
-            (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
-        )
 
     def residuals(self, fit: CandidateFit) -> ResidualSet:
         """Return the residuals of a fit in the fitted and the held-out trials.
@@ -142,10 +145,6 @@ class FittedCandidates:
     def compared_no_effect(self) -> CandidateFit:
         """The fit without effect, under the same noise as the other compared candidates."""
         return self.wide_fits.get((), self.no_effect)
-
-    def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of effects over all places, in descending order."""
-        return probabilities_of_sets(self.compared_fits().values(), self.score)
 
     def record_fit(self, fit: CandidateFit, *, exact: bool) -> CandidateFit:
         """Store a fit unless an earlier fit of the same candidate has more evidence.
@@ -191,29 +190,3 @@ class FittedCandidates:
         converged_fit = try_fit(self.problem, rough_fit.candidate, rough_fit.point)
         # the rough fit may be at a point from which the model cannot be fitted further
         return self.record_fit(converged_fit or rough_fit, exact=True)
-
-
-def probabilities_of_sets(
-    hypotheses: Iterable[HypothesisT], score: Callable[[HypothesisT], float]
-) -> dict[tuple[str, ...], float]:
-    """Return the probability of each set of effects over all places, in descending order.
-
-    Parameters
-    ----------
-    hypotheses : iterable of CandidateFit or Estimate
-        The hypotheses that are compared.
-    score : callable
-        Returns ln (evidence times prior) of a hypothesis [nat].
-    """
-    scores_by_set: dict[tuple[str, ...], list[float]] = {}
-    for hypothesis in hypotheses:
-        identifiers = hypothesis.candidate.identifiers
-        scores_by_set.setdefault(identifiers, []).append(score(hypothesis))
-    log_weights = {
-        identifiers: float(logsumexp(set_scores))
-        for identifiers, set_scores in scores_by_set.items()
-    }
-    sets_in_order = sorted(log_weights, key=lambda identifiers: -log_weights[identifiers])
-    log_weights_in_order = [log_weights[identifiers] for identifiers in sets_in_order]
-    probabilities = normalised_probabilities(log_weights_in_order).tolist()
-    return dict(zip(sets_in_order, probabilities, strict=True))

@@ -345,7 +345,11 @@ class Search(FittedCandidates):
         self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
         if len(force_search.model_laws):
             self._estimate_along_laws_of_model(force_search)
-        best_estimate = self.force_estimates[0]
+        best_estimate = next(
+            estimate
+            for estimate in self.force_estimates
+            if not estimate.candidate.can_imitate_nearly_anything
+        )
         if best_estimate.candidate.terms:
             self.on_progress(f"fitting {best_estimate.candidate.description} until it converges")
             start = force_search.point(best_estimate)

@@ -197,12 +197,12 @@ class MetricsServer:
 
     def __init__(self, host: str, port: int) -> None:
         self._metrics_of_asset: dict[str, WatchMetrics] = {}
-        self._registry = CollectorRegistry()
-        self._registry.register(self)
+        self._collectors = CollectorRegistry()
+        self._collectors.register(self)
         with MissionInputError.instead_of(
             OSError, before=f"the metrics cannot be served at {host}:{port}: ", after="."
         ):
-            self._server, self._thread = start_http_server(port, host, self._registry)
+            self._server, self._thread = start_http_server(port, host, self._collectors)
         self.address = f"http://{host}:{self._server.server_port}/metrics"
 
     def attach(self, asset: str, watch: Watch) -> WatchMetrics:
@@ -242,7 +242,7 @@ class MetricsServer:
 
     def text(self) -> str:
         """Return the figures in the text format of Prometheus; empty before a watch is attached."""
-        text: str = generate_latest(self._registry).decode()
+        text: str = generate_latest(self._collectors).decode()
         return text
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.judgement.decide import reach_verdict
+from discrepancy.judgement.decide import comparison_of, reach_verdict
 from discrepancy.judgement.noise_case import NoiseCase
 from discrepancy.judgement.noise_verdict import common_effects_verdict, undecided_verdict
 from discrepancy.judgement.remainder_verdict import not_named_sentence
@@ -142,7 +142,7 @@ def concluded(label, seed):
         laws=laws,
         words=frozenset(case.get("names", ())),
         verdict=verdict,
-        set_probabilities=search.set_probabilities(),
+        set_probabilities=comparison_of(search).set_probabilities(),
         compared_sets=frozenset(item.candidate.identifiers for item in search.compared_fits().values()),
         fitted_effects=fit.candidate.identifiers,
     )
@@ -425,6 +425,18 @@ def test_what_does_not_fit_alone_is_not_named_though_all_probable_sets_hold_it(f
     cell_and_gain = identifiers(terms, "load_cell", "gauge_gain")
     probabilities = {cell_and_gain: 0.6, ("load_cell",): 0.4}
     assert common_effects_verdict(case_of(friction_search, probabilities)) is None
+
+
+def test_a_law_of_free_shape_beside_another_effect_is_no_rival_of_a_name(friction_search, terms):
+    """Together they can imitate nearly anything."""
+    free = replace(terms["coulomb_friction"], free_shape=True)
+    fit = friction_search.record_fit(
+        kit.fitted(friction_search.problem, free, terms["gauge_gain"]), exact=True
+    )
+    probabilities = SimulationComparison(friction_search).set_probabilities()
+    del friction_search.exact_fits[fit.candidate.key]
+    assert fit.candidate.identifiers not in probabilities
+    assert FRICTION_ALONE in probabilities
 
 
 def test_nothing_is_named_where_the_model_without_effects_is_probable(friction_search):

@@ -1,0 +1,128 @@
+"""The trials in motion of a problem as linear systems, and an estimate carried from some to others.
+
+The others are linear about other unknowns, or have all samples of thinned trials.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.problem import Problem
+from discrepancy.trials_in_motion.effects import EffectLaws
+from discrepancy.trials_in_motion.ported_trial import ported_trial, thin_trial
+from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial
+from fe.runtime.patch import ModelPatch
+
+from .estimate import Estimate
+from .gauss_newton import EstimatorStart, start_from_estimate
+
+
+@dataclass(frozen=True, eq=False)
+class TrialSet:
+    """Some trials in motion of a problem, from which linear systems with ports and laws are made.
+
+    Attributes
+    ----------
+    problem : Problem
+        The campaign and the model without its own laws, with the layout of their unknowns.
+    trial_indices : sequence of int
+        The indices of the trials in the problem.
+    evaluate_model_laws : callable
+        The function that takes the shared unknowns (K,) and returns the model's own laws at ports.
+    unknowns_of_model_laws : tuple of int
+        The numbers of the shared unknowns that change the model's own laws.
+    sample_limit : int or None
+        The number of samples of all trials together to which trials are thinned, if they can be.
+    """
+
+    problem: Problem
+    trial_indices: Sequence[int]
+    evaluate_model_laws: Callable[[FloatArray], ModelPatch]
+    unknowns_of_model_laws: tuple[int, ...]
+    sample_limit: int | None = None
+
+    def with_problem(self, problem: Problem, trial_indices: Sequence[int]) -> "TrialSet":
+        """Return all samples of other trials, with the same model."""
+        return replace(self, problem=problem, trial_indices=trial_indices, sample_limit=None)
+
+    def trials_about(self, point: Point) -> tuple[PortedTrial, ...]:
+        """Return the trials as systems with ports, linear about values of the unknowns."""
+        sample_counts = [len(self.problem.trials[k].trial.time) for k in self.trial_indices]
+        wanted_stride = 1.0
+        if self.sample_limit is not None:
+            wanted_stride = sum(sample_counts) / self.sample_limit
+        return tuple(
+            thin_trial(ported_trial(self.problem, number, point), wanted_stride)
+            for number in self.trial_indices
+        )
+
+    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+        """Return the laws and sensor errors of a hypothesis in these trials."""
+        return EffectLaws(
+            problem=self.problem,
+            trials=tuple(trials),
+            trial_indices=self.trial_indices,
+            candidate=candidate,
+            evaluate_model_laws=self.evaluate_model_laws,
+            unknowns_of_model_laws=self.unknowns_of_model_laws,
+        )
+
+
+def start_in_other_trials(
+    estimate: Estimate, other_trials: Sequence[PortedTrial]
+) -> EstimatorStart:
+    """Return the start of an estimate in trials that are linear about other unknowns.
+
+    The motion of the ports stays the same. The model moves them differently about other unknowns,
+    so that the added state changes by what moves the ports back.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The estimate of the motion and of all unknowns.
+    other_trials : sequence of PortedTrial
+        The trials in which the next estimate is made, with the same fine stamps.
+    """
+    trajectories = []
+    for smoothed_trial, other_trial in zip(estimate.trials, other_trials, strict=True):
+        unknowns = np.concatenate((estimate.shared, smoothed_trial.local))
+        trajectory = smoothed_trial.trajectory
+        motion = smoothed_trial.trial.port_motion(unknowns, trajectory.added_state)
+        other_motion = other_trial.port_motion(unknowns, trajectory.added_state)
+        motion_difference = np.concatenate(motion, axis=1) - np.concatenate(other_motion, axis=1)
+        motion_by_state = np.concatenate((other_trial.system.positions, other_trial.system.speeds))
+        change = motion_difference @ np.linalg.pinv(motion_by_state).T
+        trajectories.append(replace(trajectory, added_state=trajectory.added_state + change))
+    return replace(start_from_estimate(estimate), trajectories=tuple(trajectories))
+
+
+def trajectory_in_all_samples(
+    thinned_trial: PortedTrial, trial: PortedTrial, trajectory: Trajectory, unknowns: FloatArray
+) -> Trajectory:
+    """Return the motion of a thinned trial at all fine stamps of the record.
+
+    The added state and the forces are interpolated. The motion of the ports is that of the model,
+    which is known at all stamps, and what the added state adds to it.
+
+    Parameters
+    ----------
+    thinned_trial, trial : PortedTrial
+        The trial with some of its samples, and with all of them.
+    trajectory : Trajectory
+        The motion of the thinned trial.
+    unknowns : (K + L,) array
+        The values of the shared unknowns, then of those of the trial alone.
+    """
+    time, thinned_time = trial.fine_time, thinned_trial.fine_time
+    added_state = np.column_stack(
+        [np.interp(time, thinned_time, state) for state in trajectory.added_state.T]
+    )
+    forces = {
+        port: np.interp(time, thinned_time, force) for port, force in trajectory.forces.items()
+    }
+    positions, speeds = trial.port_motion(unknowns, added_state)
+    return Trajectory(added_state, positions, speeds, forces)
