@@ -203,31 +203,24 @@ _Record = TypeVar("_Record")
 
 @dataclass(frozen=True)
 class Origin:
-    """What a verdict was reached from.
-
-    Attributes
-    ----------
-    campaign, model : str
-        Names of the campaign and the model, for messages and pages.
-    data_hash, model_hash : str
-        SHA-256 of the campaign's files and of the model.
-    command : str
-        The command that repeats the investigation in any folder, with absolute paths.
-    provenance : Provenance
-        Seed, versions, hashes of the sources.
-    model_file : str or None
-        Absolute path of the model's file, or of the folder of a mission whose twin used the model;
-        for a shipped model its name, empty for the shipped wing. None in files of versions that did
-        not record it.
-    """
+    """What a verdict was reached from."""
 
     campaign: str
+    """Name of the campaign, for messages and pages."""
     model: str
+    """Name of the model, for messages and pages."""
     data_hash: str
+    """SHA-256 of the campaign's files."""
     model_hash: str
+    """SHA-256 of the model."""
     command: str
+    """The command that repeats the investigation in any folder, with absolute paths."""
     provenance: Provenance
+    """Seed, versions, hashes of the sources."""
     model_file: str | None = None
+    """Absolute path of the model's file, or of the folder of a mission whose twin used the model;
+    for a shipped model its name, empty for the shipped wing. None in files of versions that did not
+    record it."""
 
     @property
     def short_command(self) -> str:

@@ -38,22 +38,16 @@ OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 
 @dataclass(frozen=True)
 class ParameterCoverage:
-    """A parameter of a named effect: its true value, and the 90 % interval that was found.
-
-    Attributes
-    ----------
-    parameter : str
-        Name of the parameter.
-    true : float
-        The value with which the campaign was simulated [unit of the parameter].
-    low, high : float
-        Limits of the 90 % interval that was found [unit of the parameter].
-    """
+    """A parameter of a named effect: its true value, and the 90 % interval that was found."""
 
     parameter: str
+    """Name of the parameter."""
     true: float
+    """The value with which the campaign was simulated [unit of the parameter]."""
     low: float
+    """Lower limit of the 90 % interval that was found [unit of the parameter]."""
     high: float
+    """Upper limit of this interval [unit of the parameter]."""
 
     @property
     def contains_true_value(self) -> bool:
@@ -63,35 +57,24 @@ class ParameterCoverage:
 
 @dataclass(frozen=True)
 class CalibrationCase:
-    """One simulated campaign.
-
-    Attributes
-    ----------
-    hidden : str
-        Identifier of the hidden effect; "nothing" if there is none.
-    place : str
-        Place where the effect acts.
-    distance : float
-        Squared distance d^2 of the readings with and without the effect [noise variances].
-    kind : VerdictKind
-        Kind of the verdict.
-    named : tuple of str
-        Identifiers of the effects in the verdict: the named ones, the members of a group, or the
-        nearest member of a family.
-    outcome : str
-        "right", "wrong", "missed", "in part", "group", "family", "unexplained", "below
-        detectability" or "data error"; see `outcome_of`.
-    covered : tuple of ParameterCoverage
-        Parameters of the effect with their intervals, if it was named correctly.
-    """
+    """One simulated campaign."""
 
     hidden: str
+    """Identifier of the hidden effect; "nothing" if there is none."""
     place: str
+    """Place where the effect acts."""
     distance: float
+    """Squared distance d^2 of the readings with and without the effect [noise variances]."""
     kind: VerdictKind
+    """Kind of the verdict."""
     named: tuple[str, ...]
+    """Identifiers of the effects in the verdict: the named ones, the members of a group, or the
+    nearest member of a family."""
     outcome: str
+    """"right", "wrong", "missed", "in part", "group", "family", "unexplained", "below
+    detectability" or "data error"; see `outcome_of`."""
     covered: tuple[ParameterCoverage, ...]
+    """Parameters of the effect with their intervals, if it was named correctly."""
 
 
 @dataclass(frozen=True)

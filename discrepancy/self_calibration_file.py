@@ -19,88 +19,61 @@ SCHEMA = "uav-twin self calibration 1"
 
 @dataclass(frozen=True)
 class StoredProportion:
-    """A fraction of cases, as it is stored.
-
-    Attributes
-    ----------
-    count, total : int
-        The number of these cases, and of all cases.
-    low, high : float
-        Limits of the 90 % Wilson interval of the fraction [1].
-    share : float or None
-        The fraction; null without cases [1].
-    """
+    """A fraction of cases, as it is stored."""
 
     count: int
+    """The number of these cases."""
     total: int
+    """The number of all cases."""
     low: float
+    """Lower limit of the 90 % Wilson interval of the fraction [1]."""
     high: float
+    """Upper limit of this interval [1]."""
     share: float | None
+    """The fraction; null without cases [1]."""
 
 
 @dataclass(frozen=True)
 class StoredOutcomes:
-    """The fractions of all outcomes, by their names.
-
-    Attributes
-    ----------
-    with_an_effect, with_nothing : mapping of str to StoredProportion
-        Of the campaigns in which an effect was hidden, and of those in which nothing was.
-    """
+    """The fractions of all outcomes, by their names."""
 
     with_an_effect: Mapping[str, StoredProportion]
+    """The fractions of the campaigns in which an effect was hidden."""
     with_nothing: Mapping[str, StoredProportion]
+    """The fractions of the campaigns in which nothing was hidden."""
 
 
 @dataclass(frozen=True)
 class StoredConfusion:
-    """How often each verdict was reached for each hidden effect.
-
-    Attributes
-    ----------
-    hidden : tuple of str
-        Names of the rows: the hidden effects.
-    verdict : tuple of str
-        Names of the columns: the named effects, and the other verdicts.
-    counts : tuple of tuple of int
-        The numbers of campaigns by row and column.
-    """
+    """How often each verdict was reached for each hidden effect."""
 
     hidden: tuple[str, ...]
+    """Names of the rows: the hidden effects."""
     verdict: tuple[str, ...]
+    """Names of the columns: the named effects, and the other verdicts."""
     counts: tuple[tuple[int, ...], ...]
+    """The numbers of campaigns by row and column."""
 
 
 @dataclass(frozen=True)
 class StoredSelfCalibration:
-    """The content of `self_calibration.json`.
-
-    Attributes
-    ----------
-    seed : int
-        Seed of the simulated campaigns.
-    not_detectable : tuple of str
-        Identifiers of the effects that no draw of their priors made detectable, so that none was
-        hidden.
-    outcomes : StoredOutcomes
-        The fractions of the outcomes.
-    coverage_90 : StoredProportion
-        The fraction of the 90 % intervals of rightly named effects that hold the true value.
-    confusion : StoredConfusion
-        How often each verdict was reached for each hidden effect.
-    cases : tuple of CalibrationCase
-        All simulated campaigns.
-    origin : Origin
-        What the verdict was reached from.
-    """
+    """The content of `self_calibration.json`."""
 
     seed: int
+    """Seed of the simulated campaigns."""
     not_detectable: tuple[str, ...]
+    """Identifiers of the effects that no draw of their priors made detectable, so that none was
+    hidden."""
     outcomes: StoredOutcomes
+    """The fractions of the outcomes."""
     coverage_90: StoredProportion
+    """The fraction of the 90 % intervals of rightly named effects that hold the true value."""
     confusion: StoredConfusion
+    """How often each verdict was reached for each hidden effect."""
     cases: tuple[CalibrationCase, ...]
+    """All simulated campaigns."""
     origin: Origin
+    """What the verdict was reached from."""
 
 
 def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin: Origin) -> Path:

@@ -46,35 +46,26 @@ class Moment:
 
 @dataclass(frozen=True)
 class GapWindow:
-    """A stretch of a record in which something acts that the model lacks.
-
-    Attributes
-    ----------
-    trial : str
-        Name of the trial.
-    channels : tuple of str
-        Names of the channels that show the gap.
-    begin, end : Moment or None
-        Beginning and end of the window; None if it begins with the first sample, or ends with the
-        last.
-    first, last : float
-        Times of the first and the last sample of the record [s].
-    size : float
-        Root mean square residual in the window over the noise, of the channel with the largest. For
-        a channel without a noise record, the residuals of the model without effects in the fitted
-        trials replace the noise, also if `with_effect` is true [1].
-    with_effect : bool
-        True if the gap remains with the best hypothesis; False for the model without effects.
-    """
+    """A stretch of a record in which something acts that the model lacks."""
 
     trial: str
+    """Name of the trial."""
     channels: tuple[str, ...]
+    """Names of the channels that show the gap."""
     begin: Moment | None
+    """Beginning of the window; None if it begins with the first sample."""
     end: Moment | None
+    """End of the window; None if it ends with the last sample."""
     first: float
+    """Time of the first sample of the record [s]."""
     last: float
+    """Time of the last sample of the record [s]."""
     size: float
+    """Root mean square residual in the window over the noise, of the channel with the largest. For
+    a channel without a noise record, the residuals of the model without effects in the fitted
+    trials replace the noise, also if `with_effect` is true [1]."""
     with_effect: bool = False
+    """True if the gap remains with the best hypothesis; False for the model without effects."""
 
 
 @dataclass(frozen=True)
@@ -144,28 +135,20 @@ class CalibratedParameter:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A fitted hypothesis.
-
-    Attributes
-    ----------
-    effects : tuple of NamedEffect
-        Effects of the hypothesis; empty for 'none', the unchanged model.
-    log_evidence : float
-        ln p(data | hypothesis) by Laplace's approximation [nat].
-    probability : float
-        Posterior probability among the hypotheses compared [1].
-    chi_square, degrees_of_freedom : float
-        Chi-squared of the fitted trials against the noise records, and its degrees of freedom [1].
-    parameters : tuple of CalibratedParameter
-        Calibrated parameters of the model, fitted together with these effects.
-    """
+    """A fitted hypothesis."""
 
     effects: tuple[NamedEffect, ...]
+    """Effects of the hypothesis; empty for 'none', the unchanged model."""
     log_evidence: Number
+    """ln p(data | hypothesis) by Laplace's approximation [nat]."""
     probability: Number
+    """Posterior probability among the hypotheses compared [1]."""
     chi_square: Number
+    """Chi-squared of the fitted trials against the noise records [1]."""
     degrees_of_freedom: Number
+    """Degrees of freedom of `chi_square` [1]."""
     parameters: tuple[CalibratedParameter, ...] = ()
+    """Calibrated parameters of the model, fitted together with these effects."""
 
     @property
     def identifiers(self) -> tuple[str, ...]:
@@ -184,25 +167,18 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Gate:
-    """Outcome of one test of a hypothesis, such as "absolute fit", "shape" or "consistency".
-
-    Attributes
-    ----------
-    name : str
-        Name of the gate.
-    passed : bool or None
-        True if the hypothesis passed; None if the gate could not be applied.
-    statistic, limit : float
-        Statistic, and the limit that it was compared with [unit of the statistic].
-    reason : str
-        The outcome, or why the gate could not be applied, in one sentence.
-    """
+    """Outcome of one test of a hypothesis, such as "absolute fit", "shape" or "consistency"."""
 
     name: str
+    """Name of the gate."""
     passed: bool | None
+    """True if the hypothesis passed; None if the gate could not be applied."""
     statistic: Number
+    """Statistic of the test [unit of the statistic]."""
     limit: Number
+    """Limit that the statistic was compared with [unit of the statistic]."""
     reason: str
+    """The outcome, or why the gate could not be applied, in one sentence."""
 
     @property
     def has_failed(self) -> bool:
@@ -212,45 +188,30 @@ class Gate:
 
 @dataclass(frozen=True)
 class RemainderEstimate:
-    """The remainder of a channel in the best hypothesis.
-
-    Attributes
-    ----------
-    channel : str
-        Name of the channel.
-    size : float
-        Standard deviation of the remainder over that of the channel's noise [1].
-    time : float
-        Correlation time of the remainder [s].
-    frequency : float
-        Frequency at which the remainder oscillates [Hz]; 0 if it does not.
-    """
+    """The remainder of a channel in the best hypothesis."""
 
     channel: str
+    """Name of the channel."""
     size: Number
+    """Standard deviation of the remainder over that of the channel's noise [1]."""
     time: Number
+    """Correlation time of the remainder [s]."""
     frequency: Number
+    """Frequency at which the remainder oscillates [Hz]; 0 if it does not."""
 
 
 @dataclass(frozen=True)
 class ForceLeft:
-    """What a law leaves of a missing force, in trials that were fitted or in those held out.
-
-    Attributes
-    ----------
-    left, whole : float
-        Root mean square of the missing force that remains with the law, and of the missing force
-        without any effect [unit of the force].
-    trials : int
-        Number of trials.
-    tested : bool
-        Whether the law has a force in these trials that is large enough to be detected.
-    """
+    """What a law leaves of a missing force, in trials that were fitted or in those held out."""
 
     left: Number
+    """Root mean square of the missing force that remains with the law [unit of the force]."""
     whole: Number
+    """Root mean square of the missing force without any effect [unit of the force]."""
     trials: int
+    """Number of trials."""
     tested: bool
+    """Whether the law has a force in these trials that is large enough to be detected."""
 
 
 @dataclass(frozen=True)
@@ -271,52 +232,41 @@ class ForceMoment:
 
 @dataclass(frozen=True)
 class ForceAtPort:
-    """The force that the model lacks at a port, as it is seen in the fitted trials.
-
-    Attributes
-    ----------
-    port : str
-        Name of the port.
-    unit : str
-        Unit of the force: "N", "N m", or "N or N m" if the model does not say whether the port
-        translates or rotates. At a port of a state it is the unit of the flow.
-    rms, displacement, speed : float
-        Root mean squares of the force [`unit`], and of displacement and speed of the port [m or rad
-        and per second]. At a port of a state, `displacement` is that of the state's integral, and
-        `speed` that of the state.
-    largest : ForceMoment
-        The moment at which the force is largest.
-    evidence : mapping of str to float
-        Log evidence of a missing force at a port over that of none [nat], by the name of the port.
-    correlation_time : float
-        Correlation time of the force [s].
-    orders : mapping of str to float
-        Fraction of the force's variance that is explained by its mean at equal displacement,
-        velocity, amplitude, time, recorded input or rate of an input, by the name of that variable
-        [1]; at equal displacement and velocity if these explain clearly more together.
-    ordered_by : tuple of str
-        Variables that explain the force about as well as the best one; empty if none explains it.
-    law : str
-        Law that was fitted to the force, with places if laws act at several ports; empty if none
-        was.
-    fitted, held_out : ForceLeft or None
-        What remains of the force with the law, in fitted and in held-out trials; if laws act at
-        several ports, of the forces at all of them.
-    """
+    """The force that the model lacks at a port, as it is seen in the fitted trials."""
 
     port: str
+    """Name of the port."""
     unit: str
+    """Unit of the force: "N", "N m", or "N or N m" if the model does not say whether the port
+    translates or rotates. At a port of a state it is the unit of the flow."""
     rms: Number
+    """Root mean square of the force [`unit`]."""
     displacement: Number
+    """Root mean square displacement of the port [m or rad]; at a port of a state, of the state's
+    integral."""
     speed: Number
+    """Root mean square speed of the port [m/s or rad/s]; at a port of a state, of the state."""
     largest: ForceMoment
+    """The moment at which the force is largest."""
     evidence: Mapping[str, Number]
+    """Log evidence of a missing force at a port over that of none [nat], by the name of the
+    port."""
     correlation_time: Number
+    """Correlation time of the force [s]."""
     orders: Mapping[str, Number]
+    """Fraction of the force's variance that is explained by its mean at equal displacement,
+    velocity, amplitude, time, recorded input or rate of an input, by the name of that variable [1];
+    at equal displacement and velocity if these explain clearly more together."""
     ordered_by: tuple[str, ...]
+    """Variables that explain the force about as well as the best one; empty if none explains it."""
     law: str = ""
+    """Law that was fitted to the force, with places if laws act at several ports; empty if none
+    was."""
     fitted: ForceLeft | None = None
+    """What remains of the force with the law in fitted trials; if laws act at several ports, of the
+    forces at all of them."""
     held_out: ForceLeft | None = None
+    """The same in held-out trials."""
 
     @property
     def followed_percent(self) -> str:
@@ -354,29 +304,21 @@ class UnfittedRecord:
 
 @dataclass(frozen=True)
 class MovedUnknown:
-    """A parameter, gain or zero that a fit without effects moves far from its stated value.
-
-    Attributes
-    ----------
-    name : str
-        Name of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT
-        in TRIAL".
-    stated, deviation : float
-        Stated value and its standard deviation [unit of the entry].
-    value : float
-        Value in the fit without any effect [unit of the entry].
-    deviations : float
-        Distance of the two in standard deviations [1].
-    unit : str
-        Unit in SI; for a gain it is "1", and the values are relative errors of the gain.
-    """
+    """A parameter, gain or zero that a fit without effects moves far from its stated value."""
 
     name: str
+    """Name of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT
+    in TRIAL"."""
     stated: Number
+    """Stated value [unit of the entry]."""
     deviation: Number
+    """Standard deviation of the stated value [unit of the entry]."""
     value: Number
+    """Value in the fit without any effect [unit of the entry]."""
     deviations: Number
+    """Distance of the two in standard deviations [1]."""
     unit: str
+    """Unit in SI; for a gain it is "1", and the values are relative errors of the gain."""
 
 
 class SensorValue(StrEnum):
@@ -388,37 +330,26 @@ class SensorValue(StrEnum):
 
 @dataclass(frozen=True)
 class SensorEstimate:
-    """The gain of a channel or its zero in a trial, fitted in the hypothesis of the verdict.
-
-    Attributes
-    ----------
-    channel : str
-        Name of the channel.
-    kind : SensorValue
-        "gain" or "zero". A gain is given by its relative error.
-    trial : str
-        Name of the trial in which the channel has this zero; empty for a gain, which is the same in
-        all trials.
-    value, deviation : float
-        Fitted value and its posterior standard deviation [unit of the entry]. The stated value is
-        zero.
-    stated_deviation : float
-        Stated standard deviation of the value; infinite if the value was not stated [unit of the
-        entry].
-    deviations : float
-        Fitted value in stated standard deviations; not a number if the value was not stated [1].
-    unit : str
-        Unit in SI; "1" for a gain.
-    """
+    """The gain of a channel or its zero in a trial, fitted in the hypothesis of the verdict."""
 
     channel: str
+    """Name of the channel."""
     kind: SensorValue
+    """Whether it is a gain, which is given by its relative error, or a zero."""
     trial: str
+    """Name of the trial in which the channel has this zero; empty for a gain, which is the same in
+    all trials."""
     value: Number
+    """Fitted value [unit of the entry]. The stated value is zero."""
     deviation: Number
+    """Posterior standard deviation of the value [unit of the entry]."""
     stated_deviation: Number
+    """Stated standard deviation of the value; infinite if the value was not stated [unit of the
+    entry]."""
     deviations: Number
+    """Fitted value in stated standard deviations; not a number if the value was not stated [1]."""
     unit: str
+    """Unit in SI; "1" for a gain."""
 
 
 @dataclass(frozen=True)
@@ -449,91 +380,65 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The conclusion.
-
-    Attributes
-    ----------
-    kind : VerdictKind
-        Kind of the conclusion.
-    sentence : str
-        The conclusion in one sentence.
-    probability : float
-        Posterior probability of the conclusion among the hypotheses compared: of all sets that
-        contain the named one, of all members of the group, or of 'none' (nothing missing and below
-        detectability). For a family it is that of the family and its members, or that of the member
-        if only the shape gate found the family. It has no meaning for an unexplained gap, where no
-        set is named, and is nan where the data are at fault [1].
-    log_bayes_factor : float
-        Log evidence of the best hypothesis over that of the model as it is, without a missing force
-        [nat].
-    effects : tuple of NamedEffect
-        The named set of effects; for a group its members; for a family the member of the nearest
-        shape.
-    group : tuple of str
-        Identifiers of effects that these data cannot separate.
-    family : str
-        Name of the family, if the verdict is a family; else empty.
-    gates : tuple of Gate
-        Outcomes of the gates of absolute fit and shape.
-    hypotheses : tuple of Hypothesis
-        Hypotheses that were compared, the most probable first.
-    inclusion : mapping of str to float
-        Probability that an effect is in the set, by identifier [1].
-    next_experiments : tuple of Experiment
-        Proposed experiments, the best first; empty if no question is open.
-    remarks : tuple of str
-        Limits of the conclusion and faults of the data, one sentence each.
-    resembles : tuple of str
-        Effects that an unexplained remainder resembles; these are not names.
-    remainders : tuple of RemainderEstimate
-        Remainders of the channels in the best hypothesis.
-    not_fitted : tuple of NotFitted
-        Effects of the catalogue that were not fitted.
-    windows : tuple of GapWindow
-        Windows in time with a gap in each record, for the model without effects and for the best
-        hypothesis.
-    parameters : tuple of CalibratedParameter
-        Parameters of the model beside the named effects or the first member of a group; without an
-        effect if neither is there.
-    force : ForceAtPort or None
-        The missing force; None if no force is missing, or none can be determined.
-    unfitted : tuple of UnfittedRecord
-        Records whose residuals in the hypothesis of the verdict have a larger variance than the
-        readings themselves.
-    moved : tuple of MovedUnknown
-        Parameters, gains and zeros that the fit without any effect moves by more than two of their
-        stated standard deviations, the farthest first.
-    moved_within_prior : tuple of MovedUnknown
-        Unknowns that the fit without any effect moves by one to two of their stated standard
-        deviations, if these are so wide that the move is at least 2 % of the stated value (for a
-        zero, of the largest reading) and three posterior standard deviations.
-    sensors : tuple of SensorEstimate
-        Gains of the channels, and their zeros in each fitted trial, beside the named effects;
-        without an effect if none is named.
-    """
+    """The conclusion."""
 
     kind: VerdictKind
+    """Kind of the conclusion."""
     sentence: str
+    """The conclusion in one sentence."""
     probability: Number
+    """Posterior probability of the conclusion among the hypotheses compared: of all sets that
+    contain the named one, of all members of the group, or of 'none' (nothing missing and below
+    detectability). For a family it is that of the family and its members, or that of the member if
+    only the shape gate found the family. It has no meaning for an unexplained gap, where no set is
+    named, and is nan where the data are at fault [1]."""
     log_bayes_factor: Number
+    """Log evidence of the best hypothesis over that of the model as it is, without a missing force
+    [nat]."""
     effects: tuple[NamedEffect, ...] = ()
+    """The named set of effects; for a group its members; for a family the member of the nearest
+    shape."""
     group: tuple[str, ...] = ()
+    """Identifiers of effects that these data cannot separate."""
     family: str = ""
+    """Name of the family, if the verdict is a family; else empty."""
     gates: tuple[Gate, ...] = ()
+    """Outcomes of the gates of absolute fit and shape."""
     hypotheses: tuple[Hypothesis, ...] = ()
+    """Hypotheses that were compared, the most probable first."""
     inclusion: Mapping[str, Number] = field(default_factory=dict)
+    """Probability that an effect is in the set, by identifier [1]."""
     next_experiments: tuple[Experiment, ...] = ()
+    """Proposed experiments, the best first; empty if no question is open."""
     remarks: tuple[str, ...] = ()
+    """Limits of the conclusion and faults of the data, one sentence each."""
     resembles: tuple[str, ...] = ()
+    """Effects that an unexplained remainder resembles; these are not names."""
     remainders: tuple[RemainderEstimate, ...] = ()
+    """Remainders of the channels in the best hypothesis."""
     not_fitted: tuple[NotFitted, ...] = ()
+    """Effects of the catalogue that were not fitted."""
     windows: tuple[GapWindow, ...] = ()
+    """Windows in time with a gap in each record, for the model without effects and for the best
+    hypothesis."""
     parameters: tuple[CalibratedParameter, ...] = ()
+    """Parameters of the model beside the named effects or the first member of a group; without an
+    effect if neither is there."""
     force: ForceAtPort | None = None
+    """The missing force; None if no force is missing, or none can be determined."""
     unfitted: tuple[UnfittedRecord, ...] = ()
+    """Records whose residuals in the hypothesis of the verdict have a larger variance than the
+    readings themselves."""
     moved: tuple[MovedUnknown, ...] = ()
+    """Parameters, gains and zeros that the fit without any effect moves by more than two of their
+    stated standard deviations, the farthest first."""
     moved_within_prior: tuple[MovedUnknown, ...] = ()
+    """Unknowns that the fit without any effect moves by one to two of their stated standard
+    deviations, if these are so wide that the move is at least 2 % of the stated value (for a zero,
+    of the largest reading) and three posterior standard deviations."""
     sensors: tuple[SensorEstimate, ...] = ()
+    """Gains of the channels, and their zeros in each fitted trial, beside the named effects;
+    without an effect if none is named."""
 
     def __repr__(self) -> str:
         effects = [effect.identifier for effect in self.effects]

@@ -20,22 +20,15 @@ MOST_HYPOTHESES = 20
 
 @dataclass(frozen=True)
 class VerdictSoFar:
-    """Content of verdict_so_far.json.
-
-    Attributes
-    ----------
-    remark : str
-        Limits of these figures, which are not those of a finished search.
-    hypotheses : tuple of Hypothesis
-        Hypotheses as in verdict.json, the most probable first; a hypothesis without effects is the
-        unchanged model.
-    origin : Origin
-        Campaign, model and command.
-    """
+    """Content of verdict_so_far.json."""
 
     remark: str
+    """Limits of these figures, which are not those of a finished search."""
     hypotheses: tuple[Hypothesis, ...]
+    """Hypotheses as in verdict.json, the most probable first; a hypothesis without effects is the
+    unchanged model."""
     origin: Origin
+    """Campaign, model and command."""
 
 
 REMARK = (

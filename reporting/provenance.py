@@ -49,28 +49,19 @@ _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
 
 @dataclass(frozen=True)
 class Provenance:
-    """The data that are needed to repeat a result.
-
-    Attributes
-    ----------
-    seed : int or None
-        The seed of the run's ``SeedSequence``; None if the run draws no random numbers.
-    versions : mapping of str to str
-        The version of each distribution and of ``python``; ``not installed`` if it is missing.
-    source_hashes : mapping of str to str
-        The SHA-256 of the sources of each package of this project.
-    input_hashes : mapping of str to str
-        The SHA-256 of each input, such as design, scenario or FMU.
-    plug_ins : mapping of str to str
-        The distribution and the version of each plug-in of another package, such as
-        ``my-laws 1.2``, by the group and the name of its entry point, ``uav_twin.laws: my_law``.
-    """
+    """The data that are needed to repeat a result."""
 
     seed: int | None
+    """The seed of the run's ``SeedSequence``; None if the run draws no random numbers."""
     versions: Mapping[str, str]
+    """The version of each distribution and of ``python``; ``not installed`` if it is missing."""
     source_hashes: Mapping[str, str]
+    """The SHA-256 of the sources of each package of this project."""
     input_hashes: Mapping[str, str] = field(default_factory=dict)
+    """The SHA-256 of each input, such as design, scenario or FMU."""
     plug_ins: Mapping[str, str] = field(default_factory=dict)
+    """The distribution and the version of each plug-in of another package, such as ``my-laws 1.2``,
+    by the group and the name of its entry point, ``uav_twin.laws: my_law``."""
 
     def as_dict(self) -> dict[str, object]:
         """Return plain dictionaries, ready for JSON."""

@@ -28,54 +28,36 @@ class Hold(StrEnum):
 
 @dataclass(frozen=True)
 class NoiseRecord:
-    """The noise of a channel and how well it is known; the table `noise` of a channel in a file.
-
-    Attributes
-    ----------
-    standard_deviation : float
-        Standard deviation s0 of a reading [channel's unit].
-    degrees_of_freedom : float
-        Degrees of freedom n0 of s0; infinite if the standard deviation is taken as exact [1].
-    samples : (n,) ndarray or None
-        The recorded noise itself, mean removed, if there is one.
-    interval : float or None
-        Sampling interval of `samples` [s].
-    source : str
-        "pre-trigger", "repeats" or "stated".
-    file : str
-        Name of the file that holds `samples`; empty if there is none.
-    """
+    """The noise of a channel and how well it is known; the table `noise` of a channel in a file."""
 
     standard_deviation: Positive
+    """Standard deviation s0 of a reading [channel's unit]."""
     degrees_of_freedom: Positive = inf
+    """Degrees of freedom n0 of s0; infinite if the standard deviation is taken as exact [1]."""
     samples: Annotated[FloatArray | None, NOT_IN_FILES] = None
+    """The recorded noise itself (n,), mean removed, if there is one."""
     interval: Annotated[float | None, NOT_IN_FILES] = None
+    """Sampling interval of `samples` [s]."""
     source: Literal["pre-trigger", "repeats", "stated"] = "stated"
+    """What the standard deviation comes from."""
     file: Annotated[str, NOT_IN_FILES] = field(default="", compare=False)
+    """Name of the file that holds `samples`; empty if there is none."""
 
     __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True)
 class InTables:
-    """A channel or an input: anything that has a column in the tables of a campaign.
-
-    Attributes
-    ----------
-    name : str
-        Name, unique in the campaign; also that of its column unless `column` says otherwise.
-    quantity : Quantity
-        The physical quantity.
-    column : str
-        Name of its column in the files; empty if that is `name`.
-    unit : str
-        Unit of its column in the files; empty if the campaign was not read from files.
-    """
+    """A channel or an input: anything that has a column in the tables of a campaign."""
 
     name: Name
+    """Name, unique in the campaign; also that of its column unless `column` says otherwise."""
     quantity: Quantity
+    """The physical quantity."""
     column: Name = field(default="", compare=False, kw_only=True)
+    """Name of its column in the files; empty if that is `name`."""
     unit: InFiles = field(default="", compare=False, kw_only=True)
+    """Unit of its column in the files; empty if the campaign was not read from files."""
 
     __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
 
@@ -90,56 +72,39 @@ class RecordedInput(InTables):
     """The time history of one input of a model in a trial.
 
     Without its values `[[input]]` of a file.
-
-    Attributes
-    ----------
-    name : str
-        Name of the model's input.
-    values : (N,) ndarray
-        Values at the samples [SI].
-    hold : Hold or None
-        Course between the samples; None if the file does not state it, which means linear.
-    offset_deviation : float
-        Prior standard deviation of a constant error of the record in this trial [SI]; zero for
-        none.
-    reference : bool
-        True for a motion that a controller is to follow: it is not a motion of the structure, and
-        need not be smooth.
     """
 
+    name: Name
+    """Name of the model's input."""
     values: Annotated[FloatArray, NOT_IN_FILES, Field(default=np.empty(0), exclude=True)]
+    """Values at the samples (N,) [SI]."""
     hold: Hold | None = None
+    """Course between the samples; None if the file does not state it, which means linear."""
     offset_deviation: NotNegative = 0.0
+    """Prior standard deviation of a constant error of the record in this trial [SI]; zero for
+    none."""
     reference: Annotated[bool, Field(strict=True)] = field(default=False, compare=False)
+    """True for a motion that a controller is to follow: it is not a motion of the structure, and
+    need not be smooth."""
 
 
 @dataclass(frozen=True)
 class Channel(InTables):
-    """One measuring channel; in a file `[[channel]]`, with deviations in the unit of the file.
-
-    Attributes
-    ----------
-    output : str
-        Output of the model that it is compared with, such as "strain[17]" or "tip_displacement".
-    noise : NoiseRecord or None
-        Its noise; without it, the size of the residuals of a fit cannot be judged.
-    gain_deviation : float
-        Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
-        unknown scale (the scale of the release amplitudes, if only these show it).
-    offset_deviation : float
-        Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free zero.
-    station : float or None
-        Position along the span [m], for maps.
-    chord : float or None
-        Position along the chord [fraction], for maps.
-    accept : tuple of str
-        Faults of its data that the user accepts, in all trials: words of `ACCEPTABLE`.
-    """
+    """One measuring channel; in a file `[[channel]]`, with deviations in the unit of the file."""
 
     output: Name
+    """Output of the model that it is compared with, such as "strain[17]" or "tip_displacement"."""
     noise: NoiseRecord | None = None
+    """Its noise; without it, the size of the residuals of a fit cannot be judged."""
     gain_deviation: Deviation = 0.0
+    """Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
+    unknown scale (the scale of the release amplitudes, if only these show it)."""
     offset_deviation: Deviation = 0.0
+    """Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free
+    zero."""
     station: Number | None = None
+    """Position along the span [m], for maps."""
     chord: Number | None = None
+    """Position along the chord [fraction], for maps."""
     accept: Accepted = ()
+    """Faults of its data that the user accepts, in all trials: words of `ACCEPTABLE`."""

@@ -96,25 +96,6 @@ Accepted = Annotated[tuple[Annotated[str, AfterValidator(_checked_fault)], ...],
 class Release:
     """How a ring-down began.
 
-    Attributes
-    ----------
-    displacement : float
-        Nominal displacement of the release point before the release [`unit`], not zero.
-    deviation : float
-        Prior standard deviation of the displacement, as a fraction of it [1].
-    at_rest : bool
-        True if the first sample is at the release: the structure starts at rest from its static
-        shape under the holding force, which also determines the higher modes, within `deviation`.
-        False if the record starts later: displacement and velocity of each of `mode_count` modes
-        are then unknown.
-    mode_count : int
-        Number of modes with an unknown initial state, at least 1. The first unknown is the
-        amplitude, within `deviation`.
-    time_zero_deviation : float
-        Prior standard deviation of the time between release and first sample [s].
-    unit : str
-        Unit of the displacement: m, V, or 1 for another signal. A file may also say mm, um or mV.
-
     Raises
     ------
     ValueError
@@ -122,11 +103,21 @@ class Release:
     """
 
     displacement: Number
+    """Nominal displacement of the release point before the release [`unit`], not zero."""
     deviation: Positive = 0.05
+    """Prior standard deviation of the displacement, as a fraction of it [1]."""
     at_rest: Annotated[bool, Field(strict=True)] = True
+    """True if the first sample is at the release: the structure starts at rest from its static
+    shape under the holding force, which also determines the higher modes, within `deviation`. False
+    if the record starts later: displacement and velocity of each of `mode_count` modes are then
+    unknown."""
     mode_count: Annotated[int, Field(strict=True, ge=1, le=MOST_MODES)] = 3
+    """Number of modes with an unknown initial state, at least 1. The first unknown is the
+    amplitude, within `deviation`."""
     time_zero_deviation: NotNegative = 0.0
+    """Prior standard deviation of the time between release and first sample [s]."""
     unit: Literal["m", "mm", "um", "V", "mV", "1"] = field(default="m", compare=False)
+    """Unit of the displacement: m, V, or 1 for another signal. A file may also say mm, um or mV."""
 
     __pydantic_config__ = IN_FILES
 
@@ -142,20 +133,6 @@ class Release:
 class Event:
     """Something that happened during trials at a known time, such as a screw that was loosened.
 
-    Attributes
-    ----------
-    name : str
-        Name in expressions, where ``NAME`` is its time and ``NAME_until`` its end.
-    trials : tuple of str
-        Names of the trials in which it happened.
-    time : float
-        Time since the start of each of these trials [s].
-    until : float or None
-        Its end [s]; None if it is not stated.
-    trial : str or None
-        A single trial, which a file may state in place of `trials`. Without both the event happened
-        in all trials that are records in time.
-
     Raises
     ------
     ValueError
@@ -164,10 +141,16 @@ class Event:
     """
 
     name: Name
+    """Name in expressions, where ``NAME`` is its time and ``NAME_until`` its end."""
     trials: Annotated[tuple[Name, ...], Field(min_length=1), LIST] = ()
+    """Names of the trials in which it happened."""
     time: NotNegative = field(kw_only=True)
+    """Time since the start of each of these trials [s]."""
     until: Number | None = field(default=None, kw_only=True)
+    """Its end [s]; None if it is not stated."""
     trial: Name | None = field(default=None, kw_only=True)
+    """A single trial, which a file may state in place of `trials`. Without both the event happened
+    in all trials that are records in time."""
 
     __pydantic_config__ = IN_FILES
 

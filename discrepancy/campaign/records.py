@@ -53,44 +53,30 @@ USUAL_REGIONS = ("z1", "z2")
 
 @dataclass(frozen=True, kw_only=True)
 class TrialKeys:
-    """What the file of a campaign states of a trial, and a trial in memory keeps as it is.
-
-    Attributes
-    ----------
-    name : str
-        Name, unique in the campaign.
-    kind : TrialKind
-        The kind of the trial: what was done in it.
-    file : str
-        Name of its table; empty if it was not read from a file.
-    run : str
-        Label of the run (set-up) that the trial belongs to.
-    held_out : bool
-        True if the trial is used only for the proof, and not to find or to fit anything.
-    noise_factor : float
-        Standard deviation of the noise in this trial over that of the channels' noise records, as
-        known from the acquisition (averaging, another range) [1].
-    load_place : str or tuple of float
-        Point at which the force acts: a name that the model knows ("tip_load" of the wing), or (y
-        [m] from the root, x [fraction of the chord]).
-    release : Release or None
-        How a ring-down began; None for other kinds.
-    hold : Hold or None
-        Course of the force of a forced trial between its samples.
-    accept : tuple of str
-        Faults of its data that the user accepts, in all channels: words of `ACCEPTABLE`.
-    """
+    """What the file of a campaign states of a trial, and a trial in memory keeps as it is."""
 
     name: Name
+    """Name, unique in the campaign."""
     kind: TrialKind
+    """The kind of the trial: what was done in it."""
     file: InFiles = field(default="", compare=False)
+    """Name of its table; empty if it was not read from a file."""
     run: str = ""
+    """Label of the run (set-up) that the trial belongs to."""
     held_out: Annotated[bool, Field(strict=True)] = False
+    """True if the trial is used only for the proof, and not to find or to fit anything."""
     noise_factor: Positive = 1.0
+    """Standard deviation of the noise in this trial over that of the channels' noise records, as
+    known from the acquisition (averaging, another range) [1]."""
     load_place: Name | tuple[Number, Number] = "tip_load"
+    """Point at which the force acts: a name that the model knows ("tip_load" of the wing), or (y
+    [m] from the root, x [fraction of the chord])."""
     release: Release | None = None
+    """How a ring-down began; None for other kinds."""
     hold: Hold | None = None
+    """Course of the force of a forced trial between its samples."""
     accept: Accepted = ()
+    """Faults of its data that the user accepts, in all channels: words of `ACCEPTABLE`."""
 
     @property
     def keys_in_file(self) -> dict[str, Any]:

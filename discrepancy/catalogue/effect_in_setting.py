@@ -47,44 +47,30 @@ Text = Annotated[str, Field(min_length=0)]
 
 @dataclass(frozen=True, kw_only=True)
 class EffectSection(EffectKeys):
-    """The table `[[effect]]`, or the whole of a file with one effect.
-
-    Attributes
-    ----------
-    primitives : tuple of dict
-        Primitives of the patch, whose values may be expressions [unit of the primitive].
-    places : str, tuple of str or None
-        A word of `PLACES`, the names of the places, or None if there is no choice.
-    preferred : tuple of str
-        Ports of a wing that stand for all its ports.
-    needs : tuple of str
-        Words of `NEEDS`.
-    events : tuple of str
-        Names of events that expressions use.
-    """
+    """The table `[[effect]]`, or the whole of a file with one effect."""
 
     __pydantic_config__ = ROW
 
     primitives: tuple[dict[str, Text | Number], ...] = ()
+    """Primitives of the patch, whose values may be expressions [unit of the primitive]."""
     places: str | tuple[str, ...] | None = None
+    """A word of `PLACES`, the names of the places, or None if there is no choice."""
     preferred: tuple[str, ...] = ()
+    """Ports of a wing that stand for all its ports."""
     needs: tuple[str, ...] = USUAL
+    """Words of `NEEDS`."""
     events: tuple[str, ...] = ()
+    """Names of events that expressions use."""
 
 
 @dataclass(frozen=True)
 class EffectsFile:
-    """A file with several effects.
-
-    Attributes
-    ----------
-    effect : tuple of EffectSection
-        The effects.
-    """
+    """A file with several effects."""
 
     __pydantic_config__ = ROW
 
     effect: tuple[EffectSection, ...]
+    """The effects."""
 
 
 def _has_ports_of_a_wing(model: Model) -> bool:

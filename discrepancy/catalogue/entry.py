@@ -27,22 +27,17 @@ LEAST_SHRINKAGE = 0.3
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of one number, as a map from a standard normal variable u.
-
-    Attributes
-    ----------
-    shape : {"log_normal", "normal", "uniform"}
-        Distribution: "log_normal" and "normal" have 90 % of their mass between `low` and `high`,
-        "uniform" has all of it there.
-    low, high : float
-        Bounds; both positive for "log_normal" [unit of the parameter].
-    """
+    """Prior of one number, as a map from a standard normal variable u."""
 
     __pydantic_config__ = ROW
 
     shape: Literal["log_normal", "normal", "uniform"]
+    """Distribution: "log_normal" and "normal" have 90 % of their mass between `low` and `high`,
+    "uniform" has all of it there."""
     low: Number
+    """Lower bound, positive for "log_normal" [unit of the parameter]."""
     high: Number
+    """Upper bound, positive for "log_normal" [unit of the parameter]."""
 
     @property
     def largest_standard_normal(self) -> float:
@@ -123,36 +118,25 @@ class Prior:
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A parameter of an effect.
-
-    Attributes
-    ----------
-    name : str
-        Full name in snake case.
-    symbol : str
-        Symbol in the equation of the effect.
-    unit : str
-        Unit in SI; "1" if it has none.
-    description : str
-        One line.
-    prior : Prior
-        Prior, in the unit.
-    magnitude : bool
-        True if the effect vanishes with this parameter.
-    levels : int
-        Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the
-        search.
-    """
+    """A parameter of an effect."""
 
     __pydantic_config__ = ROW
 
     name: str
+    """Full name in snake case."""
     symbol: str
+    """Symbol in the equation of the effect."""
     unit: str
+    """Unit in SI; "1" if it has none."""
     description: str
+    """One line."""
     prior: Prior
+    """Prior, in the unit."""
     magnitude: Annotated[bool, Strict()] = False
+    """True if the effect vanishes with this parameter."""
     levels: Annotated[int, Strict()] = 0
+    """Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the
+    search."""
 
 
 @dataclass(frozen=True)
@@ -160,24 +144,20 @@ class ShapeParameter:
     """An exponent or the like that is fixed in the named effect and free in its family.
 
     The shape gate frees it, to test whether the data determine the name.
-
-    Attributes
-    ----------
-    name, symbol, description : str
-        The keys of an `EffectParameter`.
-    canonical : float
-        Value in the named effect [1].
-    prior : Prior
-        Prior within the family.
     """
 
     __pydantic_config__ = ROW
 
     name: str
+    """Full name in snake case."""
     symbol: str
+    """Symbol in the equation of the effect."""
     description: str
+    """One line."""
     canonical: Number
+    """Value in the named effect [1]."""
     prior: Prior
+    """Prior within the family."""
     unit: ClassVar[str] = "1"
     magnitude: ClassVar[bool] = False
     levels: ClassVar[int] = 0
@@ -212,54 +192,41 @@ Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
 
 @dataclass(frozen=True, kw_only=True)
 class EffectKeys:
-    """The entries of an effect that its file states.
-
-    Attributes
-    ----------
-    identifier : str
-        Stable identifier in lower case with underscores, such as "coulomb_friction"; `id` in files.
-    name : str
-        The field's standard term.
-    family : str
-        Family of laws that it belongs to, such as "damping |v|^p |x|^a".
-    equation, signature, reference : str
-        Equation, what it changes in the data, and source; one line each.
-    acts_on : frozenset of TrialKind
-        Kinds of trials that it changes.
-    parameters : tuple of EffectParameter
-        Parameters with priors, dimensionless wherever a scale of the setting can make them so.
-    shape : tuple of ShapeParameter
-        Numbers that the shape gate frees.
-    confusable : tuple of str
-        Identifiers of effects that some campaigns cannot distinguish from it.
-    counterpart : str
-        Identifier of the effect that stands for it in other kinds of models, such as that of a mesh
-        for an effect of a wing. Empty if there is none.
-    spectral : str
-        Name of a parameter that is a frequency over the first natural frequency; fits of it begin
-        at peaks of the residuals' spectrum at the place, a channel. Empty if there is none.
-    at_several_places : bool
-        Whether it may act at several places at once, with a size at each. A search for errors of
-        whole simulations then adds it at a second place, too.
-    relative_frequency : float or None
-        How often it occurs, compared with the other effects that state this [1]. Those that do not
-        are equally probable.
-    """
+    """The entries of an effect that its file states."""
 
     identifier: Annotated[str, Field(alias="id")]
+    """Stable identifier in lower case with underscores, such as "coulomb_friction"; `id` in
+    files."""
     name: str
+    """The field's standard term."""
     family: str
+    """Family of laws that it belongs to, such as "damping |v|^p |x|^a"."""
     equation: str
+    """Equation, in one line."""
     signature: str
+    """What it changes in the data, in one line."""
     reference: str
+    """Source, in one line."""
     acts_on: frozenset[TrialKind]
+    """Kinds of trials that it changes."""
     parameters: tuple[EffectParameter, ...] = ()
+    """Parameters with priors, dimensionless wherever a scale of the setting can make them so."""
     shape: tuple[ShapeParameter, ...] = ()
+    """Numbers that the shape gate frees."""
     confusable: tuple[str, ...] = ()
+    """Identifiers of effects that some campaigns cannot distinguish from it."""
     counterpart: str = ""
+    """Identifier of the effect that stands for it in other kinds of models, such as that of a mesh
+    for an effect of a wing. Empty if there is none."""
     spectral: str = ""
+    """Name of a parameter that is a frequency over the first natural frequency; fits of it begin at
+    peaks of the residuals' spectrum at the place, a channel. Empty if there is none."""
     at_several_places: Annotated[bool, Strict()] = False
+    """Whether it may act at several places at once, with a size at each. A search for errors of
+    whole simulations then adds it at a second place, too."""
     relative_frequency: Number | None = None
+    """How often it occurs, compared with the other effects that state this [1]. Those that do not
+    are equally probable."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,21 +49,14 @@ OLD_SHARE = (
 
 @dataclass(frozen=True)
 class StoredVerdict:
-    """Content of `verdict.json`.
-
-    Attributes
-    ----------
-    verdict : Verdict
-        What was concluded.
-    proof : Proof or None
-        Its proof on trials that were held out, if there are any.
-    origin : Origin
-        Model, campaign and program that it comes from.
-    """
+    """Content of `verdict.json`."""
 
     verdict: Verdict
+    """What was concluded."""
     proof: Proof | None
+    """Its proof on trials that were held out, if there are any."""
     origin: Origin
+    """Model, campaign and program that it comes from."""
 
     def __repr__(self) -> str:
         return brief(
@@ -190,28 +183,22 @@ _OUTPUTS = {
 
 @dataclass(frozen=True)
 class PrimitiveInterval:
-    """90 % posterior interval of one parameter of a primitive.
-
-    Attributes
-    ----------
-    primitive : int
-        Index of the primitive in the effect's patch.
-    parameter : str
-        Name of the parameter.
-    value : float
-        Value in the patch [unit of the entry].
-    low, high : float
-        Ends of the interval; nan if no draws of the posterior were taken [unit of the entry].
-    unit : str
-        Unit of the parameter.
-    """
+    """90 % posterior interval of one parameter of a primitive."""
 
     primitive: Annotated[int, Field(ge=0)]
+    """Index of the primitive in the effect's patch."""
     parameter: str
+    """Name of the parameter."""
     value: Annotated[float, Field(allow_inf_nan=False)]
+    """Value in the patch [unit of the entry]."""
     low: Number
+    """Lower end of the interval; nan if no draws of the posterior were taken [unit of the
+    entry]."""
     high: Number
+    """Upper end of the interval; nan if no draws of the posterior were taken [unit of the
+    entry]."""
     unit: str
+    """Unit of the parameter."""
 
 
 @dataclass(frozen=True)
@@ -233,35 +220,25 @@ def _checked_basis(kind: VerdictKind) -> VerdictKind:
 
 @dataclass(frozen=True)
 class StoredPatch:
-    """Content of patch.json.
-
-    Attributes
-    ----------
-    verdict : VerdictKind
-        Verdict on which the patch rests. For a group the patch is one member, mostly the most
-        probable, and for an unexplained gap the best hypothesis: these are not names.
-    sentence : str
-        The verdict in words.
-    effects : tuple of PatchEffect
-        The effects in order.
-    channels : mapping of str to str
-        Outputs of the wing FMU by the names of channels.
-    parameters : tuple of CalibratedParameter
-        Calibrated parameters of the model, fitted together with these effects.
-    origin : Origin
-        Model, campaign and program that it comes from.
-    """
+    """Content of patch.json."""
 
     verdict: Annotated[
         VerdictKind,
         AfterValidator(_checked_basis),
         WithJsonSchema({"enum": [kind.value for kind in APPLIED]}),
     ]
+    """Verdict on which the patch rests. For a group the patch is one member, mostly the most
+    probable, and for an unexplained gap the best hypothesis: these are not names."""
     sentence: str
+    """The verdict in words."""
     effects: tuple[PatchEffect, ...]
+    """The effects in order."""
     channels: Mapping[str, str]
+    """Outputs of the wing FMU by the names of channels."""
     parameters: tuple[CalibratedParameter, ...]
+    """Calibrated parameters of the model, fitted together with these effects."""
     origin: Origin
+    """Model, campaign and program that it comes from."""
 
     @property
     def patch(self) -> ModelPatch:

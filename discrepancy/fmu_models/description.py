@@ -41,34 +41,27 @@ Forces = Annotated[
 
 
 class FmuInputsSection(Section):
-    """`[inputs]`: the inputs that a trial sets, by names of the binding or of the FMU.
-
-    Attributes
-    ----------
-    force : str or table
-        Applied force [N]; a table by the load places of the campaign.
-    load_factor, z1, z2 : str, optional
-        Load factor and stiffness losses [1].
-    health : table
-        Stiffness losses [1] by damage region; z1 and z2 can stand in it, too.
-    temperature : str, optional
-        Temperature less the reference [K], or the temperature itself [degC] with
-        `temperature_reference`.
-    temperature_reference : float, optional
-        Temperature at which the FMU's model holds [degC].
-    bending_moment, torque : str, optional
-        Moment [N m] that a force gives when it acts a metre further outboard, or aft.
-    """
+    """`[inputs]`: the inputs that a trial sets, by names of the binding or of the FMU."""
 
     force: Forces = Field(default_factory=dict)
+    """Applied force [N]; a table by the load places of the campaign."""
     load_factor: Name | None = None
+    """Load factor [1]."""
     temperature: Name | None = None
+    """Temperature less the reference [K], or the temperature itself [degC] with
+    `temperature_reference`."""
     temperature_reference: Number | None = None
+    """Temperature at which the FMU's model holds [degC]."""
     z1: Name | None = None
+    """Stiffness loss of the damage region z1 [1]."""
     z2: Name | None = None
+    """Stiffness loss of the damage region z2 [1]."""
     health: dict[Name, Name] = Field(default_factory=dict)
+    """Stiffness losses [1] by damage region; z1 and z2 can stand in it, too."""
     bending_moment: Name | None = None
+    """Moment [N m] that a force gives when it acts a metre further outboard."""
     torque: Name | None = None
+    """Moment [N m] that a force gives when it acts a metre further aft."""
 
     @property
     def regions(self) -> dict[str, str]:
@@ -82,28 +75,19 @@ class FmuInputsSection(Section):
 
 
 class StaticSection(Section):
-    """`[static]`: how a state at rest is reached.
-
-    Attributes
-    ----------
-    settle : bool
-        False if the FMU is quasi-static, so that a step gives the equilibrium; true if its motion
-        is followed until it rests.
-    step : float
-        Communication step [s].
-    limit : float
-        Longest motion that is waited for [s].
-    tolerance : float
-        At rest, no output moves by more than this fraction of its largest value [1].
-    parameters : table
-        Parameters of the FMU in such trials, in its units [unit of the FMU].
-    """
+    """`[static]`: how a state at rest is reached."""
 
     settle: bool = False
+    """False if the FMU is quasi-static, so that a step gives the equilibrium; true if its motion is
+    followed until it rests."""
     step: Positive = 1.0
+    """Communication step [s]."""
     limit: Positive = 600.0
+    """Longest motion that is waited for [s]."""
     tolerance: Positive = 1e-9
+    """At rest, no output moves by more than this fraction of its largest value [1]."""
     parameters: dict[Name, Number] = Field(default_factory=dict)
+    """Parameters of the FMU in such trials, in its units [unit of the FMU]."""
 
 
 class MotionSection(Section):
@@ -116,25 +100,17 @@ class MotionSection(Section):
 
 
 class ReleaseSection(Section):
-    """`[release]`: how a ring-down starts.
-
-    Attributes
-    ----------
-    displacement : str, optional
-        Parameter: displacement [m] from which the FMU is released at its start.
-    velocity : str, optional
-        Parameter: velocity [m/s] at the start, for records that do not begin at rest.
-    hold : str, optional
-        In place of a parameter: force input that holds the release point until the start.
-    output : str, optional
-        Displacement output that shows where the release point is. Needed with `hold`; with a
-        parameter it is for one that is not the release point's own displacement.
-    """
+    """`[release]`: how a ring-down starts."""
 
     displacement: Name | None = None
+    """Parameter: displacement [m] from which the FMU is released at its start."""
     velocity: Name | None = None
+    """Parameter: velocity [m/s] at the start, for records that do not begin at rest."""
     hold: Name | None = None
+    """In place of a parameter: force input that holds the release point until the start."""
     output: Name | None = None
+    """Displacement output that shows where the release point is. Needed with `hold`; with a
+    parameter it is for one that is not the release point's own displacement."""
 
     def checks(self) -> Iterator[Check]:
         """Yield a fault if there is not exactly one way of release, or no output for `hold`."""
@@ -201,61 +177,42 @@ class ScalesSection(Section):
 
 
 class FmuModelDescription(ModelDescription):
-    """Content of the file.
-
-    Attributes
-    ----------
-    kind : "fmu"
-        Kind of the model.
-    fmu : str
-        The FMU, seen from the file's folder.
-    binding : str, optional
-        A binding file, seen from the file's folder, or a shipped binding by name. Without one,
-        names here are variables of the FMU.
-    inputs : FmuInputsSection
-        Inputs that a trial sets.
-    static : StaticSection
-        How a state at rest is reached.
-    motion : MotionSection
-        How a motion is computed.
-    release : ReleaseSection or None
-        How a ring-down starts.
-    input : tuple of FmuInputSection
-        Inputs that static trials hold in each row, and that drive driven trials.
-    output : tuple of FmuOutputSection
-        What channels can measure.
-    port : tuple of FmuPortSection
-        Where an internal force can act.
-    parameter : tuple of FmuParameterSection
-        Calibrated parameters, which are variables of the FMU.
-    scales : ScalesSection
-        Natural scales that cannot be computed with the FMU.
-    effects : table
-        Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
-        `effect.<id>.<number>`).
-    superposition : bool
-        Whether motions are superposed if the FMU proves to be linear; if false, every motion is
-        stepped.
-    isolated : bool
-        Whether the FMU runs in a process of its own.
-    """
+    """Content of the file."""
 
     what: ClassVar[str] = "an FMU model"
     kind: Literal["fmu"]
+    """Kind of the model."""
     fmu: Name
+    """The FMU, seen from the file's folder."""
     binding: Name | None = None
+    """A binding file, seen from the file's folder, or a shipped binding by name. Without one, names
+    here are variables of the FMU."""
     inputs: FmuInputsSection = Field(default_factory=FmuInputsSection)
+    """Inputs that a trial sets."""
     static: StaticSection = Field(default_factory=StaticSection)
+    """How a state at rest is reached."""
     motion: MotionSection = Field(default_factory=MotionSection)
+    """How a motion is computed."""
     release: ReleaseSection | None = None
+    """How a ring-down starts."""
     input: tuple[FmuInputSection, ...] = ()
+    """Inputs that static trials hold in each row, and that drive driven trials."""
     output: tuple[FmuOutputSection, ...] = Field(min_length=1)
+    """What channels can measure."""
     port: tuple[FmuPortSection, ...] = ()
+    """Where an internal force can act."""
     parameter: tuple[FmuParameterSection, ...] = ()
+    """Calibrated parameters, which are variables of the FMU."""
     effects: dict[Name, Name] = Field(default_factory=dict)
+    """Kind of a primitive to the id of the FMU's effect (`effect.<id>.active`,
+    `effect.<id>.<number>`)."""
     scales: ScalesSection = Field(default_factory=ScalesSection)
+    """Natural scales that cannot be computed with the FMU."""
     superposition: bool = True
+    """Whether motions are superposed if the FMU proves to be linear; if false, every motion is
+    stepped."""
     isolated: bool = True
+    """Whether the FMU runs in a process of its own."""
 
     def checks(self) -> Iterator[Check]:
         """Yield the checks on the whole file: on names, effects and the reference temperature."""
