@@ -52,7 +52,10 @@ def mission_model() -> tuple[GraphicalModel, GaussianSensorModel, RewardModel]:
     states = StateSpace((Factor("z1", levels), Factor("z2", levels)))
     tables = [[worsening_table(5, p)] * 2 for p in (0.05, 0.10)]
     model = GraphicalModel(
-        states, ("2g", "3g"), states.certain((0.0, 0.0)), TransitionModel.from_factors(tables)
+        states,
+        ("2g", "3g"),
+        states.certain_belief((0.0, 0.0)),
+        TransitionModel.from_factors(tables),
     )
     z1, z2 = states.coordinates.T[:, None, :, None, None]
     span = np.linspace(0.0, 1.0, 24)

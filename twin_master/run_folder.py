@@ -76,8 +76,6 @@ def create_run_folder(
     ----------
     folder : Path
         The folder; it must be absent or empty unless `replace` is given.
-    config : dict
-        The content of `config.json`.
     files : mapping of str to bytes, optional
         The contents of further files, by their paths in the folder.
     replace : bool
@@ -155,8 +153,6 @@ def lock_run_folder(folder: Path, *, fleet_is_locked: bool = False) -> int:
 
     Parameters
     ----------
-    folder : Path
-        The folder.
     fleet_is_locked : bool
         Whether it is this process that watches the fleet.
 
@@ -213,10 +209,6 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
-    config : dict
-        The content of its `config.json`.
     seed : int
         The seed of the run.
 
@@ -267,10 +259,6 @@ def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
-    config : dict
-        The content of its `config.json`.
     hashes : mapping of str to str
         The SHA-256 hash of each input.
 
@@ -349,8 +337,6 @@ def new_run_folder(
     files : mapping of str to bytes
         The contents of the files that belong to asset and belief, and of further ones, by their
         paths in the folder.
-    replace : bool
-        Whether to replace an existing run folder.
     watched : bool
         Whether a real asset is watched.
     parts : mapping of str to str, optional
@@ -388,8 +374,6 @@ def hold_run_folder(
 
     Parameters
     ----------
-    folder : Path
-        The path of the folder.
     loaded_scenario : LoadedScenario or None
         The scenario that the user expects there; it is compared with that of the folder.
     fleet_is_locked : bool

@@ -395,8 +395,6 @@ def check_scenario(
 
     Parameters
     ----------
-    loaded_scenario : LoadedScenario
-        The scenario, as read from its file.
     overrides : Overrides or mapping, optional
         What differs from the file, as for `fly`.
 

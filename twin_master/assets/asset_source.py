@@ -163,8 +163,6 @@ def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> 
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario that the asset flies in.
     states : (S, F) array
         The value of each state factor in each state.
     asset : Asset
@@ -218,8 +216,6 @@ def calibration_sentence(
         The record of the calibration that a run folder contains.
     asset, believed : str
         The asset that flies and the model that the twin believes, in words.
-    hashes : mapping of str to str
-        The hashes of the files and designs of the run, by name.
 
     Returns
     -------
@@ -248,8 +244,6 @@ class AssetSource:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     section : FileSection, optional
         The table of the scenario that names the files.
     """
@@ -315,13 +309,6 @@ class AssetSource:
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
         """Copy the files into a run folder, build the FMU or model, and return the hashes.
 
-        Parameters
-        ----------
-        folder : Path
-            The path of the run folder.
-        progress : Progress
-            Receives reports on the progress.
-
         Returns
         -------
         dict of str to str
@@ -364,8 +351,6 @@ class AssetSource:
         ----------
         draws : ParameterDraws
             The E draws of the parameter.
-        model : GraphicalModel
-            The graphical model, which has the S joint states.
 
         Returns
         -------
@@ -399,8 +384,6 @@ class AssetSource:
 
         Parameters
         ----------
-        path : Path
-            The file to write.
         state : mapping of str to float
             The estimated value of each state factor, SI.
         control : mapping of str to float

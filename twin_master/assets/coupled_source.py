@@ -167,8 +167,6 @@ class SeveralSource(FmuSource):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     section : SeveralSection
         The table `asset` of the scenario. A variable of the binding is a connector of the system,
         or an FMU's own variable, which is written `component.variable`.
@@ -328,13 +326,7 @@ class CoupledSource(SeveralSource):
         return Wiring(self._system_structure(fmus))
 
     def _system_structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
-        """Return the components, connections and connectors of the system of the scenario.
-
-        Parameters
-        ----------
-        fmus : mapping of str to Path
-            The file of each component's FMU, by the name of the component.
-        """
+        """Return the components, connections and connectors of the system of the scenario."""
         names = [component.name for component in self.section.component]
         # A pattern such as `wing.strain[{1..24}]` stands for several connections.
         connections: list[Connection] = []

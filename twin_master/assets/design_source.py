@@ -222,8 +222,6 @@ class _Wing(NamedStructure):
 
         Parameters
         ----------
-        path : Path
-            The file to write.
         state : mapping of str to float
             The estimated value of each state factor, SI.
         control : mapping of str to float
@@ -460,8 +458,6 @@ class StrainPredictor(Protocol):
 
         Parameters
         ----------
-        young_modulus_factor : float
-            The factor on Young's modulus.
         tip_force : float
             The force at the load point near the tip [N].
         control : mapping of str to float
@@ -478,8 +474,6 @@ def strain_predictor(
 
     Parameters
     ----------
-    wing : ReducedModel
-        The reduced model of the wing.
     patch : PatchFile
         The primitive changes by which the effects act on the model.
     patch_arrays : PatchArrays, optional

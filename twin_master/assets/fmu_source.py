@@ -152,8 +152,6 @@ class FmuAsset(Asset):
 
     Parameters
     ----------
-    session : FmiAsset or CoupledAsset
-        The FMU or the FMUs, in their initial state.
     observation : slice
         The positions of the observed quantity among the observed values of the binding.
     load : mapping of str to float
@@ -245,8 +243,6 @@ class FmuSource(AssetSource):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     section : FmuSection
         The table `asset` of the scenario.
     """
@@ -534,19 +530,6 @@ def _check_unit(binding: Binding, what: str, bound_unit: str, key: str, unit: st
     "1" is the default of a scenario, and so may stand for any unit. It is refused only for a
     dimensionless quantity with a scale of its own, such as a percentage, whose values it would
     misread.
-
-    Parameters
-    ----------
-    binding : Binding
-        The binding, for the message.
-    what : str
-        The quantity, for the message: "the state z1".
-    bound_unit : str
-        The unit of the quantity in the binding.
-    key : str
-        The key of the scenario that states the unit, for the message.
-    unit : str
-        The unit of the quantity in the scenario.
     """
     if bound_unit == unit:
         return  # saves the third of a second in which the library of units loads

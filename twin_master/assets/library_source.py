@@ -269,18 +269,6 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
 
     Equal libraries give equal bytes.
 
-    Parameters
-    ----------
-    path : Path
-        The path of the NetCDF file.
-    library : ObservationLibrary
-        The library.
-
-    Returns
-    -------
-    Path
-        The file.
-
     Raises
     ------
     FileNotWrittenError
@@ -291,11 +279,6 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
 
 def load_observation_library(path: Path) -> ObservationLibrary:
     """Read an observation library and check its layout.
-
-    Parameters
-    ----------
-    path : Path
-        The path of the NetCDF file.
 
     Raises
     ------
@@ -361,8 +344,6 @@ class LibrarySource(AssetSource):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     section : LibraryBelief
         The table `belief` of the scenario.
     flown : FmuSource
@@ -428,15 +409,7 @@ class LibrarySource(AssetSource):
     def _check_same_texts(
         self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]
     ) -> None:
-        """Refuse a library whose labels differ from those of the scenario, in number or order.
-
-        Parameters
-        ----------
-        verb : str
-            The verb and the compared things, for the message: "has the sensors".
-        of_library, of_scenario : sequence of str
-            The labels of the library, and those that the scenario asks for.
-        """
+        """Refuse a library whose labels differ from those of the scenario, in number or order."""
         if list(of_library) != list(of_scenario):
             raise MissionInputError(
                 f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "

@@ -74,12 +74,8 @@ class RecordedStructure(Asset):
     ----------
     scenario : Scenario
         A scenario with `observation.modes` and `truth.record`.
-    model : ReducedModel
-        The model that was packed.
     open_session : callable
         Opens the FMU with a binding and parameters.
-    binding : Binding
-        The binding of the FMU.
     parameters : mapping of str to float
         The parameters of the true structure.
     """

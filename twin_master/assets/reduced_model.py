@@ -311,8 +311,6 @@ class ReducedModelSource(NamedStructure):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     model : ReducedModel, optional
         The reduced model of a wing, if it exists already.
     section : FileSection, optional
@@ -391,8 +389,6 @@ class ReducedModelSource(NamedStructure):
         ----------
         draws : ParameterDraws
             The E draws of the parameter.
-        model : GraphicalModel
-            The graphical model, which has the S joint states.
 
         Returns
         -------
@@ -426,8 +422,6 @@ class ReducedModelSource(NamedStructure):
 
         Parameters
         ----------
-        draws : ParameterDraws
-            The E draws of the parameter.
         states : (S, F) array
             The value of each state factor in each joint state, SI.
 

@@ -103,8 +103,6 @@ def resolve_scenario(
 
     Parameters
     ----------
-    loaded_scenario : LoadedScenario
-        The scenario and its file.
     overrides : Overrides or mapping, optional
         The values that replace those of the scenario.
 
@@ -364,8 +362,6 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
     ----------
     table : dict
         The table of a scenario, in SI; it is changed.
-    path : Path
-        The file of `uav-twin fleet learn`.
     group : str, optional
         The group of assets. If the file does not have the group, the tables for a new asset are
         used.

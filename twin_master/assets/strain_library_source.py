@@ -252,10 +252,6 @@ class StrainLibrarySource(AssetSource):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
-    library : StrainLibrary
-        The library.
     path : Path, optional
         The path of the library's file; a run folder gets a copy of it.
     """

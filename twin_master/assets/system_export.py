@@ -53,10 +53,6 @@ def export_scenario(
 
     Parameters
     ----------
-    loaded_scenario : LoadedScenario
-        The scenario, as read from its file.
-    out : Path
-        The file to write.
     seed : int, optional
         The seed of the run, from which the seeds of the FMUs are drawn; by default that of the
         scenario.
@@ -64,11 +60,6 @@ def export_scenario(
         What evaluates the FMUs that are packed from designs; by default as the scenario says.
     replace_file : bool
         Whether an existing file may be replaced.
-
-    Returns
-    -------
-    Path
-        The file.
 
     Raises
     ------
@@ -153,17 +144,10 @@ def export_design(
     ----------
     design : Path, optional
         The file of the design; by default the shipped one.
-    out : Path
-        The file to write.
     kind : {"python", "compiled"}
         What evaluates the FMU.
     replace_file : bool
         Whether an existing file may be replaced.
-
-    Returns
-    -------
-    Path
-        The file.
     """
     wing = load_design(design)
     binding = load_binding(binding_files()["uav_wing"])
@@ -188,8 +172,6 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
     ----------
     name : str
         The name of the system.
-    fmu : Path
-        The FMU.
     binding : Binding
         The binding of the FMU. The component has its name, with `_` for characters that are no
         letters or digits.
@@ -223,17 +205,7 @@ def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
 def _with_values(
     wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
 ) -> Wiring:
-    """Return the system with the start values of parameters and loads at its components.
-
-    Parameters
-    ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
-    binding : Binding
-        The binding of the system.
-    parameters, load : mapping of str to float
-        The values by their names in the binding, in its units.
-    """
+    """Return the system with the start values of parameters and loads at its components."""
     # The values of the system's connectors, in the units of the system.
     system = system_description(wiring)
     blocks = Blocks(system, binding)

@@ -1,7 +1,7 @@
 """Compiled loops that advance the beliefs of all hypotheses about gauges, and average them.
 
-Notation is that of `fault_kernels`. A pair in which no fault believes has a row of zeros among the
-beliefs of the faults. Such rows are most of all rows, and are neither read nor written.
+Notation is that of `fault_kernels`. A pair that has no probability under any fault has a row of
+zeros among the beliefs of the faults. Most rows are such rows, which are neither read nor written.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,14 @@ from twin_master.network.kernels import PredecessorLists
 
 
 class Onsets(NamedTuple):
-    """The probability that faults of B twins began before this step, if they have begun at all.
+    """The probability that each fault of B twins began before this step, if it has begun at all.
 
     Attributes
     ----------
     gauge : (B, R) array
-        Of each fault of a gauge.
+        The probability for each fault of a gauge.
     free_gains : (B,) array
-        Of free gains.
+        The probability for free gains.
     """
 
     gauge: Float
@@ -31,7 +31,7 @@ class Onsets(NamedTuple):
 
 
 class Recoveries(NamedTuple):
-    """What the hypothesis "recovered" takes over from faults that ended or were hidden in a step.
+    """The probability that passes from ended or hidden faults to "recovered" in a step.
 
     Attributes
     ----------
@@ -62,8 +62,6 @@ def advance_belief(
 
     Parameters
     ----------
-    lists : PredecessorLists
-        The predecessors of each level.
     control : int
         The control before the transition.
     draws : int
@@ -110,12 +108,10 @@ def advance_rows(
     work_is_nonzero: NDArray[np.bool_],
     work: Single,
 ) -> None:
-    """Do the same for the beliefs of all R faults of a twin, whose rows of zeros are left out.
+    """Advance the beliefs of all R faults of a twin by one transition, in place.
 
     Parameters
     ----------
-    lists : PredecessorLists
-        The predecessors of each level.
     control : int
         The control before the transition.
     is_nonzero, work_is_nonzero : (N,) array of bool
@@ -179,7 +175,7 @@ def begin_gauge_faults(
     rows: Single,
     recovering: Float,
 ) -> None:
-    """Let faults of gauges begin, and average their beliefs for "recovered".
+    """Let faults of gauges begin, and average their beliefs for the hypothesis "recovered".
 
     A fault that begins now has the belief of the model. It is mixed with the belief of the fault
     that began earlier, so that one belief stands for all first steps.
@@ -241,8 +237,6 @@ def advance_beliefs(
 
     Parameters
     ----------
-    lists : PredecessorLists
-        The predecessors of each level.
     control : (B,) array
         The control of the step before.
     draws : int
@@ -295,7 +289,7 @@ def advance_beliefs(
 
 @compiled_with_reordered_sums
 def add_gauge_beliefs(weight: Float, beliefs: Beliefs, twin: int, average: Float) -> None:
-    """Add to `average` (S,) the beliefs about the state of a twin under faults of weights (R,)."""
+    """Add the weighted beliefs about the state under a twin's faults to `average` (S,)."""
     pairs, faults = beliefs.gauge.shape[1:]
     draws = pairs // len(average)
     single_weight = np.empty(faults, np.float32)
@@ -313,7 +307,7 @@ def add_gauge_beliefs(weight: Float, beliefs: Beliefs, twin: int, average: Float
 def average_competing_beliefs(
     recovered_weight: Float, gauge_weight: Float, beliefs: Beliefs, average: Float
 ) -> None:
-    """Fill in the beliefs about the state under "recovered" and faults of gauges, weighted.
+    """Fill `average` with the weighted sum of the beliefs under "recovered" and faults of gauges.
 
     Parameters
     ----------
@@ -321,8 +315,6 @@ def average_competing_beliefs(
         The weight of "recovered".
     gauge_weight : (B, R) array
         The weight of each fault of a gauge.
-    beliefs : Beliefs
-        The beliefs of B twins.
     average : (B, S) array
         To be filled.
     """

@@ -1,4 +1,4 @@
-"""Compiled loops: the density of an observation if that of one gauge is exchanged for another.
+"""Compiled loops: the density of an observation after the density of one gauge is exchanged.
 
 Notation and method are those of `fault_kernels`. Single precision suffices: the ratio of two
 densities of a gauge is a power of a number near one, which is kept as its excess over one.
@@ -26,7 +26,7 @@ where it sees that the arrays were made one by one."""
 
 
 class GaugeDensities(NamedTuple):
-    """Densities of L values of gauges that may take the place of those of the model.
+    """L densities of gauges that may take the place of those of the model.
 
     Each is Student's, and the gauge shows (1 + gain) times the prediction.
 
@@ -47,12 +47,12 @@ class GaugeDensities(NamedTuple):
 
 
 class ExchangeFactors(NamedTuple):
-    """Numbers for the ratios of L densities to those of the model that hold at all pairs.
+    """Numbers, the same at all pairs, for the ratios of L densities to those of the model.
 
     A density of Student is k^(-n / 2), where n is the number of degrees of freedom plus one. Its
-    kernel is k = 1 + (innovation)^2 / (variance times scale squares), and that of the model is
-    k_0 = 1 + (residual)^2 / (scale squares). With r, the ratio k_0 / k at the reference pair, the
-    ratio of two densities is the power n / 2 of k_0 / (r k). Each number below is made for this.
+    kernel is k = 1 + (innovation)^2 / (variance times scale squares), and that of the model is k_0
+    = 1 + (residual)^2 / (scale squares). With r, the ratio k_0 / k at the reference pair, the ratio
+    of two densities is the power n / 2 of k_0 / (r k).
 
     Attributes
     ----------
@@ -141,9 +141,9 @@ def log_exchanged_density(
     number: int,
     pair: int,
 ) -> float:
-    """Return the log of the ratio of a density to that of the model at a pair.
+    """Return the log of the ratio of density `number` to that of the model at a pair.
 
-    Logarithms are taken from the start, so that nothing overflows; `number` tells which density.
+    Logarithms are taken from the start, so that nothing overflows.
     """
     g = densities.gauge[number]
     if not observation.present[g]:
@@ -219,22 +219,16 @@ def exchange_factors(
 def _append_digits(
     power: np.float32, excess: np.float32, digits: Single, first: int, number: int
 ) -> np.float32:
-    """Return a power with six more binary digits of the exponent; all as excesses over one.
+    """Return a power with six more binary digits of its exponent; powers are excesses over one.
 
-    The power is squared for each digit, and multiplied by the base if the digit is one:
-    (1 + z)^2 = 1 + z (2 + z). So single precision suffices for an excess of at least zero, however
-    large the exponent. The digits are written out, so that the numbers stay in registers.
+    The power is squared for each digit, and multiplied by the base if the digit is one: (1 + z)^2 =
+    1 + z (2 + z). So single precision suffices for an excess of at least zero, however large the
+    exponent. The digits are written out, so that the numbers stay in registers.
 
     Parameters
     ----------
-    power, excess : np.float32
-        The excess of a power and of its base over one.
     digits : (6 m, L) array
         The binary digits of the exponents of L numbers.
-    first : int
-        The first of the digits that are appended.
-    number : int
-        Which of the L numbers.
     """
     one = np.float32(1.0)
     two = np.float32(2.0)
@@ -262,23 +256,19 @@ def exchange_densities(
     ratio: Single,
     work: ExchangeWork,
 ) -> None:
-    """Fill in the ratios of L densities to those of the model at one pair.
+    """Fill `ratio` with the ratios of L densities to those of the model at one pair.
 
-    Each is relative to what `log_reference_density` returns. A ratio below exp(-41) is cut to this;
-    one above exp(44) may be infinite or NaN.
+    Each is relative to the density whose logarithm `log_reference_density` returns. A ratio below
+    exp(-41) is cut to this; one above exp(44) may be infinite or NaN.
 
     Parameters
     ----------
-    factors : ExchangeFactors
-        The densities.
     residual, prediction : (L,) array
         The residual and the prediction of the gauge of each density.
     square : (L,) array
         To be filled: the squared innovation over its variance.
     ratio : (L,) array
         To be filled.
-    work : ExchangeWork
-        Work space.
     """
     excess, power_excess, inverse_variance, sign = work
     one = np.float32(1.0)

@@ -30,7 +30,7 @@ from twin_master.gauges.model_likelihood import (
 
 @compiled
 def _unfilled_observation(pairs: int, gauges: int) -> StandardizedObservation:
-    """Return the arrays of an observation of one twin, to be filled."""
+    """Return an observation of one twin with arrays that are still to be filled."""
     return StandardizedObservation(
         np.empty(gauges, np.bool_),
         np.empty((pairs, gauges)),
@@ -55,12 +55,6 @@ def correct_beliefs(
 
     Parameters
     ----------
-    predictions : Predictions
-        What all controls and states predict.
-    observations : Observations
-        The observations of the twins.
-    priors : FaultPriors
-        The priors of the faults.
     observation_count : (B, G) array
         The number of earlier observations of each gauge.
     beliefs : Beliefs

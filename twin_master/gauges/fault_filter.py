@@ -22,9 +22,9 @@ from twin_master.scenario.tables import MOST_DRAWS, Noticing
 _GAINS = (-2.5, -1.0, 1.0, 2.5)
 """Gain errors that are compared, in `Noticing.gauge_gain`; the largest also find larger ones."""
 _GAIN_DEVIATIONS = (1.0, 0.5, 0.5, 1.0)
-"""Prior standard deviation of each: half of a gain error that is to be found is none."""
+"""Prior standard deviation of each, in the same unit."""
 _MOST_BELIEF_NUMBERS = 20_000_000
-"""Numbers that the beliefs of the gauge faults may take: each kept step holds them."""
+"""Largest number of entries in the beliefs of the gauge faults, which each kept step contains."""
 _LEAST_INFORMATION = 1e-3
 """Least information about a gain in a step, so that a gauge without load has a finite prior."""
 _STATE_FORMAT = b"4"
@@ -32,7 +32,7 @@ _STATE_FORMAT = b"4"
 
 
 class FaultFilter:
-    """Advances the beliefs of the model and of the faults, and corrects them by observations.
+    """The filters of the model and of the faults: they advance all beliefs, and correct them.
 
     Parameters
     ----------
@@ -42,8 +42,6 @@ class FaultFilter:
         Predictions (E, S, U, G) and assumed noise.
     draws : (E,) array
         The value of the parameter in each draw.
-    settings : Noticing
-        The priors of the faults.
 
     Attributes
     ----------
@@ -127,7 +125,7 @@ class FaultFilter:
         """Return the log prior probability (G,) that the fault is in each gauge.
 
         The probability is proportional to the expected number of steps until a fault of the gauge
-        is found. Otherwise a gauge with a weak signal would have no chance beside gauges whose
+        is found. Otherwise a gauge with a weak signal would stand no chance against gauges whose
         faults are found in one step.
         """
         sensor_model = self._sensor_model
@@ -169,7 +167,7 @@ class FaultFilter:
 
     @property
     def belief_size(self) -> int:
-        """The number of numbers in the beliefs of the gauge faults of a twin."""
+        """The number of entries in the beliefs of the gauge faults of a twin."""
         return int(np.prod(self._gauge_belief_shape))
 
     def restore(self, before: Carried) -> WatchState:
@@ -179,7 +177,7 @@ class FaultFilter:
     def advance(self, state: WatchState, previous_control: Index, control_index: Index) -> None:
         """Advance the state of the watch of B twins to the next step, before its observation.
 
-        The beliefs pass one transition. In the weights, faults may begin, end or become hidden.
+        The beliefs make one transition. In the weights, faults may begin, end or become hidden.
 
         Parameters
         ----------
@@ -210,10 +208,11 @@ class FaultFilter:
         )
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: Float) -> Float:
-        """Let faults of single gauges begin in this step, and let the sums about their gains fade.
+        """Let faults of single gauges begin in this step, and return how probably they are older.
 
-        A fault that begins now has the sums of squares of the model so far. The probability (B,
-        G K) that each fault began earlier is returned, with which beliefs are mixed.
+        It is the probability (B, G K) that each fault began earlier, with which beliefs are mixed.
+        A fault that begins now has the sums of squares of the model so far. Old terms of the sums
+        about gains are forgotten, as gains may change.
 
         Parameters
         ----------
@@ -232,9 +231,9 @@ class FaultFilter:
             state.step_count[:, None] - state.gauge_onset
         )
         # A fault that begins now has learnt no gain yet: its sums are zero.
-        fading = self._fading_per_step()
-        np.multiply(beliefs.gauge_sum_cc, fading * earlier_weight, out=beliefs.gauge_sum_cc)
-        np.multiply(beliefs.gauge_sum_cx, fading * earlier_weight, out=beliefs.gauge_sum_cx)
+        forgetting = self._forgetting_factor()
+        np.multiply(beliefs.gauge_sum_cc, forgetting * earlier_weight, out=beliefs.gauge_sum_cc)
+        np.multiply(beliefs.gauge_sum_cx, forgetting * earlier_weight, out=beliefs.gauge_sum_cx)
         model_squares = np.repeat(beliefs.model_squares, gains, axis=1)
         beliefs.gauge_squares[:] = (
             earlier_weight * beliefs.gauge_squares + (1.0 - earlier_weight) * model_squares
@@ -242,12 +241,10 @@ class FaultFilter:
         return np.asarray(earlier_weight)
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: Float) -> Float:
-        """Let the fault of free gains begin in this step, and let its sums about the gains fade.
+        """Let free gains begin in this step, and return the probability (B,) that they are older.
 
-        Free gains are the fault that several gauges have unknown gains.
-
-        A fault that begins now has the sums of squares of the model so far. The probability (B,)
-        that it began earlier is returned, with which beliefs are mixed.
+        Free gains are the fault that several gauges have unknown gains. It is treated as the faults
+        of single gauges in `_begin_gauge_faults`.
 
         Parameters
         ----------
@@ -268,13 +265,13 @@ class FaultFilter:
         )
         for squares in (statistics.fixed_squares, statistics.free_squares):
             squares += new_weight * (beliefs.model_squares - squares)
-        fading = self._fading_per_step()
+        forgetting = self._forgetting_factor()
         for sums in (statistics.sum_cc, statistics.sum_cx):
-            sums *= fading * earlier_weight
+            sums *= forgetting * earlier_weight
         return np.ascontiguousarray(earlier_weight[:, 0])
 
-    def _fading_per_step(self) -> float:
-        """Return the factor by which the sums about gains fade in a step, as gains may change."""
+    def _forgetting_factor(self) -> float:
+        """Return the factor on the sums about gains in each step: gains may change slowly."""
         return float(np.exp(-1.0 / self._settings.memory_steps))
 
     def probability_to_begin_after(self, step: Float) -> Float:
@@ -326,14 +323,12 @@ class FaultFilter:
         return ended_or_hidden
 
     def _recoveries(self, state: WatchState, ended_or_hidden: Float) -> Recoveries:
-        """Return by how much each fault enters the hypothesis "recovered" in this step.
+        """Return how much probability each fault passes to the hypothesis "recovered" in this step.
 
         "Recovered" is the hypothesis that the gauges are right again after a fault.
 
         Parameters
         ----------
-        state : WatchState
-            The state of the watch.
         ended_or_hidden : (B, 1 + G K) array
             The probability of each fault that it ended or was hidden in this step.
         """
@@ -359,16 +354,14 @@ class FaultFilter:
     def _mix_squares(self, state: WatchState, recoveries: Recoveries) -> None:
         """Mix the sums of squares of ended and hidden faults into those of "recovered".
 
-        A gauge has the sum of the fault if the fault is its own, and otherwise that of the model.
-        The sums are averaged over the faults by their weights, and the average enters "recovered"
-        by the fraction that is new.
+        Under a fault its own gauge has the sum of the fault, and each other gauge that of the
+        model. These sums are averaged over the faults by their weights, and the average enters
+        "recovered" in proportion to the probability that is new there.
 
         Parameters
         ----------
         state : WatchState
             The state of the watch; updated in place.
-        recoveries : Recoveries
-            By how much each fault enters.
         """
         beliefs = state.beliefs
         model_squares = beliefs.model_squares
@@ -394,8 +387,6 @@ class FaultFilter:
         ----------
         state : WatchState
             The state of the watch; updated in place.
-        observations : Observations
-            The observations.
         """
         twins, faults = state.log_gauge_evidence.shape
         log_evidence = LogEvidence(
@@ -432,8 +423,8 @@ class FaultFilter:
 def _choose_even_draws(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:
     """Choose at most `MOST_DRAWS` draws, evenly over the whole range of their values.
 
-    They are chosen evenly and not by probability, because a true value in a wide gap between two
-    chosen draws would look like a fault.
+    They are not chosen by probability, because a true value in a wide gap between two chosen draws
+    would look like a fault.
 
     Parameters
     ----------

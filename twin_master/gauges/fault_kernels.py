@@ -1,4 +1,4 @@
-"""Compiled loops of the filters of gauge faults: an observation, and how sound gauges explain it.
+"""Compiled loops of the filters of gauge faults: an observation, and its density for sound gauges.
 
 A pair is a state and a draw of the parameter; there are N of them, in the order of the states. The
 innermost loops run over the gauges or over their faults, whose numbers lie side by side.
@@ -25,7 +25,7 @@ from reporting.arrays import Float, Index, Single
 NEGLIGIBLE_UNDER_MODEL = 1e-30
 """Pairs of draw and state of smaller probability are left out of the evidence of the model."""
 NEGLIGIBLE_UNDER_FAULT = 1e-7
-"""The same for a fault: leaving pairs out lowers its evidence, so that an alarm comes later."""
+"""The same for a fault; its evidence becomes lower by that, so that an alarm comes later."""
 LARGEST_DISTANCE = 1e140
 """Distances are cut to this in the fit within an interval; its square is still a number."""
 LEAST_TOTAL = 1e-200
@@ -35,7 +35,7 @@ _GAUGES_OF_A_PRODUCT = 64
 
 
 class Predictions(NamedTuple):
-    """What U controls and N pairs predict for G gauges; F factors of the state have intervals.
+    """The predictions of G gauges at N pairs under U controls, and their F intervals.
 
     Attributes
     ----------
@@ -62,14 +62,14 @@ class Observations(NamedTuple):
     ----------
     readings : (B, G) array
         The values of the gauges, SI; NaN where a gauge is lost or left out.
-    log_density_beside : (B, S) array
-        The log density of the remaining observation, such as readings of inspections.
+    other_log_density : (B, S) array
+        The log density of the other parts of the observation, such as readings of inspections.
     control : (B,) array
         The control in force.
     """
 
     readings: Float
-    log_density_beside: Float
+    other_log_density: Float
     control: Index
 
 
@@ -93,7 +93,7 @@ class FaultPriors(NamedTuple):
 
 
 class FreeGainStatistics(NamedTuple):
-    """What is learnt about each gauge of B twins if some gauges have unknown gains.
+    """The regression of each gauge of B twins under the fault that some gauges have unknown gains.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class Beliefs(NamedTuple):
     gauge : (B, N, R) array
         The belief under each fault of a gauge, gauge by gauge; most entries are zero.
     gauge_is_nonzero : (B, N) array of bool
-        Whether any fault of a gauge believes in the pair; else its row of `gauge` is zero.
+        Whether the pair has a probability under any fault of a gauge; else its row is zero.
     free_gains : (B, N) array
         The belief if several gauges have unknown gains.
     model_squares, recovered_squares : (B, G) array
@@ -148,14 +148,14 @@ class Beliefs(NamedTuple):
 
 
 class LogEvidence(NamedTuple):
-    """The log evidence of an observation under each hypothesis of B twins, up to one constant.
+    """The log evidence of an observation under each hypothesis of B twins, up to a common constant.
 
     Attributes
     ----------
     model, recovered, free_gains : (B,) array
-        Those of the model, of "recovered" and of free gains.
+        The log evidence of the model, of "recovered" and of free gains.
     gauge : (B, R) array
-        Those of the faults of single gauges.
+        The log evidence of each fault of a single gauge.
     """
 
     model: Float
@@ -222,11 +222,6 @@ def _normal_root(design: Float, weight: Float, root: Float) -> float:
         The weight of each gauge.
     root : (F, F) array
         To be filled below and on the diagonal.
-
-    Returns
-    -------
-    float
-        Half the log determinant of the normal matrix.
     """
     half_log_determinant = 0.0
     for i in range(len(root)):
@@ -265,9 +260,9 @@ def _fit_within_intervals(
 ) -> None:
     """Move the predictions to the most probable point within the interval of each state.
 
-    The point has a standard normal prior for each factor, so that it is found by a ridge
-    regression, solved by Cholesky's method. A gauge is weighted by the noise that is learnt.
-    Otherwise a gauge that is off would shift the point, and so the residuals of all other gauges.
+    The point has a standard normal prior for each factor: it is found by a ridge regression, solved
+    by Cholesky's method. Each gauge is weighted by its learnt noise; otherwise a faulty gauge would
+    shift the point, and with it the residuals of all other gauges.
 
     Parameters
     ----------
@@ -275,8 +270,6 @@ def _fit_within_intervals(
         The change of each gauge within the interval of a state, in units of the noise.
     precision : (G,) array
         The precision of each gauge over the assumed one.
-    draws : int
-        The number E of draws.
     pairs : (n,) array
         The pairs that are considered, in rising order.
     observation : StandardizedObservation
@@ -325,12 +318,6 @@ def standardize(
 
     Parameters
     ----------
-    predictions : Predictions
-        What all controls and pairs predict.
-    observations : Observations
-        The observations of all twins.
-    twin : int
-        The twin.
     precision : (G,) array
         The precision of each gauge over the assumed one.
     pairs : (n,) array
@@ -354,7 +341,7 @@ def standardize(
         state = i // draws
         if state != state_of_scale:
             state_of_scale = state
-            log_scale = observations.log_density_beside[twin, state]
+            log_scale = observations.other_log_density[twin, state]
             for g in range(gauges):
                 log_scale += is_present[g] * predictions.log_inverse_deviation[control, state, g]
         observation.log_density[i] = log_scale
@@ -373,7 +360,7 @@ def standardize(
 
 @compiled
 def number_products(degrees_after: Float, product: Index) -> None:
-    """Fill in to which product of densities each gauge (G,) belongs, in the order of the gauges."""
+    """Fill `product` (G,) with the number of the product of densities of each gauge."""
     degrees = np.empty(len(product))
     members = np.zeros(len(product), np.int64)
     count = 0
@@ -397,7 +384,7 @@ def number_products(degrees_after: Float, product: Index) -> None:
 
 @compiled
 def multiply_by_power(base: Float, exponent: float, product: Float) -> None:
-    """Multiply numbers (n,) by a power of others (n,) in place; the base is overwritten.
+    """Multiply `product` (n,) by a power of `base` (n,), in place; the base is overwritten.
 
     The whole part of the exponent is taken by repeated squaring.
     """
@@ -439,12 +426,10 @@ def _density_by_products(
     scale_squares: Float,
     density: Float,
 ) -> float:
-    """Fill in the density of the observation at pairs (n,) if every gauge is sound, up to a factor.
+    """Fill `density` (n,) with that of the observation for sound gauges; return its log factor.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation.
     pairs : (n,) array
         The indices of the pairs.
     is_counted : (n,) array of bool
@@ -453,11 +438,6 @@ def _density_by_products(
         Degrees of freedom plus the sum of squared residuals of each gauge.
     density : (n,) array
         To be filled. Where it underflows it is zero, where it overflows it may be NaN.
-
-    Returns
-    -------
-    float
-        The log of the factor.
     """
     gauges = len(scale_squares)
     count = len(pairs)
@@ -533,12 +513,10 @@ def update_sound_gauges(
     squares: Float,
     density: Float,
 ) -> SoundEvidence:
-    """Correct the belief of a hypothesis under which all gauges are sound; return its evidence.
+    """Correct the belief of a hypothesis under which all gauges are sound, and return its evidence.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation.
     pairs : (n,) array
         The pairs that are considered, outside of which the belief is zero or negligible.
     degrees_of_freedom : float

@@ -29,28 +29,28 @@ from twin_master.gauges.model_likelihood import ModelLikelihood
 
 
 class FreeGainWeights(NamedTuple):
-    """How the fault of free gains explains an observation at the pairs that it believes in.
+    """The weights of the pairs under free gains, and which gauges have a gain there.
 
     Attributes
     ----------
     weight : (n,) array
         The density times the belief, up to a factor.
-    free_part : (n, G) array
+    free_probability : (n, G) array
         The probability that a gauge has a gain of its own.
     free_square : (n, G) array
         The squared innovation over its variance, if it has one.
     """
 
     weight: Float
-    free_part: Single
+    free_probability: Single
     free_square: Single
 
 
 @compiled
 def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
-    """Return the positions in `model.pair` of pairs whose belief (N,) is not negligible.
+    """Return the positions in `model.pair` of the pairs whose belief is not negligible.
 
-    Negligible beliefs become zero.
+    Negligible entries of the belief (N,) become zero.
     """
     for i in range(len(belief)):
         if belief[i] < NEGLIGIBLE_UNDER_FAULT:
@@ -68,7 +68,7 @@ def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
 def free_gain_densities(
     priors: FaultPriors, statistics: FreeGainStatistics, twin: int
 ) -> GaugeDensities:
-    """Return the 2 G densities of the gauges of a twin: G with a gain of their own, G without."""
+    """Return 2 G densities of the gauges of a twin: G with a gain of their own, then G without."""
     gauges = statistics.sum_cc.shape[1]
     deviation = priors.free_gain_deviation
     densities = GaugeDensities(
@@ -100,24 +100,19 @@ def weigh_free_gains(
     believed: Index,
     belief: Single,
 ) -> FreeGainWeights:
-    """Return how the fault of free gains explains an observation, relative to the reference pair.
+    """Return the weights of the pairs under free gains, relative to the reference pair.
 
     The density of each gauge is a mixture of two: without and with a gain of its own.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation.
-    model : ModelLikelihood
-        How the model explains it.
     densities : GaugeDensities
         The densities of the gauges with a gain, and then those without.
     free_probability : (G,) array
         The probability that a gauge has a gain of its own.
     believed : (n,) array
-        Which of the pairs of `model` the fault believes in.
+        The positions in `model.pair` of the pairs with a belief that is not negligible.
     belief : (N,) array
-        The belief.
     """
     gauges = len(free_probability)
     count = len(believed)
@@ -156,7 +151,7 @@ def weigh_free_gains(
         for g in range(gauges):
             free_density = factor[g] * ratio[g]
             mixture = free_density + factor[gauges + g] * ratio[gauges + g]
-            weights.free_part[m, g] = free_density / mixture
+            weights.free_probability[m, g] = free_density / mixture
             weights.free_square[m, g] = square[g]
             product *= mixture
         weights.weight[m] = product
@@ -173,10 +168,10 @@ def weigh_free_gains_in_logs(
     belief: Single,
     weights: FreeGainWeights,
 ) -> float:
-    """Fill `weights` as `weigh_free_gains` does, but by logarithms.
+    """Fill `weights` as `weigh_free_gains` does, by logarithms that neither overflow nor underflow.
 
-    They neither overflow nor underflow. The first G of `densities` are those of gauges with a gain
-    of their own, and the other G those of gauges without.
+    The first G of `densities` are those of gauges with a gain of their own, and the other G those
+    of gauges without.
 
     Returns
     -------
@@ -199,7 +194,7 @@ def weigh_free_gains_in_logs(
             innovation = observation.residual[i, g]
             innovation -= densities.gain[g] * observation.prediction[i, g]
             variance = 1.0 + densities.gain_variance[g] * observation.prediction[i, g] ** 2
-            weights.free_part[m, g] = np.exp(log_free - log_mixture)
+            weights.free_probability[m, g] = np.exp(log_free - log_mixture)
             weights.free_square[m, g] = innovation * innovation / variance
         largest = max(largest, log_density[m])
     for m in range(count):
@@ -224,24 +219,16 @@ def update_free_gains(
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation of the twin.
-    model : ModelLikelihood
-        How the model explains it.
-    priors : FaultPriors
-        The prior of free gains.
     belief : (N,) array
         The belief; updated in place.
     statistics : FreeGainStatistics
-        What is learnt of all twins; that of the twin is updated in place.
-    twin : int
-        The twin.
+        The regressions of all twins; those of the twin are updated in place.
 
     Returns
     -------
     float
-        The log evidence, up to the same constant as that of the model; minus infinity if no pair is
-        believed.
+        The log evidence, up to the same constant as that of the model; minus infinity if the belief
+        is negligible everywhere.
     """
     believed = _believed_pairs(model, belief)
     count = len(believed)
@@ -282,24 +269,12 @@ def _update_statistics(
     statistics: FreeGainStatistics,
     twin: int,
 ) -> None:
-    """Update what is learnt of each gauge by the expectation over the pairs, in place.
+    """Update the regression of each gauge by its expectation over the pairs, in place.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation of the twin.
-    model : ModelLikelihood
-        How the model explains it.
-    deviation : float
-        The prior standard deviation of a free gain.
     believed : (n,) array
         Which of the pairs of `model` the fault believes in.
-    weights : FreeGainWeights
-        The probabilities of these pairs.
-    statistics : FreeGainStatistics
-        Updated for the twin.
-    twin : int
-        The twin.
     """
     gauges = len(observation.present)
     free_probability = np.zeros(gauges)
@@ -313,7 +288,7 @@ def _update_statistics(
         for g in range(gauges):
             x = observation.residual[i, g]
             weighted_c = weight * deviation * observation.prediction[i, g]
-            free_probability[g] += weight * weights.free_part[m, g]
+            free_probability[g] += weight * weights.free_probability[m, g]
             free_squares[g] += weight * weights.free_square[m, g]
             fixed_squares[g] += weight * x * x
             sum_cc[g] += weighted_c * deviation * observation.prediction[i, g]

@@ -37,8 +37,8 @@ class SumsOfFaults(NamedTuple):
     Attributes
     ----------
     weight, squares, predictions, products : (R,) array
-        Of one, of the squared innovation over its variance, of the squared prediction, and of the
-        prediction times the residual of the model.
+        The sums of one, of the squared innovation over its variance, of the squared prediction,
+        and of the prediction times the residual of the model.
     """
 
     weight: Single
@@ -54,21 +54,16 @@ def weigh_gauge_faults(
     faults: GaugeDensities,
     belief: Single,
 ) -> tuple[Single, SumsOfFaults]:
-    """Return the density of each pair times its belief under all faults of a gauge, and sums of it.
+    """Return the density times the belief at each pair under all faults of a gauge, and its sums.
 
-    The density is relative to that of the model at the reference pair, times what
-    `log_reference_density` returns.
-
-    The compiler vectorises loops that write to arrays of this function only.
+    The density is relative to that of the model at the reference pair, times the factor whose
+    logarithm `log_reference_density` returns. The compiler vectorises loops that write to arrays of
+    this function only.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation.
     model : ModelLikelihood
         How the model explains it at n pairs.
-    faults : GaugeDensities
-        The densities of the faulty gauges.
     belief : (N, R) array
         The beliefs of the faults.
 
@@ -76,8 +71,6 @@ def weigh_gauge_faults(
     -------
     weight : (n, R) array
         The density times the belief.
-    sums : SumsOfFaults
-        The sum of the weights, and weighted sums.
     """
     count = len(faults.gauge)
     factors = exchange_factors(observation, model, faults)
@@ -129,7 +122,7 @@ def weigh_gauge_fault_in_logs(
     weight: Single,
     sums: SumsOfFaults,
 ) -> float:
-    """Do the same as `weigh_gauge_faults` for fault r, by logarithms, which do not underflow.
+    """Fill `weight` and `sums` for fault r as `weigh_gauge_faults` does, by logarithms.
 
     Returns
     -------
@@ -204,21 +197,15 @@ def update_gauge_faults(
 ) -> None:
     """Correct the beliefs of the faults "gauge g shows 1 + gain times the predicted value".
 
-    The gain is learnt by a regression, and kept within one prior standard deviation of the gain
+    The gain is fitted by a regression, and kept within one prior standard deviation of the gain
     error.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation of the twin.
     model : ModelLikelihood
         How the model explains it at the n pairs that faults consider.
-    priors : FaultPriors
-        The gain errors of single gauges.
     beliefs : Beliefs
         The beliefs and sums of all twins; those of the twin are updated in place.
-    twin : int
-        The twin.
     log_evidence : (R,) array
         To be filled: the log evidence of each fault, up to the same constant as that of the model.
     """

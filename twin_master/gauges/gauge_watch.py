@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.gauges import hypothesis_weights
+from twin_master.gauges.discriminating_control import discriminating_controls, gauge_hypotheses
 from twin_master.gauges.fault_filter import FaultFilter
 from twin_master.gauges.fault_kernels import Observations
 from twin_master.gauges.hypothesis_weights import log_of_sum, log_of_sums
 from twin_master.gauges.notices import NoticeWriter
 from twin_master.gauges.stuck_gauges import StandstillTest, StuckGauges
-from twin_master.gauges.telling_control import gauge_hypotheses, telling_controls
 from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Hypothesis, Notice, NoticeWording, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
@@ -28,7 +28,7 @@ from twin_master.scenario.tables import Noticing
 
 @dataclass(frozen=True)
 class CheckedReadings:
-    """The observations of B twins in a step, without readings that are absurd or stand still.
+    """The observations of B twins in a step, with absurd and stuck readings marked and excluded.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class CheckedReadings:
     stuck_gauges : StuckGauges
         Which gauges stand still, after this step.
     observations : Observations
-        The values that are used.
+        The observations without the excluded readings.
     """
 
     rows: Float
@@ -63,9 +63,9 @@ class AlarmEvidence(NamedTuple):
     Attributes
     ----------
     free_gains, any_gauge : (B,) array
-        That several gauges have unknown gains, and that a single one is off.
+        The evidence that several gauges have unknown gains, and that a single one is faulty.
     each_gauge : (B, G) array
-        That of each gauge.
+        The evidence that a certain gauge is faulty.
     """
 
     free_gains: Float
@@ -135,10 +135,10 @@ class GaugeWatch:
             hypothesis_names=tuple(f"{wording.name_sensors([g])} off" for g in sensors),
         )
 
-    def leave_out_useless_readings(
+    def exclude_useless_readings(
         self, state: WatchState | None, rows: Float, control_index: Index
     ) -> CheckedReadings:
-        """Return the observations of B twins without readings that are absurd or stand still.
+        """Return the observations of B twins, without readings that are absurd or stuck.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class GaugeWatch:
         Returns
         -------
         CheckedReadings
-            The sensor values with and without those left out; readings of inspections are kept.
+            The sensor values with and without the excluded ones; readings of inspections are kept.
         """
         values, inspections_log_density = self._sensor_model.split_observation(rows)
         is_absurd = self._notices.is_absurd(values, control_index)
@@ -196,19 +196,13 @@ class GaugeWatch:
         state : WatchState or None
             The state of the watch after the previous step, updated in place; None if this is the
             first step of the model.
-        checked : CheckedReadings
-            The observations of the step.
         forecast, model_belief : (B, S) array
             The beliefs under the model before and after the observations.
         previous_control : (B,) array
             The controls of the previous step; not used in the first step of the model.
-        step : int
-            The number of the step.
 
         Returns
         -------
-        state : WatchState
-            The state of the watch after the step.
         notices : list of list of Notice
             The notices of each twin.
         """
@@ -230,7 +224,7 @@ class GaugeWatch:
     def _report_useless_readings(
         self, state: WatchState, checked: CheckedReadings, step: int
     ) -> list[list[Notice]]:
-        """Return the notices of each twin about readings that begin or cease to be left out."""
+        """Return the notices of each twin about gauges that are now excluded, or used again."""
         is_left_out = checked.is_left_out
         is_missing = np.isnan(checked.readings)
         was_left_out = state.left_out
@@ -274,7 +268,7 @@ class GaugeWatch:
     def _report_followed_hypothesis(
         self, state: WatchState, notices: Sequence[list[Notice]], step: int
     ) -> None:
-        """Append a notice for each twin that follows another hypothesis than before."""
+        """Append a notice for each twin whose belief follows another hypothesis than before."""
         hypothesis, probability = hypothesis_weights.most_probable_hypothesis(
             state.weights, gauge_count=state.left_out.shape[1]
         )
@@ -292,7 +286,7 @@ class GaugeWatch:
         model_belief: Float,
         step: int,
     ) -> None:
-        """Append to each ambiguous alarm which control tells its hypotheses apart."""
+        """Append to each ambiguous alarm the control that best separates its hypotheses."""
         for twin, notices_of_twin in enumerate(notices):
             if not any(notice.kind == "alarm" for notice in notices_of_twin):
                 continue
@@ -304,16 +298,17 @@ class GaugeWatch:
                 self._free_gain_deviation,
                 self._notices.hypothesis_names,
             )
-            telling = telling_controls(hypotheses, self._sensor_model)
-            if telling is not None:
-                notices_of_twin.append(self._notices.advise_control(telling, self._controls, step))
+            comparison = discriminating_controls(hypotheses, self._sensor_model)
+            if comparison is not None:
+                notices_of_twin.append(
+                    self._notices.advise_control(comparison, self._controls, step)
+                )
 
     def alarm_evidence(self, state: WatchState) -> AlarmEvidence:
-        """Return the evidence for the kinds of fault, relative to that for the model.
+        """Return the evidence for each kind of fault, relative to that for the model.
 
-        It is a sum over the steps in which the fault may begin. If it begins later, it predicts so
-        far what the model predicts: this term is the prior probability that it begins later, times
-        one.
+        It is summed over the steps in which the fault may begin. A fault that begins later predicts
+        so far what the model predicts: its term is the prior probability that it begins later.
         """
         log_begins_later = np.log(self.faults.probability_to_begin_after(state.step_count - 1.0))
         twins, gauges = state.left_out.shape
@@ -343,8 +338,6 @@ class GaugeWatch:
 
         Parameters
         ----------
-        state : WatchState
-            The state of the watch of the twin.
         model_belief : (1, S) array
             Its filtered belief under the model.
         """

@@ -49,7 +49,7 @@ END_PROBABILITY = 0.02
 SHOWS_ELSEWHERE = 0.5
 """Prior probability that a fault shows under another control than that in which it began."""
 LEAST_SHOWING = 1e-3
-"""Least probability that a fault shows under a control: one that grows is seen there in the end."""
+"""Least probability that a fault shows under a control; a growing fault is then noticed there."""
 _LEAST_PROBABILITY = 1e-300
 """Weights of hypotheses do not fall below this in a step, so that they have a logarithm."""
 _LEAST_REPORTED = 0.01
@@ -126,7 +126,7 @@ class HypothesisWeights:
         )
 
     def change_controls(self, previous_control: Index, control: Index) -> Float:
-        """Do what `change_control` does for B twins, each with its own controls (B,), in place.
+        """Change the controls of B twins, each from and to its own (B,), as `change_control` does.
 
         Returns
         -------
@@ -151,8 +151,7 @@ class HypothesisWeights:
     def change_control(self, previous_control: int, control: int) -> Float:
         """Divide the probability of each fault anew into a part that shows and one that is hidden.
 
-        A fault may show under one control and be hidden under another. Its total stays the same.
-        The weights are changed in place.
+        Their sum stays the same. The weights are changed in place.
 
         Parameters
         ----------
@@ -213,8 +212,8 @@ class HypothesisWeights:
         self.current = np.log(np.maximum(advanced, _LEAST_PROBABILITY))
         self.hidden = self.hidden + np.log1p(-free_gains_begin)[..., None]
 
-        # For a fault that began in this step nothing is known about the other controls: it has the
-        # prior probability to show there.
+        # Nothing is known about a fault that began in this step under the other controls: it shows
+        # there with the prior probability.
         hidden *= (1.0 - free_gains_begin)[..., None]
         of_fault = np.maximum(advanced[..., FAULTS] + hidden, _LEAST_PROBABILITY)
         self.showing += (begun / of_fault)[..., None] * (SHOWS_ELSEWHERE - self.showing)
@@ -240,7 +239,7 @@ class HypothesisWeights:
 
     @property
     def right_after_fault(self) -> Float:
-        """Probability (...) of a fault that ended or is hidden, so that the gauges are right."""
+        """Probability (...) that a fault has ended or is hidden, so that the gauges are right."""
         return np.asarray(np.exp(self.current)[..., RECOVERED] + np.exp(self.hidden).sum(axis=-1))
 
     @property
@@ -293,8 +292,6 @@ def mix_beliefs(weights: HypothesisWeights, model_belief: Float, beliefs: Belief
         The log weights of B twins.
     model_belief : (B, S) array
         Their beliefs about the state under the model.
-    beliefs : Beliefs
-        Their beliefs under each other hypothesis.
     """
     # Normalise the weights without free gains, under which no state is believed.
     log_hidden = weights.hidden[:, GAUGES_OF_FAULTS]
@@ -330,7 +327,7 @@ def list_hypotheses(
     """Return the competing hypotheses of one twin, with their probabilities and beliefs.
 
     These are the model, each gauge whose fault has a probability of at least 1 %, and "none of
-    these" (free gains).
+    these", which is free gains.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compiled loops: which pairs are considered, and how the model explains an observation at them.
+"""Compiled loops: the pairs that are considered, and the density of an observation there.
 
 Notation and method are those of `fault_kernels`.
 """
@@ -22,7 +22,7 @@ _NEGLIGIBLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
 
 
 class ModelLikelihood(NamedTuple):
-    """How the model explains an observation: what the densities of faults are compared with.
+    """The density of an observation under the model, with which densities of faults are compared.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class ModelLikelihood(NamedTuple):
 
 @compiled
 def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
-    """Return the indices (n,) of the pairs in which some fault of a twin believes.
+    """Return the indices (n,) of the pairs whose probability under some fault is not negligible.
 
-    The beliefs of gauge faults in all other pairs become zero.
+    In all other pairs the beliefs of gauge faults become zero.
     """
     _, pairs, faults = beliefs.gauge.shape
     considered = np.empty(pairs, np.int64)
@@ -94,12 +94,10 @@ def model_likelihood(
     density: Float,
     log_factor: float,
 ) -> ModelLikelihood:
-    """Return the density of an observation under the model at some pairs, over the largest of them.
+    """Return the density of an observation under the model at some pairs, relative to the largest.
 
     Parameters
     ----------
-    observation : StandardizedObservation
-        The observation.
     pair : (n,) array
         The indices of the pairs.
     scale_squares : (G,) array

@@ -31,24 +31,22 @@ from twin_master.scenario.tables import Noticing
 
 
 class WatchfulEstimator:
-    """An estimator that is watched: useless readings are left out, faults of gauges are noticed.
+    """An estimator with a watch over the gauges: it excludes useless readings and notices faults.
 
-    The belief is that of a mixture of hypotheses: the inner estimator, each gauge that is off, and
+    The belief is that of a mixture of hypotheses: the inner estimator, each faulty gauge, and
     gauges that are right again after a fault (see `hypothesis_weights`). Beside the arrays of the
     inner estimator it carries those of a `WatchState`, whose names begin with `notice/`.
 
     Parameters
     ----------
-    inner : Estimator
-        The estimator that holds the belief under the model.
+    inner_estimator : Estimator
+        The estimator of the belief under the model.
     sensor_model : GaussianSensorModel
         Predictions (E, S, U, G) and assumed noise.
     draws : (E,) array
         The value of the parameter in each draw.
     settings : Noticing, optional
         When alarms are raised.
-    words : NoticeWording, optional
-        How notices speak of steps and sensors.
 
     Attributes
     ----------
@@ -89,8 +87,9 @@ class WatchfulEstimator:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S).
 
         Under the model, the inner estimator smooths. Under the competing hypotheses, the mixed
-        beliefs of the steps are smoothed, which is approximate: the last step has the belief of the
-        competing hypotheses alone. The result is the average, with the last weight of the model.
+        beliefs of the steps are smoothed, starting from the belief of the competing hypotheses in
+        the last step, which is approximate. The result is their average, weighted by the
+        probability of the model in the last step.
         """
         under_model = self._inner.smoothed(carried)
         if not carried:
@@ -115,7 +114,7 @@ class WatchfulEstimator:
         state = None
         if before is not None and self._continues(before):
             state = faults.restore(before)
-        checked = self.watch.leave_out_useless_readings(
+        checked = self.watch.exclude_useless_readings(
             state, np.asarray(observation)[None], controls
         )
         estimate = self._inner.step(before, checked.rows[0], control_index, step)
@@ -141,10 +140,10 @@ class WatchfulEstimator:
         )
 
     def _continues(self, before: Carried) -> bool:
-        """Return whether the state of the previous step holds for the predictions of this model."""
+        """Return whether the previous step was watched with this model's predictions."""
         return bool(before.arrays.get(MODEL_KEY) == self.watch.faults.model_key)
 
 
 def gauge_watch_of(estimator: Estimator) -> GaugeWatch | None:
-    """Return the watch over the gauges of an estimator; None if it gives no notices."""
+    """Return the watch over the gauges of an estimator; None if it has none."""
     return estimator.watch if isinstance(estimator, WatchfulEstimator) else None

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float, Index
 from reporting.words import listing
-from twin_master.gauges.telling_control import TellingControls
+from twin_master.gauges.discriminating_control import DiscriminatingControls
 from twin_master.gauges.watch_state import WatchState
 from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -15,27 +15,25 @@ from twin_master.network.sensor_model import GaussianSensorModel
 CLEARLY_BETTER = float(np.log(10.0))
 """Smallest log evidence of free gains over a single gauge, which is the simpler explanation."""
 _OR_THE_ASSET = "or the asset near it differs from the model, for example because it has softened"
-"""Said of a gauge that is off: softening that the model does not know is seen by one gauge most."""
+"""The other cause of a faulty gauge: one gauge sees most of a softening that the model lacks."""
 _LEAST_NAMED_PROBABILITY = 0.1
-"""A gauge whose probability to be the one that is off is smaller is not named in an alarm."""
+"""An alarm names the gauges that are the faulty one with at least this probability."""
 _LEAST_NAMED_DEVIATIONS = 2.0
-"""A gain that is fewer prior standard deviations from zero is not named in an alarm."""
+"""An alarm names the gauges whose gain is at least so many prior standard deviations from zero."""
 _MOST_NAMED = 6
-"""Gauges that an alarm names at most."""
-_LEAST_PROBABILITY_TO_TELL = 0.1
-"""A control that tells two hypotheses apart less probably is not advised."""
+"""The largest number of gauges that an alarm names."""
+_LEAST_ADVISED_PROBABILITY = 0.1
+"""A control is advised if it discriminates with at least this probability."""
 _LARGEST_LOG = 700.0
 """Logarithms up to this have an exponential that is a finite number."""
 
 
 @dataclass(frozen=True)
 class NoticeWriter:
-    """Writes the notices of a step.
+    """The writer of the notices of a step.
 
     Attributes
     ----------
-    wording : NoticeWording
-        How sentences speak of steps and sensors.
     threshold : float
         The evidence from which an alarm is raised.
     gains : (K,) array
@@ -81,8 +79,6 @@ class NoticeWriter:
             The readings, SI; NaN where nothing was received.
         control_index : int
             The control in force.
-        step : int
-            The number of this step.
         """
         notices = []
         for g in np.flatnonzero(begins).tolist():
@@ -113,8 +109,6 @@ class NoticeWriter:
             The readings, SI.
         still_since : (G,) array
             The first step in which the gauge repeated its reading.
-        step : int
-            The number of this step.
         """
         notices = []
         for g in np.flatnonzero(begins).tolist():
@@ -142,10 +136,10 @@ class NoticeWriter:
         return notices
 
     def report_own_likelihood(self, sensor_model: GaussianSensorModel) -> list[Notice]:
-        """Return the notice that a user's sensor model has a likelihood that alarms do not use.
+        """Return the notice that alarms do not use the likelihood of a user's sensor model.
 
         Alarms compare faults of gauges under Gaussian noise. The list is empty if the likelihood of
-        the sensor model is the Gaussian one, too.
+        the sensor model is Gaussian, too.
         """
         if not sensor_model.has_own_likelihood:
             return []
@@ -160,16 +154,12 @@ class NoticeWriter:
     def report_followed_hypothesis(
         self, followed_hypothesis: int, probability: float, step: int
     ) -> list[Notice]:
-        """Return the notice that belief and decision follow another hypothesis than before.
+        """Return the notice that belief and decision follow another hypothesis from now on.
 
         Parameters
         ----------
         followed_hypothesis : int
             The hypothesis: 0 is the model, -1 free gains, and g > 0 is gauge g, counted from 1.
-        probability : float
-            Its probability.
-        step : int
-            The number of this step.
         """
         sensors = f"{self.wording.sensor}s"
         in_brackets = f"(probability {probability:.3g})"
@@ -191,18 +181,18 @@ class NoticeWriter:
         return [Notice("hypothesis", sentence, numbers, probability)]
 
     def advise_control(
-        self, telling: TellingControls, controls: tuple[str, ...], step: int
+        self, comparison: DiscriminatingControls, controls: tuple[str, ...], step: int
     ) -> Notice:
-        """Return the advice which control tells two hypotheses of an alarm apart."""
+        """Return the advice which control discriminates best between two hypotheses of an alarm."""
         hypotheses = [
             f"{'the model' if name == 'model' else name} ({probability:.2g})"
-            for name, probability in zip(telling.names, telling.probabilities, strict=True)
+            for name, probability in zip(comparison.names, comparison.probabilities, strict=True)
         ]
-        by_control = dict(zip(controls, telling.by_control.tolist(), strict=True))
+        by_control = dict(zip(controls, comparison.by_control.tolist(), strict=True))
         best, *others = sorted(by_control, key=by_control.__getitem__, reverse=True)
-        is_one_step = telling.steps == 1
-        steps = self.wording.step if is_one_step else f"{telling.steps} {self.wording.step}s"
-        if by_control[best] < _LEAST_PROBABILITY_TO_TELL:
+        is_one_step = comparison.steps == 1
+        steps = self.wording.step if is_one_step else f"{comparison.steps} {self.wording.step}s"
+        if by_control[best] < _LEAST_ADVISED_PROBABILITY:
             sentence = (
                 f"no control tells {listing(hypotheses)} apart within {steps}: inspect the "
                 f"{self.wording.sensor}s, or measure with another sensor."
@@ -225,8 +215,6 @@ class NoticeWriter:
 
         Parameters
         ----------
-        state : WatchState
-            The state of the watch.
         log_gauge, log_free_gains : (B,) array
             The log evidence of the two kinds of fault.
         """
@@ -258,7 +246,7 @@ class NoticeWriter:
         return notices
 
     def _gauge_alarm(self, state: WatchState, twin: int, log_evidence: float, step: int) -> Notice:
-        """Return the alarm that a single gauge is faulty, with the gauges that it may be."""
+        """Return the alarm that a single gauge is faulty; it names the probable ones."""
         by_gauge = (len(self.log_gauge_prior), -1)
         log_weight = (
             state.log_gauge_evidence[twin].reshape(by_gauge) + self.log_gauge_prior[:, None]
@@ -282,7 +270,7 @@ class NoticeWriter:
     def _free_gains_alarm(
         self, state: WatchState, twin: int, log_evidence: float, step: int
     ) -> Notice:
-        """Return the alarm that no state explains all gauges, with the gauges of largest gain."""
+        """Return the alarm that no state explains all gauges; it names those of largest gain."""
         statistics = state.free_gain_statistics
         gain_deviations = np.abs(statistics.sum_cx[twin]) / np.sqrt(1.0 + statistics.sum_cc[twin])
         named_gauges = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)
@@ -307,16 +295,8 @@ class NoticeWriter:
 
         Parameters
         ----------
-        step : int
-            The number of this step.
-        finding : str
-            What is wrong, as a clause.
         gauges : list of int
             The gauges that the alarm names, from 0.
-        log_evidence : float
-            The log evidence against the model.
-        onset : float
-            The expected first step of the fault.
         """
         evidence = float(np.exp(min(log_evidence, _LARGEST_LOG)))
         first_step = round(onset)
@@ -341,7 +321,7 @@ class NoticeWriter:
 def _largest(values: Float, least: float) -> list[int]:
     """Return the indices of the values (G,) of at least `least`, the largest first.
 
-    There are at most `_MOST_NAMED`, and at least that of the largest value.
+    There are at most `_MOST_NAMED`; if no value is large enough, the largest one is returned.
     """
     order = np.argsort(-values, kind="stable").tolist()
     large_enough = [g for g in order if values[g] >= least]

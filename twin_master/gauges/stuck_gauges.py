@@ -1,4 +1,4 @@
-"""Gauges that stand still: the hypothesis that a gauge shows its last reading again and again.
+"""Stuck gauges: the hypothesis that a gauge repeats its last reading.
 
 Under known noise a reading seldom repeats the one before. For a gauge with independent Gaussian
 noise of standard deviation sigma, the difference of two readings has at zero the density
@@ -12,7 +12,7 @@ readings of the gauge,
     p = (R + n f) / (N + n),    f = w / (sqrt(pi) sigma) + r,
 
 where n is the certainty of the noise as a number of observations, and r the fraction of repeats
-among the pairs of all gauges. Where no reading has ever moved, r is one: there is no noise to rely
+among the pairs of all gauges. If no reading has ever moved, r is one: there is no noise to rely
 on, and a repeat is no evidence.
 
 A gauge may become stuck in any step. It is right again as soon as its reading moves. Faults of
@@ -34,15 +34,15 @@ FROM_THE_START = 0.5
 
 
 class StuckGauges(NamedTuple):
-    """How long the gauges of B twins have stood still, each field (B, G).
+    """The test statistics of the gauges of B twins, each field (B, G).
 
     Attributes
     ----------
     last_reading : (B, G) array
         The last reading that was received, SI; minus infinity where there was none.
     pair_count, repeat_count : (B, G) array
-        The number of pairs of successive readings while the gauge was not stuck, and of those of
-        them that are equal.
+        The number of pairs of successive readings while the gauge was not stuck, and how many of
+        these pairs are equal.
     log_evidence : (B, G) array
         The log evidence that the gauge is stuck over that it is not.
     still_since : (B, G) array

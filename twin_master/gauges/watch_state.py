@@ -27,7 +27,7 @@ class WatchState:
     """Beliefs and sums of the model and of the faults of B twins.
 
     G is the number of gauges, K of gain errors, S of states, E of draws. A fault may begin in any
-    step. Its belief, evidence and sums are averages over the first steps.
+    step: its belief, evidence and sums are averages over its possible first steps.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class WatchState:
         )
 
     def is_finite(self, largest: float) -> NDArray[np.bool_]:
-        """Return for B twins whether all numbers but the beliefs are smaller than a bound."""
+        """Return for each of B twins whether all numbers except beliefs are below a bound."""
         numbers = (
             self.mixed.belief,
             self.weights.current,
@@ -148,7 +148,7 @@ class WatchState:
             *self.free_gain_statistics,
         )
         # False for NaN as well.
-        are_small = [np.all(part < largest, axis=1) for part in numbers]
+        are_small = [np.all(values < largest, axis=1) for values in numbers]
         return np.asarray(np.all(are_small, axis=0))
 
     def as_arrays(self, model_key: Unsigned) -> CarriedArrays:
@@ -283,7 +283,7 @@ def _by_state(belief: NDArray[_Number]) -> NDArray[_Number]:
 
 @dataclass(frozen=True)
 class StoredBelief:
-    """The mixed beliefs about the state that were stored in a step, for smoothing.
+    """The beliefs about the state that were stored in a step, for smoothing.
 
     Attributes
     ----------

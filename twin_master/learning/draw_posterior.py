@@ -7,7 +7,7 @@ from reporting.arrays import Float
 from twin_master.network.estimator import Learnt
 
 INTERVAL = (0.05, 0.95)
-"""Levels of the bounds of the interval in which a learnt quantity is reported."""
+"""Levels of the reported interval of a learnt quantity."""
 _GRID_POINTS = 801
 """Points of the grid on which the interpolated posterior is summed."""
 _LARGEST_LOG_RATIO = 60.0
@@ -19,10 +19,12 @@ _FEWEST_FOR_SPLINE = 4
 def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -> Learnt:
     """Return the posterior of a parameter, given the weights of its draws.
 
-    The evidence is a smooth function of the parameter, and its logarithm is nearly a parabola. If
-    the posterior is narrower than the distance between two draws, the weights alone would put it on
-    a single draw. So the log evidence is interpolated between draws by a cubic spline, and the
-    prior by a piecewise linear distribution function.
+    If the posterior is narrower than the distance between two draws, the weights alone would put it
+    on a single draw. So the log evidence, which is smooth and nearly a parabola, is interpolated
+    between draws by a cubic spline, and the prior by a piecewise linear distribution function.
+
+    With fewer than four distinct draws, or fewer than two whose evidence is not negligible, the
+    posterior is that of the draws as points.
 
     Parameters
     ----------
@@ -47,7 +49,7 @@ def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -
 
 
 def posterior_of_points(values: Float, weight: Float) -> Learnt:
-    """Return mean, standard deviation and quantiles of increasing values (E,) with weights (E,)."""
+    """Return mean, standard deviation and 90 % interval of increasing weighted values (E,)."""
     mean = float(weight @ values)
     cumulative = np.cumsum(weight)
     # The levels are lowered by a rounding error: otherwise a cumulative sum that rounds below a

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from twin_master.learning.learning_filter import LearningFilter, StaticHypotheses
-from twin_master.learning.saturation import LOST_SHARES
+from twin_master.learning.saturation import LOST_FRACTIONS
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -34,7 +34,7 @@ By Cantelli's inequality a quantile of probability p lies within sqrt((1 - p) / 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected values of the G sensors and of the rewards; the leading axes are those of beliefs.
+    """Expected values of G sensors and of the rewards; the leading axes are those of the beliefs.
 
     Attributes
     ----------
@@ -63,14 +63,12 @@ def expectation_of_draws(
     *,
     quantiles: bool = True,
 ) -> Expectation:
-    """Return the expectation under beliefs, if nothing is learnt and the draws keep their weights.
+    """Return the expectation under beliefs of a twin that learns nothing: draw weights stay.
 
     Parameters
     ----------
     sensor_model : GaussianSensorModel
         S states, U controls, G sensors.
-    rewards : RewardModel
-        The rewards of the asset.
     joint : (..., S, U) array
         The joint belief over states and controls.
     rows : (..., G + I) array or None
@@ -186,7 +184,7 @@ class LearntExpectation:
         controls: slice,
         observation: Float | None,
     ) -> Expectation:
-        """Return the expectation under B beliefs, if only the marginals of a filter are known.
+        """Return the expectation under B beliefs when only the marginals of a filter are known.
 
         The learnt quantities are taken to be independent of each other and of the state. The
         parameter has two values, one standard deviation on either side of its mean, which are
@@ -222,25 +220,26 @@ class LearntExpectation:
         return self._expect(hypotheses, np.ascontiguousarray(weight), controls, observation)
 
     def _draw_weight(self, learnt: Mapping[str, Learnt]) -> Float:
-        """Return weights of all draws with the learnt mean and deviation of the parameter.
+        """Return draw weights that give the parameter its learnt mean and standard deviation.
 
-        If saturation is learnt, its lost share is taken likewise, see `with_saturation`.
+        If saturation is learnt, its lost fraction gets its learnt moments in the same way; see
+        `with_saturation`.
         """
         parameter = self.learning.parameter
         weight = self.learning.parameter_weight
         if parameter is not None and parameter.name in learnt:
             weight = _interpolating_weights(parameter.values, learnt[parameter.name])
-        weight_of_share = np.ones(1)
+        fraction_weights = np.ones(1)
         if "saturation" in learnt:
-            weight_of_share = _interpolating_weights(LOST_SHARES, learnt["saturation"])
-        return np.outer(weight_of_share, weight).ravel()
+            fraction_weights = _interpolating_weights(LOST_FRACTIONS, learnt["saturation"])
+        return np.outer(fraction_weights, weight).ravel()
 
     def _gauge_moments(
         self, learnt: Mapping[str, Learnt], name: str, default: float
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation of a quantity that each of G gauges may have learnt.
+        """Return mean and standard deviation (G,) of a quantity that gauges may have learnt.
 
-        If a gauge has not learnt the quantity, its value is the default, with deviation zero.
+        A gauge that has not learnt it has the default value and no uncertainty.
         """
         certain = Learnt(default, 0.0, default, default)
         numbers = range(1, self.learning.sensor_model.sensor_count + 1)
@@ -262,10 +261,6 @@ class LearntExpectation:
 
         Parameters
         ----------
-        hypotheses : StaticHypotheses
-            The joint belief of the filter.
-        control_index : int
-            The control in force.
         belief : (S,) array
             The belief about the state, which takes the place of that of the filter.
         observation : (G,) array
@@ -284,14 +279,10 @@ class LearntExpectation:
 
         Parameters
         ----------
-        step : Carried
-            The arrays that the filter carried on from the step.
         belief : (S,) array
             The filtered belief about the state in the step.
         policy : (S, U) array
             The policy p(control | state) in the H steps.
-        horizon : int
-            The number H of steps.
         """
         hypotheses = self.learning.hypotheses(step)
         joint = _joint_with_marginal(hypotheses.weight, belief)
@@ -319,8 +310,6 @@ class LearntExpectation:
             K hypotheses; their own weights are not used.
         weight : (B, K, S, U') array
             The beliefs, up to a factor of each.
-        controls : slice
-            The U' controls among all.
         observation : (G,) array or None
             The observed sensor values, SI; None for a prediction.
         """
@@ -346,7 +335,7 @@ class LearntExpectation:
         quantiles = _quantiles_by_state(state_weight, first_moment_by_state, second_moment_by_state)
         lower, upper = np.moveaxis(quantiles, 1, 0)
 
-        # The structure is the same whatever share its sensors lose: see `with_saturation`.
+        # What sensors lose by saturation does not change the structure: see `with_saturation`.
         draw_of_structure = hypotheses.draw % self.rewards.quantity.draw_count
         reward_mean, reward_standard_deviation = self.rewards.expectation_of(
             weight, draw_of_structure, controls, value, value_variance, observation
@@ -410,7 +399,7 @@ def _insert_state_and_control(values: Float) -> Float:
 
 
 def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: Float) -> Float:
-    """Return quantiles (B, 2, G) of mixtures that are normal given state and control.
+    """Return quantiles (B, 2, G) of mixtures whose components, given state and control, are normal.
 
     Parameters
     ----------
@@ -430,9 +419,9 @@ def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: 
 
 
 def _joint_with_marginal(joint: Float, belief: Float) -> Float:
-    """Return the joint belief (K, S) that has p(k | D) of one belief, and p(D) of another one (S,).
+    """Return a joint belief (K, S) with its p(k | D) kept and the marginal p(D) replaced (S,).
 
-    If the first belief rules out a state, p(k | D) is not defined there, and p(k) takes its place.
+    Where the first belief rules out a state, p(k | D) is not defined, and p(k) takes its place.
     """
     marginal = joint.sum(axis=0)
     hypothesis_given_state = np.tile(joint.sum(axis=1, keepdims=True), len(belief))
@@ -441,19 +430,19 @@ def _joint_with_marginal(joint: Float, belief: Float) -> Float:
 
 
 def concatenate_expectations(parts: Iterable[Expectation]) -> Expectation:
-    """Return the expectations of parts of a mission as one, along their leading axis."""
+    """Return the expectations of successive spans of a mission as one, along their leading axis."""
     return _join_expectations(parts, np.concatenate)
 
 
 def stack_expectations(parts: Iterable[Expectation]) -> Expectation:
-    """Return expectations as the rows of a new leading axis."""
+    """Return expectations stacked along a new leading axis."""
     return _join_expectations(parts, np.array)
 
 
 def _join_expectations(
     parts: Iterable[Expectation], join: Callable[[list[Float]], Float]
 ) -> Expectation:
-    """Return one expectation with each array joined from those of the parts."""
+    """Return one expectation whose arrays are joined from those of all parts."""
     parts = list(parts)
     arrays = {
         field.name: join([getattr(part, field.name) for part in parts])

@@ -1,6 +1,6 @@
 """The filter that learns: static hypotheses as an axis of the belief, gauges by regression.
 
-A static hypothesis k is a draw of the calibrated parameter, the share that the sensors lose to
+A static hypothesis k is a draw of the calibrated parameter, the fraction that the sensors lose to
 soft saturation, and a factor on the transition probabilities; none of them changes in time. Each
 hypothesis has a filter of its own over the states, and its weight is its evidence:
 
@@ -10,7 +10,7 @@ hypothesis has a filter of its own over the states, and its weight is its eviden
 which is exact: D_t is the state in step t, o_t the observation, and T_k the transitions. The
 offset, gain and noise scale of a gauge, given the hypothesis, are learnt by a `GaugeRegression`.
 
-The axes of arrays are n or T steps, K hypotheses, E draws of the parameter, N lost shares, S
+The axes of arrays are n or T steps, K hypotheses, E draws of the parameter, N lost fractions, S
 states, U controls and G gauges.
 """
 
@@ -29,7 +29,7 @@ from twin_master.learning.draw_posterior import (
     posterior_of_points,
 )
 from twin_master.learning.regression import SUM_COUNT, GaugeFit, GaugeReadings, GaugeRegression
-from twin_master.learning.saturation import LOST_SHARES, with_saturation
+from twin_master.learning.saturation import LOST_FRACTIONS, with_saturation
 from twin_master.network.estimator import (
     BELIEVED,
     Carried,
@@ -66,7 +66,7 @@ class StaticHypotheses:
     weight : (K, S) array
         The belief p(D, k | observations).
     draw : (K,) array
-        The index of the draw of each hypothesis, n E + e for the lost share n and the draw e of
+        The index of the draw of each hypothesis, n E + e for lost fraction n and draw e of
         the parameter.
     offset : (K, G) array
         The posterior mean of each offset given the hypothesis, SI.
@@ -114,8 +114,6 @@ class LearningFilter:
         The name of the twin, for messages.
     sensor_units : sequence of str, optional
         The unit of each sensor; "1" if left out.
-    words : NoticeWording, optional
-        How notices speak of steps and sensors.
 
     Attributes
     ----------
@@ -142,9 +140,9 @@ class LearningFilter:
         transitions = transitions or {1.0: model.transition}
         self._units = sensor_units or ("1",) * sensor_model.sensor_count
         self.parameter_weight = sensor_model.draw_weight  # (E,)
-        self._lost_shares = LOST_SHARES[:1]
+        self._lost_fractions = LOST_FRACTIONS[:1]
         if settings.saturation > 0.0:
-            self._lost_shares = LOST_SHARES
+            self._lost_fractions = LOST_FRACTIONS
             sensor_model = with_saturation(
                 sensor_model, model.prior, settings.saturation, self._units
             )
@@ -198,7 +196,7 @@ class LearningFilter:
         sensor_values, other_log_density = self.sensor_model.split_observation(observation)
         forecast, regression_sums, count = self._forecast(before)
 
-        # Correct the belief by the sensors, and by the rest of the observation.
+        # Correct the belief by the sensors, and by the other parts of the observation.
         inverse_deviation = self._inverse_deviation[:, control_index]
         best_fit = self.sensor_model.fit_within_interval(
             sensor_values,
@@ -243,17 +241,15 @@ class LearningFilter:
     def _saturation_notices(
         self, forecast: Float, joint_belief: Float, step: int
     ) -> tuple[Notice, ...]:
-        """Return the notice that saturation is believed since this step, or is not any more.
+        """Return a notice if the probability of saturation crosses one half in this step.
 
         Parameters
         ----------
         forecast, joint_belief : (K, S) array
             The belief before and after the observation of the step.
-        step : int
-            The number of the step.
         """
         before, after = (
-            float(self._weight_of_shares(belief.sum(axis=1))[1:].sum())
+            float(self._weight_of_fractions(belief.sum(axis=1))[1:].sum())
             for belief in (forecast, joint_belief)
         )
         if (before > BELIEVED) == (after > BELIEVED):
@@ -267,22 +263,21 @@ class LearningFilter:
             finding = f"the {self._words.sensor}s do not saturate (probability {1.0 - after:.3g})"
         return (Notice("hypothesis", f"{self._words.step.capitalize()} {step}: {finding}."),)
 
-    def _weight_of_shares(self, weight: Float) -> Float:
-        """Return the probability of each lost share (N,), given that of each hypothesis (K,)."""
-        by_share = weight.reshape(len(self._transition_factors), len(self._lost_shares), -1)
-        return np.asarray(by_share.sum(axis=(0, 2)))
+    def _weight_of_fractions(self, weight: Float) -> Float:
+        """Return the probability of each lost fraction (N,), given that of each hypothesis (K,)."""
+        by_fraction = weight.reshape(len(self._transition_factors), len(self._lost_fractions), -1)
+        return np.asarray(by_fraction.sum(axis=(0, 2)))
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
-        """Return belief, regression sums and counts before the observation of a step.
+        """Return the belief, the regression sums and the counts before the observation of a step.
 
         Returns
         -------
         log_forecast : (K, S) array
             The log of p(D_t, k | o_0..o_t-1).
-        statistics : (K, G, 6) array
-            The sums of the regressions.
+        regression_sums : (K, G, 6) array
         count : (G,) array
-            The number of observations of each sensor.
+            The number of earlier observations of each sensor.
         """
         if before is None:
             sensors = self.sensor_model.sensor_count
@@ -387,9 +382,9 @@ class LearningFilter:
     def _with_prior_draw_weights(self, log_belief: Float) -> Float:
         """Return a log belief (K, S) in which the draws have their prior weights again.
 
-        This averages over the draws anew. The belief over states given a transition factor and a
-        lost share becomes the same for all draws of the parameter; the weights of the transition
-        factors and of the lost shares stay as they are.
+        All draws of the parameter get the same belief over states, given a transition factor and a
+        lost fraction; the weights of the transition factors and of the lost fractions stay as they
+        are.
         """
         draw_count = len(self.parameter_weight)
         by_draw = log_belief.reshape(-1, draw_count, log_belief.shape[1])
@@ -408,22 +403,21 @@ class LearningFilter:
         ----------
         weight : (K,) array
             The probability of each hypothesis.
-        statistics : (K, G, 6) array
-            The sums of the regressions.
+        regression_sums : (K, G, 6) array
         count : (G,) array
             The number of observations of each sensor.
         """
         factor_count = len(self._transition_factors)
-        share_count = len(self._lost_shares)
-        by_hypothesis = weight.reshape(factor_count, share_count, -1)  # (factors, N, E)
+        fraction_count = len(self._lost_fractions)
+        by_hypothesis = weight.reshape(factor_count, fraction_count, -1)  # (factors, N, E)
         result: dict[str, Learnt] = {}
         if self.parameter is not None:
             result[self.parameter.name] = posterior_of_draws(
                 self.parameter.values, self.parameter_weight, by_hypothesis.sum(axis=(0, 1))
             )
-        if share_count > 1:
-            weight_of_shares = self._weight_of_shares(weight)
-            result["saturation"] = posterior_of_points(self._lost_shares, weight_of_shares)
+        if fraction_count > 1:
+            fraction_weights = self._weight_of_fractions(weight)
+            result["saturation"] = posterior_of_points(self._lost_fractions, fraction_weights)
         if factor_count > 1:
             prior = np.full(factor_count, 1.0 / factor_count)
             result["transition_factor"] = posterior_of_draws(
@@ -437,9 +431,9 @@ class LearningFilter:
         return result
 
     def _learnt_noise_scales(self, weight: Float, fit: GaugeFit, count: Float) -> dict[str, Learnt]:
-        """Return the posterior of each gauge's noise scale, the true over the assumed noise.
+        """Return the posterior of each gauge's noise scale: true over assumed standard deviation.
 
-        Under a hypothesis, the square of a noise scale has an inverse gamma distribution. Mean and
+        Given a hypothesis, the square of a noise scale has an inverse gamma distribution. Mean and
         variance are averaged over the hypotheses. The quantiles are approximate: those of the
         inverse gamma distribution whose rate is the mean over the hypotheses.
 
@@ -447,8 +441,6 @@ class LearningFilter:
         ----------
         weight : (K,) array
             The probability of each hypothesis.
-        fit : GaugeFit
-            The fit of the G gauges under each hypothesis.
         count : (G,) array
             The number of observations of each gauge.
 
@@ -489,8 +481,6 @@ class LearningFilter:
         ----------
         weight : (K,) array
             The probability of each hypothesis.
-        fit : GaugeFit
-            The posterior of the coefficients given each hypothesis.
         count : (G,) array
             The number of observations of each sensor.
         """
@@ -515,14 +505,10 @@ class LearningFilter:
 def _learnt_coefficients(
     name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
 ) -> dict[str, Learnt]:
-    """Return the posterior of a coefficient by name and number of the gauge: `name[g]`, g from 1.
+    """Return the posterior of a coefficient of each gauge, by `name[g]` with g from 1.
 
     Parameters
     ----------
-    name : str
-        The name of the coefficient.
-    units : sequence of str
-        The unit of each gauge's coefficient.
     prior_deviation : (G,) array
         The prior standard deviation, in that unit; a gauge with 0 does not learn it.
     mean, mean_square : (G,) array

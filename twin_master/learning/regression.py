@@ -30,7 +30,7 @@ from reporting.arrays import Float, Index
 LARGEST_PRODUCT = 1e100
 """A larger product of factors is replaced by its logarithm, so that it cannot overflow."""
 NEGLIGIBLE_LOG_WEIGHT = -70.0
-"""A state this far below the best one of its hypothesis adds nothing that a double holds."""
+"""A state whose log weight is this far below the largest adds less than a rounding error."""
 SUM_COUNT = 6
 """Number of sums that a regression of two coefficients keeps."""
 
@@ -162,8 +162,6 @@ class GaugeRegression:
 
         Parameters
         ----------
-        fit : GaugeFit
-            The posterior of the coefficients.
         count : (G,) array
             The number of observations of each gauge.
         """
@@ -232,11 +230,10 @@ class GaugeRegression:
     def expected_products(self, readings: GaugeReadings, log_weight: Float) -> Float:
         """Return the terms that an observation adds to the six sums of each gauge's regression.
 
-        The regression learns offset and gain of a gauge from the sums over observations of the
-        products aa, ac, cc, ax, cx and xx: a and c are the changes of the gauge's reading by one
-        prior standard deviation of offset and of gain, and x is its residual, all divided by the
-        standard deviation of the noise. As the state is unknown, the expectation of each product
-        over the S states is returned.
+        These are the products aa, ac, cc, ax, cx and xx: a and c are the changes of the gauge's
+        reading by one prior standard deviation of offset and of gain, and x is its residual, all
+        divided by the standard deviation of the noise. As the state is unknown, each product is
+        averaged over the S states.
 
         Parameters
         ----------
@@ -275,14 +272,14 @@ def _add_log_densities(
     count: Float,
     result: Float,
 ) -> None:
-    """Add to `result` (K, S) the kernels of the log predictive density, which depend on the state.
+    """Add the part of the log predictive density that depends on the state to `result` (K, S).
 
-    For a gauge, x is the standardised residual
-    after the fitted offset and gain are subtracted, and a and c are the changes of its standardised
-    value by one prior standard deviation of offset and gain.
+    For a gauge, x is the standardised residual after the fitted offset and gain are subtracted, and
+    a and c are the changes of its standardised value by one prior standard deviation of offset and
+    gain.
 
-    Most of the time is spent on logarithms. So the factors of gauges whose densities have the same
-    power are multiplied first, and one logarithm is taken of the product.
+    Logarithms take most of the time. So the factors of gauges whose densities have the same power
+    are multiplied first, and one logarithm is taken of the product.
     """
     observation, draw, prediction, inverse_deviation = readings
     for k in range(result.shape[0]):

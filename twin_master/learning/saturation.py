@@ -1,8 +1,8 @@
 """Soft saturation of all sensors, as static hypotheses beside the draws of the parameter.
 
-A sensor that saturates softly shows L tanh(x / L) of a value x. The limit L follows from the share
-s of a reading y that is lost, to first order s = (y / L)^2 / 3 (as in the catalogue of effects,
-`sensor_saturation`).
+A sensor that saturates softly shows L tanh(x / L) of a value x. The limit L follows from the
+fraction s of a reading y that is lost, to first order s = (y / L)^2 / 3 (as in the catalogue of
+effects, `sensor_saturation`).
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
 from twin_master.network.sensor_model import GaussianSensorModel
 
-LOST_SHARES: Float = np.array([0.0, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32])
-"""Shares of the largest reading before any damage that are compared; zero for sound sensors."""
+LOST_FRACTIONS: Float = np.array([0.0, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32])
+"""Lost fractions of the largest reading before damage that are compared; 0 for sound sensors."""
 
 
 def with_saturation(
@@ -23,9 +23,9 @@ def with_saturation(
     probability: float,
     sensor_units: Sequence[str],
 ) -> GaussianSensorModel:
-    """Return a sensor model whose sensors may all saturate, with a draw for each lost share.
+    """Return a sensor model whose sensors may all saturate, with draws for each lost fraction.
 
-    Draw n E + e of the result is draw e of the E draws of the given model with the lost share n.
+    Draw n E + e of the result is draw e of the E draws of the given model with lost fraction n.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def with_saturation(
     prior_belief : (S,) array
         The belief before the first step, under which the largest reading of each unit is taken.
     probability : float
-        The prior probability that the sensors saturate; all lost shares are equally probable.
+        The prior probability that the sensors saturate; all lost fractions are equally probable.
     sensor_units : sequence of str
         The unit of each of G sensors. Sensors of one unit have one limit.
 
@@ -54,15 +54,15 @@ def with_saturation(
     units = np.array(sensor_units)
     largest = np.array([reading[units == unit].max() for unit in sensor_units])
     values = [value]
-    for share in LOST_SHARES[1:]:
-        limit = np.maximum(largest / np.sqrt(3.0 * share), np.finfo(np.float64).tiny)
+    for fraction in LOST_FRACTIONS[1:]:
+        limit = np.maximum(largest / np.sqrt(3.0 * fraction), np.finfo(np.float64).tiny)
         values.append(limit * np.tanh(value / limit))
-    saturating = len(LOST_SHARES) - 1
-    weight_of_share = np.array([1.0 - probability, *[probability / saturating] * saturating])
+    saturating = len(LOST_FRACTIONS) - 1
+    fraction_weights = np.array([1.0 - probability, *[probability / saturating] * saturating])
     return GaussianSensorModel(
         np.concatenate(values),
         sensor_model.standard_deviation,
-        draw_weight=np.outer(weight_of_share, sensor_model.draw_weight).ravel(),
+        draw_weight=np.outer(fraction_weights, sensor_model.draw_weight).ravel(),
         average="inside" if sensor_model.averages_inside else "outside",
         model_error=sensor_model.model_error,
         interval=sensor_model.interval,

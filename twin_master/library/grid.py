@@ -120,8 +120,6 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
     ----------
     texts : sequence of str
         The texts that the user gave, one for each axis.
-    binding : Binding
-        The binding of the FMU.
 
     Returns
     -------
@@ -289,8 +287,6 @@ def grid_of_scenario(
 
     Parameters
     ----------
-    loaded_scenario : LoadedScenario
-        The scenario, as read from its file.
     folder : Path
         The folder into which the FMU and its binding are copied.
     texts : sequence of str

@@ -22,11 +22,6 @@ class GridSampler:
     Every block begins with a reset of the FMU, so that its observations do not depend on which
     blocks were sampled before.
 
-    Parameters
-    ----------
-    grid : SamplingGrid
-        The points at which the FMU is sampled.
-
     Raises
     ------
     FmuError
@@ -158,8 +153,6 @@ class GridSampler:
 
         Parameters
         ----------
-        point : int
-            The point.
         first_observation : (G,) array
             The first observation at the point.
         """

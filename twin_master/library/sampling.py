@@ -91,8 +91,6 @@ def sample_library(
 
     Parameters
     ----------
-    grid : SamplingGrid
-        The points at which the FMU is sampled.
     out : Path
         The NetCDF file. Until it is written, finished blocks are in the folder
         `blocks_folder(out)`.
@@ -168,16 +166,10 @@ def _sample_blocks(
 
     Parameters
     ----------
-    grid : SamplingGrid
-        The grid of N points.
     rows : (N, G) array
         The observations of the G sensors at all points; the rows of the blocks are filled in.
     blocks : list of (int, int)
         The first point of each block, and the point after its last; emptied at the end.
-    worker_count : int
-        The largest number of threads.
-    progress_stage : Stage
-        Receives the number of finished blocks.
     """
     samplers: list[GridSampler] = []
     next_blocks = iter(blocks)  # shared: each block goes to the next free thread
@@ -318,10 +310,6 @@ def sampled_dataset(
 
     Parameters
     ----------
-    grid : SamplingGrid
-        The points at which the FMU is sampled.
-    binding : Binding
-        The binding of the FMU.
     record : mapping
         The hashes of the files, and the version.
     rows : (N, G) array

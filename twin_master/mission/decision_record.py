@@ -21,8 +21,6 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
     ----------
     line : mapping of str to object
         The record of the line.
-    scenario : Scenario
-        The scenario of the run or watch.
     model : GraphicalModel
         The states to which the belief in the line refers.
     """

@@ -57,8 +57,6 @@ def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) 
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of the twin.
     control : (..., T) array
         The indices of the controls in force; negative in steps that were not flown.
     belief : (..., T, S) array

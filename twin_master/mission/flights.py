@@ -215,8 +215,6 @@ def fly_side_by_side(
     ----------
     knowledge : Knowledge
         The knowledge of all twins; the scenario does not learn.
-    truths : sequence of Truth
-        The truth of each twin.
     assets : sequence of Asset
         The asset of each twin, at its start; twins may share one without memory.
 
@@ -245,8 +243,6 @@ def fly_formation(knowledge: Knowledge, plant: Plant, source: Source["TwinsSideB
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of all twins.
     plant : Plant
         The assets, at the start of the missions.
     source : Source
@@ -294,12 +290,8 @@ class TwinsSideBySide:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the twins.
     twin : Twin
         A twin before its first observation: all have its model, sensors and policy.
-    flights : Flights
-        The record of the twins, in which failures and notices are noted.
 
     Attributes
     ----------
@@ -347,7 +339,7 @@ class TwinsSideBySide:
         # The beliefs: under the model and, with notices, averaged over the faults of gauges.
         checked = None
         if self._watch is not None:
-            checked = self._watch.leave_out_useless_readings(self._watch_state, rows, controls)
+            checked = self._watch.exclude_useless_readings(self._watch_state, rows, controls)
         used_rows = rows if checked is None else checked.rows
         model_beliefs, errors = self._filter.step_of_twins(
             self._log_belief, self.previous_control, used_rows, controls, self.steps
@@ -429,10 +421,6 @@ def fly_one_by_one(
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of all twins.
-    truths : sequence of Truth
-        The truth of each twin.
     asset_of : callable
         Returns the asset of a twin at its start. It takes the number of the twin, and whether the
         flight before it went to its end.

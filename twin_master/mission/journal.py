@@ -198,8 +198,6 @@ def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
 
     Parameters
     ----------
-    record : dict
-        The record.
     noise_free : callable
         Removes noise and drift from readings, see `NoiseFree`.
     """
@@ -228,8 +226,6 @@ def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -
 
     Parameters
     ----------
-    record : dict
-        The record.
     noise_free : callable, optional
         Removes noise and drift from readings; needed for the steps of a simulated asset.
 
@@ -395,8 +391,6 @@ def records(path: Path, begin: int = 0, recent: RecentParts | None = None) -> It
 
     Parameters
     ----------
-    path : Path
-        The path of the journal.
     begin : int
         The position of the first line to read, in bytes.
     recent : RecentParts, optional
@@ -437,10 +431,6 @@ def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -
 
     Parameters
     ----------
-    line : bytes
-        The line.
-    path : Path
-        The path of the journal, for messages.
     recent : RecentParts, optional
         The large parts of the last lines; if they are given, the record has them.
 
@@ -478,8 +468,6 @@ def records_backwards(
 
     Parameters
     ----------
-    path : Path
-        The path of the journal.
     end : int, optional
         The end of the last line to read, in bytes; the end of the file if left out.
     recent : RecentParts, optional
@@ -528,8 +516,6 @@ def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
 
     Parameters
     ----------
-    path : Path
-        The path of the journal.
     limit : float
         The largest step that counts.
 
@@ -557,8 +543,6 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
 
     Parameters
     ----------
-    path : Path
-        The path of the journal.
     begin : int
         The position of the first byte of the damaged line in the file.
     reason : str

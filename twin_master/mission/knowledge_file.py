@@ -39,10 +39,6 @@ def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
-    knowledge : Knowledge
-        The knowledge to write.
     number : int, optional
         The number of an earlier model of a watch, from 0; left out for the last or only one.
 
@@ -93,8 +89,6 @@ def load_knowledge(
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
     scenario : Scenario
         The scenario in its `config.json`.
     number : int, optional

@@ -69,12 +69,8 @@ def plan_within_limit(
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission.
     problem : DecisionProblem
         The decision problem of the mission, without a price.
-    rewards : RewardModel
-        The rewards, which contain the health limit.
 
     Raises
     ------

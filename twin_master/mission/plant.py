@@ -63,8 +63,6 @@ class Truth:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission.
     model : GraphicalModel
         The states, and the transitions that random growth of damage follows.
     seed : int
@@ -328,8 +326,6 @@ class Plant(Source[FlownTwins]):
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the missions.
     truth : Truth
         Damage, noise and faults of one mission, or of B missions (`Truth.stack`).
     *assets : Asset

@@ -448,8 +448,6 @@ def prepare_knowledge(
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario to fly.
     source : AssetSource
         The source of the asset, already prepared.
     seed : int

@@ -93,8 +93,6 @@ class RecentParts:
 
         Parameters
         ----------
-        record : dict
-            The record.
         line_hash : bytes
             The hash of its line, in hexadecimal digits.
         """
@@ -138,13 +136,7 @@ class RecentParts:
 
 
 class RecentPartsFile(RecentParts):
-    """The parts of the last lines of a journal, as the process has them that writes the journal.
-
-    Parameters
-    ----------
-    folder : Path
-        The run folder.
-    """
+    """The parts of the last lines of a journal, as the process has them that writes the journal."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -157,12 +149,8 @@ class RecentPartsFile(RecentParts):
 
         Parameters
         ----------
-        step : int
-            The step of the line.
         line_hash : bytes
             The hash of the line, in hexadecimal digits.
-        parts : dict
-            The parts.
 
         Raises
         ------

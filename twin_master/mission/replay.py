@@ -84,8 +84,6 @@ def replay(
 
     Parameters
     ----------
-    path : Path
-        The path of the journal.
     models : sequence of BelievedModel
         The model at the beginning, and those that were adopted later.
     lag : int or None
@@ -302,8 +300,6 @@ def spans_of_models(
 
     Parameters
     ----------
-    history : History
-        The steps of the flight so far.
     models : sequence of BelievedModel
         The models in the order of their adoption.
     """
@@ -336,15 +332,6 @@ def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> 
 
     Lines after the last saved state of the asset are removed from the journal; their steps must be
     flown again.
-
-    Parameters
-    ----------
-    journal : JournalFile
-        The journal of the run folder.
-    knowledge : Knowledge
-        The knowledge of the twin.
-    plant : Plant
-        The plant at its start.
 
     Raises
     ------

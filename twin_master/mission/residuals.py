@@ -24,10 +24,6 @@ def expected_in_steps(
 
     Parameters
     ----------
-    history : History
-        The T steps of the flight so far.
-    knowledge : Knowledge
-        The knowledge of the twin in these steps.
     belief : (T, S) array
         The filtered or smoothed belief in each step.
     is_smoothed : bool
@@ -56,10 +52,6 @@ def expected_ahead(
 
     Parameters
     ----------
-    history : History
-        The T steps of the flight so far.
-    knowledge : Knowledge
-        The knowledge of the twin in these steps.
     predicted_beliefs : (T, H, S) array
         The belief about the state in each of the H steps after each step.
 
@@ -96,8 +88,6 @@ def residual_summary(
 
     Parameters
     ----------
-    history : History
-        The steps of the flight so far.
     from_step : int
         The number of the first step that is evaluated.
     models : sequence of BelievedModel

@@ -310,8 +310,6 @@ def level_separations(
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of the twin.
     readings : sequence of DrawnReadings
         The readings under each control.
     sensors : sequence of int
@@ -360,8 +358,6 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario, with absolute paths.
     candidates : str
         The largest number of rosettes to place evenly on the surface, or a TOML file with tables
         `gauge` and `rosette`, as in a structure file.

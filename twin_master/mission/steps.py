@@ -229,11 +229,13 @@ class History:
 
     @property
     def learnt(self) -> Float:
-        """The posterior of N learnt quantities in each step (T, N, 4), see `Learnt.figures`."""
-        figures = []
+        """Posterior of N learnt quantities in each step, `Learnt.moments_and_bounds`: (T, N, 4)."""
+        posteriors = []
         for step in self.steps:
-            figures.append([posterior.figures for posterior in step.twin_step.learnt.values()])
-        return np.array(figures).reshape(len(self.steps), len(self.learnt_names), 4)
+            posteriors.append(
+                [posterior.moments_and_bounds for posterior in step.twin_step.learnt.values()]
+            )
+        return np.array(posteriors).reshape(len(self.steps), len(self.learnt_names), 4)
 
 
 class SteppedTwin(Protocol[StepT]):

@@ -36,14 +36,9 @@ _RAISING_SWEEPS = 3
 
 
 class _Bounds:
-    """Lower and upper bound of the return from every belief.
+    """The lower and the upper bound of the return at every belief.
 
-    The lower one begins with plans that take one control for ever.
-
-    Parameters
-    ----------
-    problem : DecisionProblem
-        The decision problem, with its states, controls and observations.
+    The lower bound begins with plans that take one control for ever.
     """
 
     def __init__(self, problem: DecisionProblem) -> None:
@@ -179,15 +174,13 @@ def plan_on_belief(
     gap: float = 0.005,
     most_beliefs: int | None = None,
 ) -> BeliefPlan:
-    """Return a plan on the belief, by heuristic search between a lower and an upper bound.
+    """Return a plan on the belief, found by heuristic search between a lower and an upper bound.
 
-    It ends if the bounds of the return from the prior are close, or if the largest number of
-    beliefs is visited.
+    The search ends when the bounds of the return from the prior are close, or when the largest
+    number of beliefs has been visited.
 
     Parameters
     ----------
-    problem : DecisionProblem
-        The decision problem, with its states, controls and observations.
     first : int, optional
         The control of the first step, if it is prescribed.
     gap : float
@@ -220,9 +213,9 @@ def plan_on_belief(
 
 
 def _policy_at(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
-    """Return the policy at some beliefs (B, S).
+    """Return a policy from the vectors that are best at some beliefs (B, S).
 
-    For each control it has the vectors that are the largest of that control at one of the beliefs.
+    For each first control it has the vectors that are the largest of that control at one of them.
     """
     vectors_by_control = []
     for control in range(len(bounds.problem.discount)):

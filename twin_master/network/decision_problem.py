@@ -54,8 +54,6 @@ class DecisionProblem:
         ----------
         belief : (S,) or (B, S) array
             One belief; or B beliefs with an observation for each.
-        control : int
-            The control of the step.
         observation : (B,) array, optional
             The observation that follows each belief; if left out, all K observations of one belief.
 
@@ -79,8 +77,6 @@ class DecisionProblem:
 
         Parameters
         ----------
-        control : int
-            The control of the step.
         plan_of_class : (K,) array
             For each of K observations, the index of the plan that is followed after it.
         vectors : (N, S) array
@@ -111,19 +107,17 @@ def observation_classes(
     generator: np.random.Generator,
     classes: int = MOST_CLASSES,
 ) -> tuple[Float, ...]:
-    """Return for each control p(class of the observation | state), for K classes: (K, S).
+    """Return p(class of the observation | state) (K, S) for each control.
 
-    Observations are drawn in each state. Those with similar posterior beliefs, from a uniform
-    prior, are joined to a class: their Hellinger distance is small. The probability of a class in a
-    state is the sum of the posteriors of its members, normalised over the classes. The number of
-    classes is doubled until they contain as much information about the state as all observations.
+    Observations are drawn in each state. Those whose posteriors, from a uniform prior, are close in
+    Hellinger distance are joined to one of K classes. The probability of a class in a state is the
+    sum of the posteriors of its members, normalised over the classes. The number of classes is
+    doubled until they contain nearly as much information about the state as all observations.
 
     Parameters
     ----------
     sensor_model : GaussianSensorModel
         S states, U controls.
-    generator : numpy.random.Generator
-        The source of random numbers for the observations.
     classes : int
         The largest number of classes.
     """

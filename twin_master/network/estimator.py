@@ -31,18 +31,15 @@ from twin_master.scenario.schema import Scenario
 CarriedArrays = Mapping[str, AnyArray]
 """Arrays of several types by name, which an estimator carries from step to step."""
 BELIEVED = 0.5
-"""Largest probability that no state explains the sensors, up to which a state is believed.
+"""Largest probability that no state explains the sensors with which a state is still believed.
 
-Beyond one half that explanation is more probable than all others together."""
+Beyond one half, that explanation is more probable than all others together."""
 
 
 def is_state_believed(none_of_these: float) -> bool:
     """Return whether the twin believes in any state.
 
-    Parameters
-    ----------
-    none_of_these : float
-        The probability that no state of the model explains the sensors.
+    `none_of_these` is the probability that no state of the model explains the sensors.
     """
     return none_of_these <= BELIEVED
 
@@ -73,7 +70,7 @@ class SensorModel(Protocol):
 
 @dataclass(frozen=True)
 class Carried:
-    """What an estimator carries from one step to the next.
+    """The arrays that an estimator carries from one step to the next.
 
     Attributes
     ----------
@@ -108,8 +105,8 @@ class Learnt:
     unit: str = "1"
 
     @property
-    def figures(self) -> tuple[float, float, float, float]:
-        """Mean, standard deviation and the bounds of the interval."""
+    def moments_and_bounds(self) -> tuple[float, float, float, float]:
+        """Mean, standard deviation, lower and upper bound."""
         return self.mean, self.standard_deviation, self.lower, self.upper
 
 
@@ -198,7 +195,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an estimator concludes in one step t.
+    """The conclusions of an estimator in one step t.
 
     Attributes
     ----------
@@ -356,9 +353,9 @@ class ExactFilter:
             such control.
         """
         # A sensor model of a user may take only one observation at a time.
-        of_sequence = getattr(self._sensor_model, "log_likelihood_sequence", None)
-        if of_sequence is not None:
-            likelihoods = of_sequence(observations, control_index)
+        sequence_likelihood = getattr(self._sensor_model, "log_likelihood_sequence", None)
+        if sequence_likelihood is not None:
+            likelihoods = sequence_likelihood(observations, control_index)
         else:
             pairs = zip(observations, np.asarray(control_index).tolist(), strict=True)
             likelihoods = [self._sensor_model.log_likelihood(row, u) for row, u in pairs]
@@ -395,7 +392,7 @@ class ExactFilter:
 
 @dataclass(frozen=True)
 class NoticeWording:
-    """The words and units of a scenario for steps and sensors in the sentences of notices.
+    """The words and units with which notices name the steps and sensors of a scenario.
 
     Attributes
     ----------
@@ -420,7 +417,7 @@ class NoticeWording:
 
     @classmethod
     def of(cls, scenario: Scenario) -> NoticeWording:
-        """Return the wording that fits the steps and sensors of a scenario."""
+        """Return the wording for the steps and sensors of a scenario."""
         observation = scenario.observation
         factor, units = observation.printed
         return cls(

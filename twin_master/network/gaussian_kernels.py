@@ -33,7 +33,7 @@ ROUNDING = 1e-13
 """Entries that remain of a separated matrix, relative to the largest value, are rounding errors."""
 
 
-def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
+def factor_low_rank(values: Float, largest: float) -> tuple[Float, Float]:
     """Factor a matrix (N, E) of low rank R into matrices (N, R) and (R, E), to rounding.
 
     The method is a cross approximation with full pivoting (Bebendorf 2000): the product of the
@@ -71,11 +71,11 @@ def separate_matrix(values: Float, largest: float) -> tuple[Float, Float]:
 def fill_exponentials(
     exponent: Float, subtracted: Float, mantissa: Float, power_bits: Index
 ) -> None:
-    """Fill `mantissa` and `power_bits` with exp(`exponent` - `subtracted`), (B,) arrays.
+    """Compute exp(`exponent` - `subtracted`) (B,) as the product of `mantissa` and a power of two.
 
-    The exponential function is the mantissa times a power of two, whose bits are a whole number; it
-    is written out because the compiler does not vectorise calls of a library function. Differences
-    below `LEAST_EXPONENT` are replaced by it.
+    `power_bits` are the bits of a power of two. The exponential is written out because the compiler
+    does not vectorise calls of a library function. Differences below `LEAST_EXPONENT` are replaced
+    by it.
     """
     for b in range(len(exponent)):
         value = max(exponent[b] - subtracted[b], LEAST_EXPONENT)
@@ -127,7 +127,7 @@ def log_densities(
 ) -> None:
     """Fill rows of `result` with log densities in each state, for each draw or their sum.
 
-    With d = (observation - mean) / deviation that of an observation is for a draw e
+    With d = (observation - mean) / deviation, the log density of an observation under draw e is
 
         (|I d|² - |d|²) / 2 + (d A) b_e - offset_e + log scale,
 
@@ -148,7 +148,7 @@ def log_densities(
     draw_coefficients : (R, E) array
         The vectors b_e.
     draw_offset : (S, E) array
-        The term of each draw that is subtracted whatever is observed.
+        The term of each draw that does not depend on the observation.
     log_scale : (S,) array
         The log of the normalising factor of the density.
     row : (N,) array

@@ -166,14 +166,14 @@ class StateSpace:
         from scipy.interpolate import RegularGridInterpolator  # slow to import
 
         levels = [np.asarray(factor.levels) for factor in self.factors]
-        lowest = [of_factor[0] for of_factor in levels]
-        highest = [of_factor[-1] for of_factor in levels]
+        lowest = [factor_levels[0] for factor_levels in levels]
+        highest = [factor_levels[-1] for factor_levels in levels]
         grid = np.asarray(table, dtype=np.float64).reshape(*self.shape, -1)
         within_levels = np.clip(nan_where_masked(values), lowest, highest)
         return np.asarray(RegularGridInterpolator(levels, grid)(within_levels))
 
-    def certain(self, levels: Sequence[float]) -> Float:
-        """Return the belief (S,) that is certain of the given levels."""
+    def certain_belief(self, levels: Sequence[float]) -> Float:
+        """Return the belief (S,) with probability one at the given levels."""
         belief = np.zeros(self.size)
         belief[self.index(levels)] = 1.0
         return belief
@@ -189,11 +189,11 @@ class StateSpace:
         return np.asarray(np.sqrt(product_of_each(belief, deviation**2)))
 
     def change_within_interval(self, table: ArrayLike) -> Float:
-        """Return the typical change of a table within the interval that each state stands for.
+        """Return how much a table typically changes within the interval that a state stands for.
 
-        A level stands for the interval of values that are nearest to it: half way to its neighbours
-        on either side, and on one side only for the first and the last level. The true value is
-        uniformly distributed in the interval. Between levels the table is piecewise linear.
+        A level stands for the values that are nearest to it, half way to its neighbours; the first
+        and the last level have a neighbour on one side only. The true value is uniformly
+        distributed in this interval, and the table is linear between levels.
 
         Parameters
         ----------
@@ -401,7 +401,7 @@ def worsening_table(level_count: int, probability: float) -> Float:
 
 
 def repaired_table(table: Float, success: float) -> Float:
-    """Return transitions (L, L) after which a repair to the lowest level follows.
+    """Return the transitions (L, L) of a step at whose end a repair to the lowest level is tried.
 
     Parameters
     ----------
@@ -418,7 +418,7 @@ def repaired_table(table: Float, success: float) -> Float:
 
 
 def leaving_table(table: Float, factor: float) -> Float:
-    """Return transitions of L levels (L, L), with all probabilities to leave times a factor.
+    """Return transitions (L, L) with each probability of leaving a level multiplied by a factor.
 
     Raises
     ------

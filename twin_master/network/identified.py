@@ -31,9 +31,9 @@ class IdentifiedSensorModel(GaussianSensorModel):
     """
 
     def split_observation(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return the rows unchanged, with covariances if they have them, and zero log densities.
+        """Return the rows unchanged, and log densities (..., S) of zero.
 
-        The log densities (..., S) are those of other parts of an observation, which there are not.
+        An observation has no other parts.
         """
         rows = nan_where_masked(observation)
         return rows, np.zeros((*rows.shape[:-1], self.state_count))
@@ -60,7 +60,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
     def _log_densities(
         self, observations: ArrayLike, control_index: ArrayLike, draws: int
     ) -> Float:
-        """Return log densities of rows as `GaussianSensorModel._log_densities`: (T, S, draws).
+        """Return the log densities (T, S, draws) of rows; see `GaussianSensorModel._log_densities`.
 
         Raises
         ------
@@ -186,7 +186,7 @@ class InspectedSensorModel(GaussianSensorModel):
         return np.hstack((values, readings))
 
     def split_observation(self, observation: ArrayLike) -> tuple[Float, Float]:
-        """Return the values of the sensors, and the log densities of what inspections showed.
+        """Return the values of the sensors, and the log densities of the readings of inspections.
 
         Parameters
         ----------

@@ -148,8 +148,6 @@ def filter_many(
 
     Returns
     -------
-    filtered : Filtered
-        The beliefs, with leading axes (B, T).
     failed : (B,) array
         The first step whose observation is impossible, or -1. Later beliefs of such a twin are not
         defined.
@@ -315,18 +313,9 @@ def predict(
 def _predict_by_blocks(
     transition: TransitionModel, policy: Float, predicted_beliefs: Float
 ) -> None:
-    """Predict the beliefs of steps 2 to H from the first one, with little memory.
+    """Fill the later rows of the beliefs (H, S) by applying the blocks of the transition.
 
     The table (U, S, S) of all transitions is not built, because it may be too large.
-
-    Parameters
-    ----------
-    transition : TransitionModel
-        The transitions of S states under U controls.
-    policy : (S, U) array
-        p(control | state).
-    predicted_beliefs : (H, S) array
-        The belief in each step; the rows after the first are filled in place.
     """
     for h in range(1, len(predicted_beliefs)):
         joint = predicted_beliefs[h - 1][:, None] * policy
@@ -338,7 +327,7 @@ def _predict_by_blocks(
 
 
 def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: int) -> Float:
-    """Return the joint beliefs over states and controls (..., S, U), if the controls are known.
+    """Return the joint beliefs over states and controls (..., S, U) when the controls are known.
 
     Parameters
     ----------

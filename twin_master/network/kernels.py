@@ -66,10 +66,10 @@ def _exp(value: float) -> float:
 def apply_blocks(
     lists: PredecessorLists, control: int, before: Float, after: Float, work: Float
 ) -> None:
-    """Fill `after` with the numbers `before`, one for each state, after all blocks of a transition.
+    """Apply all blocks of a transition to the numbers `before` (S,), and fill `after` (S,).
 
-    A block is applied along the first axis of the joint state, which becomes the last one. So after
-    all blocks the order of the axes is as before. `work` (S,) is work space.
+    Each block is applied along the first axis of the joint state, which then becomes the last one.
+    So after all blocks the axes are in their first order again. `work` (S,) is work space.
     """
     levels, first_row, start, predecessor, probability, _ = lists
     source = before
@@ -98,7 +98,7 @@ def _move_belief(
     log_after: Float,
     work: Float,
 ) -> None:
-    """Fill `after` and `log_after` (S,) with a belief and its logarithm after one transition.
+    """Move a belief by one transition: fill `after` (S,), and `log_after` with its logarithm.
 
     The axes are treated as in `apply_blocks`. `work` (2, S) is work space.
     """
@@ -161,8 +161,6 @@ def forward_pass(
 
     Parameters
     ----------
-    lists : PredecessorLists
-        The predecessors of each level.
     control : (B, T) array
         The control in force in each step.
     log_first : (B, S) array
@@ -246,8 +244,6 @@ def backward_pass(
 
     Parameters
     ----------
-    forward, backward : PredecessorLists
-        The predecessors and the successors of each level.
     control : (B, T) array
         The control in force in each step.
     filtered, log_filtered : (B, T, S) array
@@ -323,8 +319,6 @@ def sweep_bellman(
 
     Parameters
     ----------
-    backward : PredecessorLists
-        The successors of each level.
     reward : (S, U) array
         The expected reward of one step.
     discount : (U,) array

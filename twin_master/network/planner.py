@@ -96,7 +96,7 @@ class BeliefPolicy:
         return np.asarray(product_of_each(checked_beliefs(belief), self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
-        """Return the expected return of each first control: beliefs (..., S) -> (..., U).
+        """Return the return of the best plan that begins with each control: (..., S) -> (..., U).
 
         It is minus infinity for a control with which no plan begins.
         """
@@ -117,10 +117,9 @@ class BeliefPolicy:
 class RiskPolicy:
     """A policy that takes the hardest control whose risk is below a level.
 
-    The risk of a control is the probability that it is beyond the limit: harder than the best
-    control of the state. It is averaged over the belief, and so over all hypotheses about the
-    sensors that are mixed into the belief. If no state explains the sensors, the state is taken to
-    be the worst one for each control.
+    The risk of a control is the probability, under the belief, that it is harder than the best
+    control of the state. If no state explains the sensors, each control has the risk that it has in
+    its worst state.
 
     Attributes
     ----------
@@ -300,7 +299,7 @@ def decision_probability(
 def ration_controls(
     transition: TransitionModel,
     filtered_belief: Float,
-    before: Index,
+    control_in_force: Index,
     chosen_controls: Index,
     policy: BeliefPolicy,
     scarce: Sequence[int],
@@ -317,8 +316,7 @@ def ration_controls(
         The transitions between S states.
     filtered_belief : (B, S) array
         p(D_t | o_0..o_t).
-    before : (B,) array
-        The controls in force.
+    control_in_force : (B,) array
     chosen_controls : (B,) array
         The next controls that were decided for each twin alone.
     policy : BeliefPolicy
@@ -332,7 +330,8 @@ def ration_controls(
     if len(requesting_twins) <= budget:
         return chosen_controls
     predicted_beliefs = [
-        transition.forward(int(before[twin]), filtered_belief[twin]) for twin in requesting_twins
+        transition.forward(int(control_in_force[twin]), filtered_belief[twin])
+        for twin in requesting_twins
     ]
     action_value = policy.action_value(np.array(predicted_beliefs), transition.shape[0])
     other_action_value = action_value.copy()
@@ -423,7 +422,7 @@ class _DecisionProcess:
         return cls(transition, rewards, np.full(controls, factors))
 
     @property
-    def is_solved(self) -> bool:
+    def has_direct_solution(self) -> bool:
         """Whether there are few enough states to solve a dense linear system for a value."""
         return len(self.reward) <= LARGEST_SOLVED
 
@@ -472,12 +471,12 @@ class _DecisionProcess:
         return _ValueIteration(value, sweeps, change, converged=change <= largest_change)
 
     def check_converged(self, result: _ValueIteration) -> None:
-        """Refuse a value that still changes.
+        """Refuse a value that is not known to the tolerance.
 
         Raises
         ------
         PlanningError
-            If the value is not known to the tolerance.
+            If value iteration stopped while the value still changed by more than that.
         """
         if not result.converged:
             raise PlanningError(
@@ -502,7 +501,7 @@ class _DecisionProcess:
     def rounding_error(self, value: Float) -> Float:
         """Return the largest rounding error of an action value in each of S states: (S,).
 
-        It is proportional to the sum of the absolute values of the terms.
+        It is proportional to the sum of the absolute values of the rewards and expected returns.
         """
         absolute_process = replace(self, reward=np.abs(self.reward))
         size_of_terms = absolute_process.action_value(np.abs(value))
@@ -521,7 +520,7 @@ class _DecisionProcess:
             The value from which the iteration begins, if there are too many states to solve the
             linear system.
         """
-        if not self.is_solved:
+        if not self.has_direct_solution:
             result = self.iterate_value(0.0, _MOST_EVALUATION_SWEEPS, policy, start)
             self.check_converged(result)
             return result.value
@@ -574,9 +573,9 @@ def value_iteration(
 ) -> PlannedPolicy:
     """Return the best policy and its value: Bellman's equation, Kapteyn et al. 2021, eq. (36).
 
-    Value iteration finds a first policy. Policy iteration improves it until no control is better by
-    more than rounding. The value is that of the returned policy: with up to 1,000 states it is the
-    solution of a linear system, with more it is iterated to rounding.
+    Value iteration finds a first policy, and policy iteration improves it until no control is
+    better by more than rounding. The value is that of the returned policy: the solution of a linear
+    system with up to 1,000 states, and iterated to rounding with more.
 
     Parameters
     ----------
@@ -586,7 +585,7 @@ def value_iteration(
         The expected reward of one step.
     discount : float or (U,) array
         The discount factor gamma in [0, 1), for all controls or for each: zero if nothing comes
-        after a control. Rounding of the value is about 1e-16 / (1 - gamma) of its size.
+        after a control. The value has a relative rounding error of about 1e-16 / (1 - gamma).
     tolerance : float
         The error of the value at which value iteration ends, relative to the largest reward. It is
         bounded from the last change of the value by the contraction.
@@ -611,10 +610,10 @@ def value_iteration(
         transition = TransitionModel((nan_where_masked(transition),))
     problem = _DecisionProcess.from_arrays(transition, reward, discount)
     most_sweeps = max_iterations
-    if problem.is_solved:
+    if problem.has_direct_solution:
         most_sweeps = min(max_iterations, _WARM_UP_SWEEPS)
     iteration = problem.iterate_value(tolerance, most_sweeps)
-    if not problem.is_solved:
+    if not problem.has_direct_solution:
         problem.check_converged(iteration)
     greedy = np.argmax(problem.action_value(iteration.value), axis=1)
     control, value = problem.improve_policy(greedy, iteration.value)

@@ -65,8 +65,6 @@ def _fill_quantiles(
     ----------
     weight : (B, S U) array
         The beliefs over pairs of state and control.
-    sorted_values : SortedValues
-        The values of each sensor.
     levels : (P,) array
         The cumulative probabilities of the quantiles, increasing.
     result : (B, P, G) array
@@ -419,15 +417,7 @@ class RewardModel:
         return mean.reshape(shape), np.sqrt(variance).reshape(shape)
 
     def _error_reward(self, belief: Float, observation: Float) -> tuple[float, float]:
-        """Return mean and variance of the error reward of an observation (G,).
-
-        Parameters
-        ----------
-        belief : (S, U) array
-            The joint belief over states and controls.
-        observation : (G,) array
-            The observed values, SI; NaN for a lost sensor.
-        """
+        """Return mean and variance of the error reward of an observation (G,), given a belief."""
         state, control = np.nonzero(belief)  # pairs of positive probability
         value = self.quantity.value_per_draw[:, state, control]  # (E, n, G) of n pairs
         error = _error_rewards(observation, value, self._error_scale[control])
@@ -445,9 +435,9 @@ class RewardModel:
         variance: Float,
         observation: Float | None = None,
     ) -> tuple[Float, Float]:
-        """Return mean and standard deviation of each reward (B, 3), for a learning filter.
+        """Return mean and standard deviation of each reward (B, 3) for a learning filter.
 
-        Its B beliefs are over K static hypotheses, S states and U' of the controls together.
+        Each belief is over K static hypotheses, S states and U' of the controls together.
 
         Parameters
         ----------

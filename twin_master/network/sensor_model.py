@@ -18,8 +18,8 @@ from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.gaussian_kernels import (
     LOG_ROOT_TWO_PI,
+    factor_low_rank,
     log_densities,
-    separate_matrix,
 )
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.transition import check_shape, checked_controls
@@ -183,7 +183,7 @@ class GaussianSensorModel(QuantityModel):
         difference = (self.value_per_draw - self.mean) / independent
         largest = float(np.max(np.abs(self.value_per_draw) / independent))
         rows_of_draws = np.moveaxis(difference, 0, -1).reshape(-1, self.draw_count)
-        directions, self._draw_coefficients = separate_matrix(rows_of_draws, largest)
+        directions, self._draw_coefficients = factor_low_rank(rows_of_draws, largest)
         self._draw_directions = directions.reshape(*independent.shape, len(self._draw_coefficients))
         # By control: the sensors that were present last (as bytes), and the terms of the density.
         self._last_terms: dict[int, tuple[bytes, _DensityTerms]] = {}

@@ -8,13 +8,13 @@ from reporting.arrays import Float, Index
 from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.planner import BeliefPolicy
 
-LIVES = 200
-"""Number of futures ("lives") that are simulated for each twin."""
+FUTURES = 200
+"""Number of futures that are simulated for each twin."""
 Decide = Callable[[Float, Float, int], Index]
-"""Decides the controls (B,) of a step.
+"""Returns the controls (B,) of a step, given two beliefs (B, S) and the number of the step, from 0.
 
-It is called with the beliefs (B, S) about the states of the step, those about the states of the
-step before, both given all observations up to that one, and the number of the step, from 0.
+The first belief is about the states in the step, the second about those in the step before; both
+are given all observations up to the step before.
 """
 
 
@@ -25,17 +25,16 @@ def simulated_returns(
     steps: int,
     generator: np.random.Generator,
 ) -> Float:
-    """Return the discounted returns of B missions whose beliefs are exact: (B,).
+    """Return the discounted returns (B,) of simulated missions.
 
-    The reward of a step is its expectation under the belief: it has the same mean as the reward of
-    the drawn state, and a smaller variance. With an equal generator, mission number b has the same
-    random numbers for every policy, and for every problem of the same states (common random
-    numbers). So the difference of the returns of two policies varies less than either of them.
+    The reward of a step is its expectation under the exact belief: it has the same mean as the
+    reward of the drawn state, and a smaller variance. With an equal generator, mission number b has
+    the same random numbers for every policy, and for every problem of the same states (common
+    random numbers). So the difference of the returns of two policies varies less than either of
+    them.
 
     Parameters
     ----------
-    problem : DecisionProblem
-        The decision problem, with its states, controls and observations.
     decide : callable
         The policy, see `Decide`.
     missions : int
@@ -100,14 +99,12 @@ def leaving_probability(
 ) -> Float:
     """Return the probability that a policy chooses another control within some steps: (B,).
 
-    It is estimated as a fraction of simulated futures ("lives") of each twin.
+    It is estimated as the fraction of simulated futures of a twin in which that happens.
 
     Parameters
     ----------
     problem : DecisionProblem
         A problem whose state is observed before it moves.
-    policy : BeliefPolicy
-        The policy.
     belief : (B, S) array
         The belief of each twin before the first of the steps.
     control : int
@@ -118,11 +115,11 @@ def leaving_probability(
         Draws observations; all twins have the same random numbers.
     """
     fraction = np.empty(len(belief))
-    uniform = generator.random((steps - 1, LIVES))
+    uniform = generator.random((steps - 1, FUTURES))
     for twin, twin_belief in enumerate(belief):
-        beliefs = np.tile(twin_belief, (LIVES, 1))
+        beliefs = np.tile(twin_belief, (FUTURES, 1))
         has_left = policy.decide(beliefs) != control
-        # All lives begin with the same belief, and so with the same first decision. If this is
+        # All futures begin with the same belief, and so with the same first decision. If this is
         # another control, no further step is needed.
         later_steps = uniform[:0] if has_left.all() else uniform
         for uniform_of_step in later_steps:

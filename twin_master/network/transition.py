@@ -102,7 +102,7 @@ def check_shape(
     *expected: int | str,
     error: type[TwinMasterError] = InvalidModelError,
 ) -> None:
-    """Raise an error if the shape of an array is not the expected one.
+    """Refuse an array whose shape is not the expected one.
 
     Parameters
     ----------
@@ -112,8 +112,6 @@ def check_shape(
         The shape of the array.
     *expected : int or str
         The expected length of each axis; a word, such as "draws", stands for any length.
-    error : type
-        The error that is raised.
     """
     pairs = zip(expected, shape, strict=False)
     differs = any(
@@ -152,7 +150,7 @@ def checked_controls(control_index: ArrayLike, count: int) -> Index:
 
 
 def checked_beliefs(beliefs: ArrayLike) -> Float:
-    """Return beliefs (..., S) as an array of floats, without lost probabilities.
+    """Return beliefs (..., S) as an array of floats whose probabilities are all finite.
 
     Raises
     ------
@@ -170,7 +168,7 @@ def checked_beliefs(beliefs: ArrayLike) -> Float:
 
 
 def check_fits(parts: Mapping[str, float], advice: str) -> None:
-    """Raise an error if arrays together need more memory than is available.
+    """Refuse arrays that together need more memory than is available.
 
     Parameters
     ----------

@@ -53,14 +53,12 @@ _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
 
 
 def factor_tables(scenario: Scenario, leaving_factor: float = 1.0) -> dict[str, dict[str, Float]]:
-    """Return the transitions of each factor under each control, with the repairs by actions.
+    """Return the transitions of each factor under each control, including repairs by actions.
 
     The result has a table (levels, levels) by the name of the control and that of the factor.
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     leaving_factor : float
         The factor on the probabilities of each factor of the state to leave a level.
     """
@@ -97,8 +95,6 @@ def build_graphical_model(scenario: Scenario, leaving_factor: float = 1.0) -> Gr
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     leaving_factor : float
         The factor on the probabilities of each factor of the state to leave a level.
 
@@ -161,10 +157,10 @@ class _KeptStep:
 
 
 class Twin:
-    """Belief about one asset, updated step by step, without end.
+    """The belief about one asset, updated step by step, without end.
 
-    A step costs the same time and memory at the start and after years. Only the last `lag` steps
-    are kept: the twin smooths over them, and takes late observations into them.
+    A step takes the same time and memory at the start and after years, because only the last `lag`
+    steps are kept: the twin smooths over them, and late observations can revise them.
 
     Parameters
     ----------
@@ -344,7 +340,7 @@ class Twin:
         return self._assimilate_from(step, rows)
 
     def _assimilate_from(self, first: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
-        """Filter observations under their controls from a step on, and decide.
+        """Filter observations under their controls from a step on, and decide on the next control.
 
         Parameters
         ----------
@@ -368,9 +364,9 @@ class Twin:
             except (ArithmeticError, np.linalg.LinAlgError):
                 raise unbelievable_observation(self.name, step) from None
             previous_carried = estimate.carried
-            numbers = (estimate.log_evidence, estimate.filtered, *previous_carried.arrays.values())
+            results = (estimate.log_evidence, estimate.filtered, *previous_carried.arrays.values())
             # False for NaN as well.
-            if not all(np.all(np.asarray(part) < LARGEST_CARRIED) for part in numbers):
+            if not all(np.all(np.asarray(values) < LARGEST_CARRIED) for values in results):
                 raise unbelievable_observation(self.name, step)
             proposals_before = proposals
             proposals = self._proposals_after(estimate, proposals_before)
@@ -418,8 +414,8 @@ class Twin:
     def settled(self) -> tuple[int, bytes] | None:
         """Return the last step that cannot be revised any more, and the state after it.
 
-        All later steps follow from that state, which can be given to `restore_state`. If all steps
-        can still be revised, the result is None.
+        All later steps follow from that state, which `restore_state` takes. The result is None if
+        all steps can still be revised.
         """
         step = self.first_kept - 1
         if step < 0:
@@ -427,7 +423,7 @@ class Twin:
         return step, self._state_of(step + 1, [self._kept_steps[0]])
 
     def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
-        """Return the state after a number of steps, with some of them kept."""
+        """Return the state of a twin after `steps` steps, of which it keeps some, as bytes."""
         arrays: dict[str, AnyArray] = {"steps": np.array([steps, self._proposed])}
         for index, kept_step in enumerate(kept_steps):
             arrays[f"{index}/observation"] = kept_step.observation
@@ -509,7 +505,7 @@ class Twin:
         )
 
     def _proposals_after(self, estimate: Estimate, proposals_before: int) -> int:
-        """Return how often in a row a harder control is proposed, with that after an estimate."""
+        """Return how often in a row a harder control has been proposed, counting this step."""
         if self.hold is None:
             return 0
         control = np.array([estimate.carried.control_index])
@@ -519,16 +515,9 @@ class Twin:
         return int(proposals[0])
 
     def _decide(self, estimate: Estimate, proposals_before: int) -> TwinStep:
-        """Return an estimate with prediction and decision, and set the proposed control.
+        """Predict from the estimate of the last step, and decide on the next control.
 
         With the probability that no state explains the sensors, the safest control is taken.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            The estimate of the last step.
-        proposals_before : int
-            How often in a row a harder control was proposed before the step.
         """
         control_index = estimate.carried.control_index
         unexplained = estimate.unexplained
@@ -539,13 +528,16 @@ class Twin:
             prediction = prediction.mix_control(unexplained, self._safest)
 
         # The next controls by the belief of the step, and by the belief under each hypothesis.
-        believed = [named for named in estimate.hypotheses if named.belief is not None]
-        beliefs = np.array([estimate.filtered, *(named.belief for named in believed)])
-        doubt = np.zeros(len(beliefs))
-        doubt[0] = unexplained
+        believed_hypotheses = [
+            hypothesis for hypothesis in estimate.hypotheses if hypothesis.belief is not None
+        ]
+        hypothesis_beliefs = [hypothesis.belief for hypothesis in believed_hypotheses]
+        beliefs = np.array([estimate.filtered, *hypothesis_beliefs])
+        unexplained_of_belief = np.zeros(len(beliefs))
+        unexplained_of_belief[0] = unexplained
         controls_in_force = np.full(len(beliefs), control_index)
-        probability, *under_hypotheses = self.control_probabilities(
-            beliefs, controls_in_force, doubt
+        probability, *hypothesis_decisions = self.control_probabilities(
+            beliefs, controls_in_force, unexplained_of_belief
         )
         if self.hold is not None:
             held_probability, _ = self.hold.apply(
@@ -557,15 +549,15 @@ class Twin:
         # The hypothesis that decided adds most to the probability of the proposed control.
         suspicion = estimate.suspicion
         if suspicion is not None and estimate.hypotheses:
-            names = [named.name for named in believed]
-            controls_by_name = dict(zip(names, under_hypotheses, strict=True))
+            names = [hypothesis.name for hypothesis in believed_hypotheses]
+            decision_by_name = dict(zip(names, hypothesis_decisions, strict=True))
             contribution = {}
-            for named in estimate.hypotheses:
-                controls = controls_by_name.get(named.name, self._safest)
-                contribution[named.name] = 0.0
-                if controls is not None:
-                    proposed = float(controls[self._proposed])
-                    contribution[named.name] = named.probability * proposed
+            for hypothesis in estimate.hypotheses:
+                decision = decision_by_name.get(hypothesis.name, self._safest)
+                contribution[hypothesis.name] = 0.0
+                if decision is not None:
+                    proposed_probability = float(decision[self._proposed])
+                    contribution[hypothesis.name] = hypothesis.probability * proposed_probability
             decided_by = max(contribution, key=contribution.__getitem__)
             suspicion = replace(suspicion, decided_by=decided_by)
         return TwinStep(
@@ -585,7 +577,7 @@ class Twin:
 
 
 def unbelievable_observation(twin: str, step: int) -> InvalidObservationError:
-    """Return the error that no belief can be computed after an observation of a twin."""
+    """Return the error for an observation after which no belief can be computed."""
     return InvalidObservationError(
         f"twin {twin!r}, step {step}: the observation is so improbable after the earlier ones that "
         "no belief can be computed; check the sensors and the control in force"
@@ -593,7 +585,7 @@ def unbelievable_observation(twin: str, step: int) -> InvalidObservationError:
 
 
 def _kept_step_from_arrays(arrays: Mapping[str, AnyArray], index: int) -> _KeptStep:
-    """Return the kept step of an index among the arrays of a saved state."""
+    """Return the kept step with a given index from the arrays of a saved state."""
     prefix = f"{index}/carried/"
     carried_arrays = {
         name.removeprefix(prefix): value

@@ -51,7 +51,7 @@ class SparseBeliefs(NamedTuple):
 
 
 class Composition(NamedTuple):
-    """Rows (K, S) as sums of at most P beliefs and of corners, and the bound that follows.
+    """Rows (K, S) written as sums of at most P beliefs and of corners, and the resulting bound.
 
     Attributes
     ----------
@@ -92,8 +92,6 @@ def _compose_rows(
         Rows of probabilities, which need not sum to one.
     corner : (U, S) array
         The bound in each state, with each control first.
-    beliefs : SparseBeliefs
-        The J beliefs.
     drop : (J, U) array
         The bound at each belief minus that of the corners: zero or less.
     order : (J, U) array
@@ -147,7 +145,7 @@ def _compose_rows(
 
 @dataclass(frozen=True)
 class _NextRows:
-    """The compositions of all N next beliefs of the J beliefs, for sweeps of value iteration.
+    """The compositions of the N next beliefs of all J beliefs, for sweeps of value iteration.
 
     Attributes
     ----------
@@ -171,7 +169,7 @@ class _NextRows:
 
 
 class UpperBound:
-    """Upper bound of the return at any belief.
+    """An upper bound of the return at any belief.
 
     For each first control it is known at some beliefs and at the corners. The bound at a belief is
     the largest over the first controls.
@@ -248,17 +246,17 @@ class UpperBound:
         likely_states = np.argsort(-rounded, kind="stable")[:corner_count]
         corners = np.equal.outer(likely_states, np.arange(len(belief))).astype(np.float64)
         for simple_belief in (*corners, rounded / rounded.sum()):
-            if not self._index_of(simple_belief).any():
+            if not self._equals(simple_belief).any():
                 self._add_belief(simple_belief)
-        is_belief = self._index_of(belief)
+        is_belief = self._equals(belief)
         if is_belief.any():
             self._value[is_belief] = np.minimum(self._value[is_belief], self.action_bound(belief))
         else:
             self._add_belief(belief)
         self._update_lists()
 
-    def _index_of(self, belief: Float) -> Index:
-        """Return whether each of the J beliefs equals a given belief (S,): (J,) truth values."""
+    def _equals(self, belief: Float) -> Index:
+        """Return which of the J beliefs equal a given belief (S,), as truth values (J,)."""
         return np.asarray(np.all(self._beliefs == belief, axis=1))
 
     def _add_belief(self, belief: Float) -> None:

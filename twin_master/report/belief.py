@@ -122,10 +122,6 @@ def draw_step_map(
 
     Parameters
     ----------
-    axes : Axes
-        The panel that is drawn in.
-    run : Run
-        The run, as read from its folder.
     values : (T, n) array
         The values; those of one step form a column of the map.
     first_number : int
@@ -186,10 +182,6 @@ def _draw_state_map(
 
     Parameters
     ----------
-    axes : Axes
-        The panel that is drawn in.
-    run : Run
-        The run of a state with two factors.
     values : (S,) array
         The values; the first factor is drawn along the x axis.
     **look : ColorScale

@@ -36,10 +36,6 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
 
     Parameters
     ----------
-    run : Run
-        The run of T steps.
-    figure : Figure
-        The figure, with the twin's estimates and predictions at the present step.
     now : int
         The row of the present step in the run's arrays, from 0 to T - 1. Its printed number is
         larger by the number of the run's first step.

@@ -130,10 +130,6 @@ def _draw_course(
 
     Parameters
     ----------
-    axes : Axes
-        The panel that is drawn in.
-    run : Run
-        The run, as read from its folder.
     course : Moments of (T,) arrays
         The posterior after each step.
     prior : Moments of numbers

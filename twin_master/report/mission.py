@@ -82,8 +82,6 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
 
     Parameters
     ----------
-    run : Run
-        The run, as read from its folder.
     count : int
         The largest number of sensors.
     """
@@ -124,8 +122,6 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
 
     Parameters
     ----------
-    run : Run
-        The run, as read from its folder.
     now : int
         The row of the present step in the run's arrays, from 0 to T - 1.
     sensors : sequence of int, optional
@@ -222,14 +218,6 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
 
     Parameters
     ----------
-    axes : Axes
-        The panel that is drawn in.
-    run : Run
-        The run, as read from its folder.
-    now : int
-        The row of the present step.
-    course : Course
-        The estimates of the past, of the present step, and the predictions.
     truth : (T,) array or None
         The true value in each step; None if it is not known.
     """

@@ -164,8 +164,6 @@ def render_page(
 
     Parameters
     ----------
-    run : Run
-        The run, as read from its folder.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure
@@ -223,8 +221,6 @@ class _Pictures:
 
     Parameters
     ----------
-    page : Page
-        The page to which the section is added.
     drawings : mapping of str to bytes
         The figures as SVG, by name.
     figures : mapping of str to ReportFigure

@@ -38,8 +38,6 @@ def corner_beliefs(model: GraphicalModel, factor: int) -> Float:
 
     Parameters
     ----------
-    model : GraphicalModel
-        The model of S joint states.
     factor : int
         The index of the factor.
     """
@@ -65,8 +63,6 @@ def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
     ----------
     policy : BeliefPolicy
         The policy that chooses the control for a belief.
-    model : GraphicalModel
-        The model of the states.
     """
     names = model.states.names[:_MOST_FACTORS]
     count = len(model.controls)

@@ -55,8 +55,6 @@ def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | Non
 
     Parameters
     ----------
-    design : WingDesign or None
-        The design of the wing.
     scenario : Scenario
         The scenario, which defines the sensors and the factors of the state.
 
@@ -95,8 +93,6 @@ def _wing_point(design: WingDesign, span: float, chord_fraction: float) -> tuple
 
     Parameters
     ----------
-    design : WingDesign
-        The design, whose straight chord line is the x axis.
     span : float
         The distance from the root [m].
     chord_fraction : float
@@ -147,8 +143,6 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
 
     Parameters
     ----------
-    run : Run
-        The run, as read from its folder.
     planform : Planform
         The planform of the wing.
     residual : (G,) array
@@ -372,14 +366,8 @@ def _draw_surface(
 
     Parameters
     ----------
-    axes : Axes
-        The panel that is drawn in.
-    field : StructureField
-        The mesh, with the stiffness loss and the damage region of each cell.
     points : (n, 3) array
         The positions at which the n nodes of the mesh are drawn [m].
-    camera : Camera
-        The direction from which the structure is seen.
     """
     body = field.body
     outer_faces = body.outer_faces

@@ -37,17 +37,11 @@ def _add_table(
 
     Parameters
     ----------
-    page : Page
-        The page to which the section is added.
     name : str
         The name of its title and caption in `words.toml`.
-    columns : sequence of PageColumn
-        The columns of the table, with their headings.
     rows : iterable of sequence of str
         The cells. They may come from files of users: line breaks and repeated blanks become one
         blank.
-    **fields : object
-        The fields of title and caption.
     """
     cells = [[in_one_line(cell) for cell in row] for row in rows]
     if cells:

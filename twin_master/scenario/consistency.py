@@ -318,8 +318,6 @@ class ScenarioTables(Section):
 
         Parameters
         ----------
-        key : str
-            The key of the noise, for the message.
         noise : float or (G,) tuple of float
             The standard deviation of all G sensors, or of each sensor, SI.
         """

@@ -118,11 +118,6 @@ class Section(toml_file.Section):
 
         Otherwise Pydantic refuses the table. It does not know the units, which the message here
         names: `levels[_percent]`.
-
-        Parameters
-        ----------
-        table : mapping of str to object
-            The table, with keys without their units.
         """
         missing = []
         for key, field in cls.model_fields.items():
@@ -153,15 +148,7 @@ class Section(toml_file.Section):
 
 
 def _add_keys_with_units(table: Table, units: Mapping[str, str]) -> None:
-    """Add a key with a unit in its name beside each key that may carry one, to a table's schema.
-
-    Parameters
-    ----------
-    table : dict
-        The JSON Schema of the table, which is changed.
-    units : mapping of str to str
-        The unit of each key that may carry one.
-    """
+    """Add a key with a unit in its name beside each key that may carry one, to a table's schema."""
     properties: Table = {}
     alternatives = []
     for key, key_schema in table["properties"].items():
@@ -191,8 +178,6 @@ def _schema_in_unit(schema: JsonDocument, divisor: float) -> JsonDocument:
 
     Parameters
     ----------
-    schema : object
-        The schema, or a part of it.
     divisor : float
         By how much a value in the unit is divided to be in SI.
     """

@@ -130,7 +130,7 @@ def _learnt_quantities(
     moments_of: dict[str, Float] = {}
     posteriors = result.flight.learnt.swapaxes(0, 1)  # (quantities of the estimator, T, 4)
     for full_name, posterior in zip(result.flight.learnt_names, posteriors, strict=True):
-        moments = np.vstack((prior[full_name].figures, posterior))
+        moments = np.vstack((prior[full_name].moments_and_bounds, posterior))
         match = _NAME_WITH_SENSOR.fullmatch(full_name)
         if match is None:
             moments_of[full_name] = moments

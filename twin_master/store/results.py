@@ -163,8 +163,6 @@ def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bo
 
     Parameters
     ----------
-    result : MissionResult
-        The mission, of T steps.
     belief : (T, states) array
         The belief over states in each step.
     is_smoothed : bool
@@ -187,12 +185,8 @@ def _belief_variables(
 
     Parameters
     ----------
-    result : MissionResult
-        The results of the mission.
     belief : (..., states) array
         The probability of each state.
-    expectation : Expectation
-        The sensors and rewards expected under this belief.
     """
     states = result.knowledge.model.states
     return {
@@ -369,8 +363,6 @@ def _named_columns(heading_template: str, names: Iterable[str], values: AnyArray
     ----------
     heading_template : str
         The heading of every column, with `{}` in the place of its name: "action_value_{}".
-    names : iterable of str
-        The N names.
     values : (R, N) array
         The values of the columns.
     """

@@ -135,8 +135,6 @@ def find_fallback(
 
     Parameters
     ----------
-    states : StateSpace
-        The state space.
     policy_index : (S,) array
         The index of the control that the policy takes in each state.
     first_control : int
@@ -204,8 +202,6 @@ def find_policy_switch(
 
     Parameters
     ----------
-    states : StateSpace
-        The state space.
     policy_index : (states,) array
         The index of the control that the policy takes in each state.
     first_control : int
@@ -245,8 +241,6 @@ def summarise(
 
     Parameters
     ----------
-    result : MissionResult
-        The results of the mission.
     reward_mean : (steps, 3) array
         The mean of each reward under the filtered belief, in the order of `REWARD_NAMES`.
     misfit : (states, controls, sensors) array, optional

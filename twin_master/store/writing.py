@@ -51,17 +51,10 @@ def write_run(
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
     groups : mapping of str to NetcdfGroup
         The groups by name.
     attributes : mapping of str to object
         The attributes of the root: seed, versions, hashes.
-
-    Returns
-    -------
-    Path
-        The file.
 
     Raises
     ------
@@ -113,12 +106,6 @@ def store_flight(
 
     Parameters
     ----------
-    folder : Path
-        The path of the run folder.
-    config : dict
-        The content of `config.json`.
-    result : MissionResult
-        The results of the mission.
     origin : FlownAndBelieved
         What was flown, and what the twin believed, in words.
     steps : int

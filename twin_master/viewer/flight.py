@@ -262,8 +262,6 @@ class Flight:
 
         Parameters
         ----------
-        record : dict
-            The content of the line.
         begin : int
             The position at which the line begins in the journal [bytes].
         """
@@ -430,12 +428,8 @@ class Flight:
 
         Parameters
         ----------
-        expectation : LearntExpectation
-            The expectation of the twin, given what it has learnt.
         joint : (n, S, U) array
             The beliefs over states and controls.
-        records : sequence of n dict
-            The records of the steps, with what was learnt up to each.
         """
         parts = []
         observations = self.observations_in(records)
@@ -490,8 +484,6 @@ def _expectation_without_learning(
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge of the twin.
     joint : (n, S, U) array
         The beliefs over states and controls.
     rows : (n, G + I) array or None

@@ -75,11 +75,6 @@ class FlightPage:
 
     If the sensors have several units, each is shown as its deviation from the expected reading, in
     standard deviations of that reading.
-
-    Parameters
-    ----------
-    flight : Flight
-        The flight that is shown.
     """
 
     def __init__(self, flight: Flight) -> None:
@@ -185,11 +180,6 @@ class FlightPage:
 
         The answer has the past steps that the viewer lacks (`past`), and, if another step is shown
         than before, the prediction after it (`ahead`).
-
-        Parameters
-        ----------
-        request : Request
-            The request of a viewer.
         """
         flight = self._flight
         # The step to be shown
@@ -343,10 +333,6 @@ def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -
 
     Parameters
     ----------
-    request : Request
-        The request, with the steps that the viewer has.
-    step : int
-        The step that will be shown, the last one of the window.
     has_same_flight : bool
         Whether the steps of the viewer are of this flight; if not, they are void.
     """

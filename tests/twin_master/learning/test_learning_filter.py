@@ -15,7 +15,7 @@ from twin_master.errors import InvalidModelError
 from twin_master.learning.draw_posterior import posterior_of_draws
 from twin_master.learning.expectation import LearntExpectation, mixture_quantiles
 from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.saturation import LOST_SHARES
+from twin_master.learning.saturation import LOST_FRACTIONS
 from twin_master.network.estimator import Learnt
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.quantity import RewardModel
@@ -375,7 +375,7 @@ def saturating_learner(*, draws_are_learnt: bool) -> tuple[LearningFilter, Float
     """Return a filter that learns saturation, what its draws show (N, E, G), and readings (T, G)."""
     value = np.array([0.9, 1.0, 1.1])[:, None] * [1.0, 2.0, LARGEST]  # (E, G)
     largest = LARGEST * (0.2 * 0.9 + 0.5 + 0.3 * 1.1)  # the mean over the draws
-    limit = largest / np.sqrt(3.0 * LOST_SHARES[1:, None, None])
+    limit = largest / np.sqrt(3.0 * LOST_FRACTIONS[1:, None, None])
     shown = np.concatenate([value[None], limit * np.tanh(value / limit)])
     seen = shown[4, 1] + np.random.default_rng(5).normal(0.0, 0.1, size=(6, 3))
     sensor = GaussianSensorModel(value[:, None, None].repeat(2, axis=2), 0.1, [0.2, 0.5, 0.3])
@@ -400,8 +400,8 @@ def test_saturation_is_weighed_as_further_draws_of_all_gauges(draws_are_learnt):
     assert sum(estimate.log_evidence for estimate in estimates) == pytest.approx(
         np.logaddexp.reduce(of_share)
     )
-    assert learnt.mean == pytest.approx(weight @ LOST_SHARES)
-    assert learner.prior["saturation"].mean == pytest.approx(0.4 * LOST_SHARES[1:].mean())
+    assert learnt.mean == pytest.approx(weight @ LOST_FRACTIONS)
+    assert learner.prior["saturation"].mean == pytest.approx(0.4 * LOST_FRACTIONS[1:].mean())
 
 
 def test_saturation_that_is_believed_is_told_and_expected():

@@ -44,7 +44,7 @@ def test_moments_and_marginals_of_a_belief(weights):
     np.testing.assert_allclose(SPACE.mean(belief)[:, 0], mean, rtol=1e-13, atol=1e-15)
     variance = first @ np.square(LEVELS) - mean**2
     np.testing.assert_allclose(SPACE.standard_deviation(belief)[:, 0] ** 2, variance, atol=1e-14)
-    assert np.all(SPACE.standard_deviation(SPACE.certain((0.6, 1.0))) == 0.0)
+    assert np.all(SPACE.standard_deviation(SPACE.certain_belief((0.6, 1.0))) == 0.0)
 
 
 INTERVAL_CASES = {
@@ -99,7 +99,7 @@ def test_a_sensor_does_not_change_along_a_factor_on_which_it_does_not_depend(ste
 
 
 MOVES = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])
-PRIOR = SPACE.certain((0.0, 0.0))
+PRIOR = SPACE.certain_belief((0.0, 0.0))
 
 
 @pytest.mark.parametrize("most", [transition_file.MAX_JOINT_NON_ZEROS, 0])

@@ -651,7 +651,7 @@ def test_the_difference_of_two_rules_varies_little_from_mission_to_mission(moves
 
 
 def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypatch):
-    monkeypatch.setattr(simulated_missions, "LIVES", 4000)
+    monkeypatch.setattr(simulated_missions, "FUTURES", 4000)
     problem, rng = drawn(8, 4, moves_first=False), np.random.default_rng(1)
     vectors = 0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]])
     policy = BeliefPolicy(vectors, np.array([1, 0, 2]))

@@ -210,7 +210,7 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
     model, truth = build_graphical_model(scenario), scenario.scripted_history()
     np.testing.assert_allclose(truth, unit * SCENARIO.scripted_history(), rtol=1e-12)
     assert find_fallback(model.states, POLICY, 1, controls(40), truth).step_at_switch_level == 30
-    belief = np.tile(model.states.certain((0.2 * unit, 0.4 * unit)), (50, 1))
+    belief = np.tile(model.states.certain_belief((0.2 * unit, 0.4 * unit)), (50, 1))
     expected = in_credible_set(MODEL, belief, SCENARIO.scripted_history())
     np.testing.assert_array_equal(in_credible_set(model, belief, truth), expected)
     assert expected.sum() == 6

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
+from twin_master.gauges.discriminating_control import GaugeHypothesis, discriminating_controls
 from twin_master.gauges.hypothesis_weights import HypothesisWeights
-from twin_master.gauges.telling_control import GaugeHypothesis, telling_controls
 from twin_master.network.identified import InspectedSensorModel
 from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator
 
@@ -28,7 +28,7 @@ def test_the_probability_to_tell_is_that_of_the_closed_form(probability):
         GaugeHypothesis("gauge 1 off", 1.0 - probability, ONE_STATE, np.array([1.0 + gain])),
     ]
     values = np.array([2.0, 10.0, 18.0])
-    telling = telling_controls(hypotheses, under_controls(*values))
+    telling = discriminating_controls(hypotheses, under_controls(*values))
     assert telling is not None
     assert telling.names == ("model", "gauge 1 off")
     distance = gain * values
@@ -45,7 +45,7 @@ def test_where_one_step_does_not_tell_ten_steps_are_tried():
         GaugeHypothesis("model", 0.5, ONE_STATE, np.ones(1)),
         GaugeHypothesis("gauge 1 off", 0.5, ONE_STATE, np.array([1.1])),
     ]
-    telling = telling_controls(hypotheses, under_controls(10.0))
+    telling = discriminating_controls(hypotheses, under_controls(10.0))
     assert telling is not None
     distance = np.sqrt(10.0)
     assert telling.steps == 10
@@ -58,7 +58,7 @@ def test_a_state_that_may_explain_the_gauge_makes_it_hard_to_tell():
     off = GaugeHypothesis("gauge 1 off", 0.5, np.array([1.0, 0.0]), np.array([1.2]))
     for belief, told in (([1.0, 0.0], 1.0), ([0.0, 1.0], 0.0)):
         model = GaugeHypothesis("model", 0.5, np.array(belief), np.ones(1))
-        telling = telling_controls([model, off], sensors)
+        telling = discriminating_controls([model, off], sensors)
         assert telling is not None
         assert telling.by_control == pytest.approx([told])
 
@@ -76,7 +76,7 @@ def test_an_inspection_tells_what_no_gauge_can():
         GaugeHypothesis("model", 0.5, np.array([0.0, 1.0]), np.ones(1)),
         GaugeHypothesis("gauge 1 off", 0.5, np.array([1.0, 0.0]), np.array([1.2])),
     ]
-    telling = telling_controls(hypotheses, sensors)
+    telling = discriminating_controls(hypotheses, sensors)
     assert telling is not None
     assert telling.by_control == pytest.approx([0.0, 1.0])
 
@@ -87,7 +87,7 @@ def test_an_alarm_with_one_probable_hypothesis_needs_no_advice(probability):
         GaugeHypothesis("gauge 1 off", 1.0 - probability, ONE_STATE, np.array([1.2])),
         GaugeHypothesis("none of these", probability, ONE_STATE, np.array([1.4])),
     ]
-    assert telling_controls(hypotheses, under_controls(1.0)) is None
+    assert discriminating_controls(hypotheses, under_controls(1.0)) is None
 
 
 def advice_of(shown: np.ndarray, gain: float) -> list[str]:

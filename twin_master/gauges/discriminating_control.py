@@ -1,9 +1,10 @@
-"""Which control tells two hypotheses about the gauges apart, as advice where an alarm is ambiguous.
+"""The control that discriminates best between two hypotheses about the gauges.
 
-What a control shows in the next step is simulated under both hypotheses, with the gauges and, if
-the control asks for an inspection, its readings. If one step seldom suffices, ten steps are
-simulated. The hypotheses are told apart if the true one is then almost certain; the probability of
-that is the expected use of an experiment (Lindley 1956).
+It is advised when an alarm is ambiguous. The next step is simulated under each control and both
+hypotheses: the readings of the gauges and those of inspections that the control asks for. If one
+step seldom suffices, ten steps are simulated. The hypotheses are discriminated if the true one
+is then almost certain. A control is rated by the probability of that, as an experiment is rated by
+its expected information (Lindley 1956).
 """
 
 from collections.abc import Sequence
@@ -16,31 +17,27 @@ from twin_master.gauges.watch_state import WatchState
 from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEAST_PROBABILITY = 0.1
-"""Two hypotheses that are both at least as probable make an alarm ambiguous."""
+"""An alarm is ambiguous if two hypotheses have at least this probability."""
 _ALMOST_CERTAIN = 0.95
-"""The probability that a hypothesis must reach to be told apart from the other."""
+"""The probability that the true hypothesis must reach."""
 _LOG_ODDS_OF_ALMOST_CERTAIN = float(np.log(_ALMOST_CERTAIN / (1.0 - _ALMOST_CERTAIN)))
 _SIMULATIONS = 500
 """Simulations for each control and hypothesis."""
 _STEPS = (1, 10)
 """Successive steps under one control that are simulated."""
 _PROBABLE = 0.5
-"""The probability to tell from which on no more steps are simulated."""
+"""If a control discriminates with this probability, more steps need not be simulated."""
 
 
 class GaugeHypothesis(NamedTuple):
-    """A hypothesis about the gauges, and what they show under it.
+    """A hypothesis about the gauges.
 
     Attributes
     ----------
-    name : str
-        Its name.
-    probability : float
-        Its probability.
     belief : (S,) array
         The belief about the state, given the hypothesis.
     factor : (G,) array
-        What each gauge shows, as a factor on the value that the model predicts.
+        The reading of each gauge over the value that the model predicts.
     """
 
     name: str
@@ -49,15 +46,13 @@ class GaugeHypothesis(NamedTuple):
     factor: Float
 
 
-class TellingControls(NamedTuple):
-    """How probably each control tells the two most probable hypotheses apart.
+class DiscriminatingControls(NamedTuple):
+    """The probability with which each control discriminates between two hypotheses.
 
     Attributes
     ----------
-    names : tuple of str
-        The hypotheses, the more probable one first.
-    probabilities : tuple of float
-        Their probabilities.
+    names, probabilities : tuple
+        The two hypotheses, the more probable one first.
     steps : int
         The number of successive steps under a control.
     by_control : (U,) array
@@ -70,10 +65,10 @@ class TellingControls(NamedTuple):
     by_control: Float
 
 
-def telling_controls(
+def discriminating_controls(
     hypotheses: Sequence[GaugeHypothesis], sensor_model: GaussianSensorModel
-) -> TellingControls | None:
-    """Return how probably controls tell the two most probable hypotheses apart.
+) -> DiscriminatingControls | None:
+    """Return how probably each control discriminates between the two most probable hypotheses.
 
     The result is None if only one hypothesis is probable. Equal arguments give equal results.
     """
@@ -85,14 +80,14 @@ def telling_controls(
     controls = range(sensor_model.control_count)
     for steps in _STEPS:
         by_control = np.array(
-            [_probability_to_tell(first, second, sensor_model, u, steps) for u in controls]
+            [_probability_to_discriminate(first, second, sensor_model, u, steps) for u in controls]
         )
         if by_control.max() >= _PROBABLE:
             break
-    return TellingControls(names, probabilities, steps, by_control)
+    return DiscriminatingControls(names, probabilities, steps, by_control)
 
 
-def _probability_to_tell(
+def _probability_to_discriminate(
     first: GaugeHypothesis,
     second: GaugeHypothesis,
     sensor_model: GaussianSensorModel,
@@ -105,11 +100,11 @@ def _probability_to_tell(
     """
     log_odds = np.log(first.probability / second.probability)
     generator = np.random.default_rng(0)
-    told = 0.0
-    for truth, sign in ((first, 1.0), (second, -1.0)):
-        probability_of_state = truth.belief / truth.belief.sum()
+    probability = 0.0
+    for true_hypothesis, sign in ((first, 1.0), (second, -1.0)):
+        probability_of_state = true_hypothesis.belief / true_hypothesis.belief.sum()
         states = generator.choice(sensor_model.state_count, _SIMULATIONS, p=probability_of_state)
-        error = (truth.factor - 1.0) * sensor_model.mean[states, control]
+        error = (true_hypothesis.factor - 1.0) * sensor_model.mean[states, control]
         log_density_of_first = np.zeros((_SIMULATIONS, sensor_model.state_count))
         log_density_of_second = np.zeros_like(log_density_of_first)
         for _ in range(steps):
@@ -120,9 +115,9 @@ def _probability_to_tell(
         log_ratio = _log_mean(log_density_of_first, first) - _log_mean(
             log_density_of_second, second
         )
-        is_told = sign * (log_odds + log_ratio) >= _LOG_ODDS_OF_ALMOST_CERTAIN
-        told += truth.probability * float(np.mean(is_told))
-    return told / (first.probability + second.probability)
+        is_certain = sign * (log_odds + log_ratio) >= _LOG_ODDS_OF_ALMOST_CERTAIN
+        probability += true_hypothesis.probability * float(np.mean(is_certain))
+    return probability / (first.probability + second.probability)
 
 
 def _log_density(
@@ -157,14 +152,10 @@ def gauge_hypotheses(
     gain_deviation: float,
     gauge_names: tuple[str, ...],
 ) -> list[GaugeHypothesis]:
-    """Return the hypotheses of a twin about its gauges, the faulty gauge being the likeliest one.
+    """Return the hypotheses of a twin: the model, its most probably faulty gauge, and free gains.
 
     Parameters
     ----------
-    state : WatchState
-        The state of the watch of B twins.
-    twin : int
-        The twin.
     model_belief : (S,) array
         Its belief about the state under the model.
     gains : (K,) array
