@@ -60,14 +60,14 @@ NO_ASSET = (
 
 @dataclass(frozen=True)
 class AssetReading:
-    """What an asset returns for one step.
+    """The result of one step of an asset.
 
     Attributes
     ----------
     values : (G,) array
         The observation without noise in its SI unit.
     monitors : dict of str to float
-        Further figures that the asset reports, such as a certified error bound.
+        Further quantities that the asset reports, such as a certified error bound.
     state : dict of str to float or None
         The true value of each state factor, SI, if the asset has damage of its own. It serves for
         scoring; the twin does not receive it.
@@ -134,7 +134,7 @@ Predict = Callable[[Mapping[str, float], Mapping[str, float]], Float]
 
 
 def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -> Float:
-    """Return the predicted observation in every joint state under every control.
+    """Return the predicted observations (S, U, G) in all joint states under all controls.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
 
 
 def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> Float:
-    """Return the observations of an asset in every state under every control, without noise.
+    """Return the noise-free observations (S, U, G) of an asset in all states under all controls.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> 
 
 @dataclass(frozen=True)
 class FlownAndBelieved:
-    """What flies and what the twin believes, in words.
+    """The asset that flies and the model that the twin believes, in words.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ class FlownAndBelieved:
 def calibration_sentence(
     record: JsonRecord, asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return a sentence that says which model was calibrated, and whether the twin believes it.
+    """Return a sentence on which model was calibrated, and whether the twin believes that model.
 
     Parameters
     ----------
@@ -237,10 +237,10 @@ def calibration_sentence(
 
 
 class AssetSource:
-    """Prepares the asset that flies, or predicts the observations that a twin expects.
+    """Prepares the asset that flies, or predicts the observations that a twin expects, or both.
 
-    A subclass may do one of the two or both. This class copies files into the run folder, and draws
-    the uncertain parameter from the calibration of the scenario.
+    This class copies files into the run folder, and draws the uncertain parameter from the
+    calibration of the scenario.
 
     Parameters
     ----------
@@ -249,17 +249,17 @@ class AssetSource:
     """
 
     label: ClassVar = "asset"
-    """What flies or is believed, in words, if it is the same for all sources of the class."""
+    """Name of the asset or model for messages, if it is the same for all sources of the class."""
     differ: bool = False
     """Whether the believed model is known to differ from the model that flies."""
     model: "ReducedModel | None" = None
-    """The reduced model of what flies or is believed, once it is prepared, if there is one."""
+    """The reduced model of the asset or of the belief, once it is prepared, if there is one."""
 
     def __init__(self, scenario: Scenario, section: FileSection | None = None) -> None:
         self._scenario = scenario
         self.section = section
         self._drawn_means: dict[str, float] = {}
-        """Mean of the distribution from which a parameter was drawn, by its name."""
+        """Mean of the distribution from which each parameter was drawn."""
         self._folder: Path | None = None
 
     @cached_property
@@ -280,7 +280,7 @@ class AssetSource:
 
     @property
     def description(self) -> str:
-        """A phrase for the asset that flies or the model that is believed."""
+        """A phrase for the asset or the believed model."""
         return str(self.label)
 
     @property
@@ -294,7 +294,7 @@ class AssetSource:
         return calibration.source.replace("_", " "), calibration.draw_count
 
     def check(self) -> None:
-        """Check the inputs before anything is made; raise an error with the first fault."""
+        """Check the inputs before anything is built; raise an error for the first fault."""
 
     def files(self) -> dict[str, bytes]:
         """Return the contents of the files by the paths of their copies.
@@ -336,7 +336,7 @@ class AssetSource:
         return {}
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the calibrated parameter; store the mean of their distribution.
+        """Return draws of the calibrated parameter, and keep the mean of their distribution.
 
         The field of a design or structure is later written at this mean.
         """
@@ -360,7 +360,7 @@ class AssetSource:
         raise NotImplementedError
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return the predicted values at the sensors, without the errors of the sensors themselves.
+        """Return the predicted values at the sensors without errors of the sensors themselves.
 
         The health limits apply to these values, not to the readings. The arguments are those of
         `observation_table`.
@@ -427,7 +427,7 @@ class PairedSource(AssetSource):
 
     @property
     def origin(self) -> FlownAndBelieved:
-        """What flies, of the one source, and what the twin believes, of the other."""
+        """The asset of the one source, and the believed model of the other."""
         asset = self._asset.origin
         model = self._believed.origin
         differ = self.differ or asset.differ or model.differ

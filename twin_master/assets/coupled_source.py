@@ -179,14 +179,14 @@ class SeveralSource(FmuSource):
         raise NotImplementedError
 
     def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
-        """Pack the FMUs that do not exist yet; return the files of all FMUs, by `fmu_<component>`.
+        """Pack the FMUs that do not exist yet; return all FMU files by `fmu_<component>`.
 
-        The FMUs of an SSP file exist already, and the hash of that file covers them.
+        The FMUs of an SSP file exist already, and are covered by the hash of that file.
         """
         return {}
 
     def _build(self, progress: Progress) -> dict[str, str]:
-        """Pack the FMUs and check that they fit together; return their hashes."""
+        """Pack the FMUs, check that they fit together, and return their hashes."""
         fmus = self._pack_fmus(progress)
         hashes = {name: hash_file(fmu) for name, fmu in fmus.items()}
         # Opening the system raises an error if the FMUs, connections and binding do not fit.
@@ -198,7 +198,7 @@ class SeveralSource(FmuSource):
     ) -> "Session":
         """Return the coupled FMUs, ready to be started.
 
-        The system is `wiring` if it is given, and otherwise that of the method `wiring`.
+        The system is `wiring` if it is given, and else that of the method `wiring`.
         """
         from fmu_asset.coupling.asset import CoupledAsset
 
@@ -288,10 +288,10 @@ class CoupledSource(SeveralSource):
         return fmus
 
     def _pack_fmu(self, component: ComponentSection, progress: Progress) -> Path:
-        """Return the file of a component's FMU in the run folder; make the file if it is missing.
+        """Return the file of a component's FMU in the run folder; pack it if it is missing.
 
-        An FMU file of the user was copied there by `prepare`. A companion, or a wing from a design
-        or from the calibration of the scenario, is packed now.
+        `prepare` has copied an FMU file of the user there. A companion, or a wing from a design or
+        from the calibration, is packed here.
         """
         from fmu_asset.packing.structure_fmu import pack_wing
 
@@ -365,9 +365,9 @@ def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path
 
 
 def _component_settings(component: ComponentSection) -> dict[str, ComponentSetting]:
-    """Return the parameters of a component, by name.
+    """Return the parameters of a component by name.
 
-    A pattern such as `gain[{1..4}]` gives its value to each of the parameters it stands for.
+    A pattern such as `gain[{1..4}]` gives its value to all parameters that it matches.
     """
     settings: dict[str, ComponentSetting] = {}
     component_label = f"the component `{component.name}`"

@@ -107,14 +107,14 @@ class CalibrationBelief(DesignBelief):
 
 
 class _Wing(NamedStructure):
-    """What the FMU and the reduced model of a wing share: the design, the patch and their checks.
+    """The common part of a wing's FMU and of its reduced model: design, patch and their checks.
 
-    The design comes from a design file, or from inside a calibration file.
+    The design comes from a design file or a calibration file.
     """
 
     section: DesignSection | DesignBelief
     effects_label: ClassVar = "effects"
-    """What the effects of the patch are called in the description."""
+    """The name of the patch's effects in the description."""
     advice: ClassVar = Advice(calibration=WING_CALIBRATION, parameter=_ASK_ASSET, state=_ASK_ASSET)
 
     @cached_property
@@ -158,7 +158,7 @@ class _Wing(NamedStructure):
 
     @property
     def description(self) -> str:
-        """The FMU or model, the name of the design, and whether there are effects."""
+        """The FMU or model with the name of the design, and whether it has effects."""
         effects = "" if self.patch_path is None else f", with {self.effects_label}"
         return super().description + effects
 
@@ -275,7 +275,7 @@ class _SpanLocation(NamedTuple):
 
 
 def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation | None:
-    """Return where along the span a change of the model acts; None if it acts at no one place."""
+    """Return the location of a change of the model along the span; None if it has no single one."""
     span = wing.planform.semi_span
     # Masses and forces may lie beyond the tip, by the fraction OVERHANG of the span.
     farthest = (1.0 + OVERHANG) * span
@@ -292,7 +292,7 @@ def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation
 def _check_location(
     effect: "PatchFileEffect", primitive: "Primitive", wing: WingDesign, patch_path: Path
 ) -> None:
-    """Refuse a change of the model at a location that is not on the wing."""
+    """Refuse a change of the model whose location is not on the wing."""
     location = _location_on_span(primitive, wing)
     if location is None:
         return
@@ -306,10 +306,10 @@ def _check_location(
 
 
 def _check_has_no_memory(effect: "PatchFileEffect", primitive: "Primitive") -> None:
-    """Refuse an effect that depends on time, or on the history of the load.
+    """Refuse an effect that depends on time or on earlier loads.
 
-    The twin predicts the readings of each state under each control once, for all times and for any
-    history.
+    The twin predicts the readings of each state under each control once, for all times and any
+    earlier loads.
     """
     dependence = ""
     if isinstance(primitive, SensorDrift) and primitive.exponent != 0.0:
@@ -338,7 +338,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return super().binding().with_regions(self.wing_design.regions)
 
     def _effect_parameters(self) -> tuple[str, ...]:
-        """Return the names of the parameters that switch the effects on, and set their sizes."""
+        """Return the names of the parameters that switch the effects on and set their magnitude."""
         from fmu_asset.slaves.effects import effect_rows
 
         if self.patch is None:
@@ -346,7 +346,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return tuple(variable.name for variable in effect_rows(self.patch.plain, 0, {}))
 
     def _check_calibration(self, binding: Binding) -> None:
-        """Refuse a kind of FMU that cannot be built, and calibrated parameters that are unknown."""
+        """Refuse a kind of FMU that cannot be built, and a calibration with unknown parameters."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed, patched=self.patch_path is not None)
@@ -358,7 +358,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
     def _pack(self, progress: Progress) -> None:
-        """Pack the wing, with its calibrated values if it has any, as the FMU in the run folder."""
+        """Pack the wing as the FMU in the run folder, with calibrated values if there are any."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
         options: Tailoring = {}
@@ -379,12 +379,12 @@ class WingFmuSource(_Wing, StructureFmuSource):
 
 
 class DesignSource(_Wing, ReducedModelSource):
-    """The reduced model of a wing design as what is believed, with effects if there is a patch."""
+    """The reduced model of a wing design as the believed model, with the effects of a patch."""
 
     section: DesignBelief
 
     def check_model(self) -> None:
-        """Refuse a patch if other things than strains are observed."""
+        """Refuse a patch unless strains are observed."""
         role = self._scenario.observation.role
         if self.patch is not None and role != "strain":
             raise MissionInputError(

@@ -128,7 +128,7 @@ class ScriptSection(FmuSection):
 
 @dataclass(frozen=True)
 class TruthOutputs:
-    """The outputs that report the truth, of an asset whose damage and sensors are inside the FMU.
+    """The outputs of an FMU that report its true state, if damage and sensors are inside it.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class TruthOutputs:
 
 
 class FmuAsset(Asset):
-    """One or several coupled FMUs, as a mission flies them.
+    """The asset of a mission that is one FMU or several coupled ones.
 
     Parameters
     ----------
@@ -181,9 +181,9 @@ class FmuAsset(Asset):
         self.units = units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make one communication step, and return what the FMU observed at its end.
+        """Make one communication step, and return the observation at its end.
 
-        If the asset has damage and sensors of its own, the reading contains the true state, and the
+        If the asset has damage and sensors of its own, the reading contains the true state, and
         lost sensors are NaN.
 
         Parameters
@@ -224,7 +224,7 @@ def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[s
     """Return the name of each FMU variable in the run's NetCDF file, which allows fewer characters.
 
     `/` would make a group in that file; it and unprintable characters become `_`. A name that is
-    reserved or used already gets `_` at its end until it is unique.
+    reserved or already used gets `_` at its end until it is unique.
     """
     used_names = set(reserved_names)
     stored_names = {}
@@ -300,7 +300,7 @@ class FmuSource(AssetSource):
         return ()
 
     def _check_names(self, binding: Binding) -> None:
-        """Refuse names of the scenario that the binding does not have."""
+        """Refuse a scenario with names that the binding does not have."""
         scenario = self._scenario
         section = self.section
         # If the damage is inside the asset, the binding has no health inputs.
@@ -324,8 +324,8 @@ class FmuSource(AssetSource):
     def _fit_binding(self, binding: Binding) -> Binding:
         """Check the binding against the FMU; return it with the lengths of the FMU's arrays.
 
-        If the FMU refuses the value of a parameter, the error also names the parameters that the
-        calibration file sets, since one of them may be the cause.
+        If the FMU refuses the value of a parameter, the error also names the calibrated parameters,
+        as one of them may be the cause.
         """
         try:
             with scratch_folder() as scratch:
@@ -355,10 +355,10 @@ class FmuSource(AssetSource):
         return asset.binding
 
     def _warn_of_unset_inputs(self, asset: FmiAsset) -> None:
-        """Warn of inputs of an FMU that stay at their start values in the whole mission.
+        """Warn of inputs of an FMU that keep their start values during the whole mission.
 
         An FMU that uav-twin packed from a design of a wing or structure is skipped: its unset
-        inputs are forces at their start value zero, which is right.
+        inputs are forces, which are rightly zero.
         """
         is_packed_from_design = packed_design_hash(asset.description.path) != ""
         if is_packed_from_design:
@@ -436,7 +436,9 @@ class FmuSource(AssetSource):
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of the values of a role, if they are as many as in the scenario."""
+        """Return the positions of the values of a role; refuse a number that the scenario does not
+        have.
+        """
         expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start
@@ -448,7 +450,7 @@ class FmuSource(AssetSource):
         return positions
 
     def _find_truth_outputs(self, binding: Binding) -> TruthOutputs | None:
-        """Return the outputs that report the truth; None if the scenario states the truth itself.
+        """Return the outputs that report the true state; None if the scenario states it itself.
 
         Raises
         ------
@@ -475,8 +477,8 @@ class FmuSource(AssetSource):
     def parameters(self) -> dict[str, float]:
         """Return the parameters of the FMU.
 
-        They are the parameters of the scenario, one random integer for each parameter in `seeds`,
-        and the posterior means of the calibration. A value of the scenario replaces a mean.
+        They are those of the scenario, a random integer for each parameter in `seeds`, and the
+        posterior means of the calibration. A value of the scenario replaces a mean.
         """
         section = self.section
         random = generator(self._scenario.mission.seed, "asset")

@@ -1,7 +1,7 @@
-"""Observation libraries: what an FMU observed at every draw, state and control, as NetCDF.
+"""Observation libraries: the observations of an FMU at every draw, state and control, as NetCDF.
 
-`uav-twin library sample` writes them, and a scenario with a `belief` of the kind `library` believes
-one. The published strain library of Kapteyn et al. 2021 has a format of its own, see
+`uav-twin library sample` writes them, and a twin whose `belief` is of the kind `library` predicts
+with one. The published strain library of Kapteyn et al. 2021 has a format of its own, see
 `strain_library_source`.
 """
 
@@ -43,7 +43,7 @@ RESERVED = ("draw", "control", "sensor", "observation", "parameter_value", "sens
 _RELATIVE_TOLERANCE = 1e-12
 """Values of control inputs and draws that differ by less are the same."""
 _CONTROL_PREFIX = "control_"
-"""Begins the names of the variables that contain the values of control inputs."""
+"""Prefix of the names of variables that contain values of control inputs."""
 _ADVICE = "sample one for this scenario."
 
 
@@ -153,7 +153,7 @@ class ObservationLibrary:
     def control_index(self, name: str, values: Mapping[str, float]) -> int:
         """Return the index of the sampled control whose inputs have the given values.
 
-        Controls are matched by these values, because their names in a library are labels only.
+        The names of controls in a library are labels only, and are not compared.
 
         Parameters
         ----------
@@ -210,8 +210,8 @@ class ObservationLibrary:
     def observations_at(self, name: str, draws: Float) -> Float:
         """Return the observations at given values of the parameter.
 
-        Observations are interpolated linearly between the sampled values. A library without a
-        parameter serves a single draw of any parameter.
+        They are interpolated linearly between the sampled values. A library without a parameter
+        serves a single draw of any parameter.
 
         Parameters
         ----------
@@ -340,13 +340,13 @@ class LibraryBelief(BeliefSection):
 
 
 class LibrarySource(AssetSource):
-    """The source of predicted observations from an observation library.
+    """The source of predictions from an observation library.
 
     Parameters
     ----------
     section : LibraryBelief
         The table `belief` of the scenario.
-    flown : FmuSource
+    flown_source : FmuSource
         The source of the FMU that flies. It also draws the parameter and writes the field, unless
         the section names a design.
     """
@@ -359,7 +359,7 @@ class LibrarySource(AssetSource):
             belief = DesignBelief(design=section.design)
             self._design_source = DesignSource(scenario, section=belief)
         self._relation_to_flown = " of it"
-        """How the library is related to the FMU that flies, in words."""
+        """The relation of the library to the FMU that flies, in words."""
 
     @property
     def _model_source(self) -> AssetSource:
@@ -368,7 +368,7 @@ class LibrarySource(AssetSource):
 
     @property
     def description(self) -> str:
-        """The library, and whether it was sampled from the FMU that flies, in words."""
+        """The library, and in words whether it was sampled from the FMU that flies."""
         return f"observation library{self._relation_to_flown}"
 
     @cached_property
@@ -424,8 +424,8 @@ class LibrarySource(AssetSource):
     def _build(self, progress: Progress) -> dict[str, str]:
         """Prepare the design, and find out whether the library was sampled from the FMU that flies.
 
-        `PairedSource` prepares the FMU before. Another FMU, or other parameters of it, are written
-        into the description, and mark the two models as different.
+        `PairedSource` has prepared that FMU. If the library is of another FMU or of other
+        parameters, the description says so, and the two models are marked as different.
         """
         assert self._folder is not None
         library = self.library
@@ -446,9 +446,9 @@ class LibrarySource(AssetSource):
         return hashes
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the parameter, from the calibration of the scenario.
+        """Return draws of the parameter from the calibration of the scenario.
 
-        If the library has to be interpolated at one of them, their source says so.
+        Their source says so if the library has to be interpolated at one of them.
         """
         draws = self._model_source.draws(seed)
         if not self.library.parameter or np.isin(draws.values, self.library.draws).all():

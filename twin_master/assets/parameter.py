@@ -213,7 +213,7 @@ def _plain_density(posterior: "ScalarPosterior") -> JsonObject:
 
 
 def read_calibration(calibration: Calibration) -> "CalibrationRecord | None":
-    """Return the calibration whose file a scenario names; None if it names none.
+    """Return the calibration from the file that a scenario names; None if it names none.
 
     Raises
     ------
@@ -238,10 +238,10 @@ def check_calibration(
     design_hash: str = "",
     advice: str = SAME_NAMES,
 ) -> None:
-    """Check that a calibration of parameters fits the model that flies or is believed.
+    """Check that a calibration of parameters fits the asset or the believed model.
 
-    Nothing is checked if the scenario names no calibration file. Nor is the calibration of a wing
-    checked: such a file contains its own design.
+    Nothing is checked if the scenario names no calibration file, or if the file is that of a wing,
+    which contains its own design.
 
     Parameters
     ----------
@@ -291,9 +291,9 @@ def check_calibration(
 
 
 def is_of_parameters(file: Path | str) -> bool:
-    """Return whether a calibration file has parameters only, and no wing design.
+    """Return whether a calibration file contains parameters only, and no wing design.
 
-    The result is False for a damaged file; the error is raised when the file is used.
+    The result is False for a damaged file, whose error is raised when the file is used.
     """
     from calibration.errors import CalibrationRecordError
     from calibration.result.file import load_calibration

@@ -1,4 +1,4 @@
-"""The FMU of a structure in motion: each step records accelerations and identifies the modes."""
+"""The FMU of a vibrating structure: each step records accelerations and identifies the modes."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -64,11 +64,11 @@ def modal_features(
 
 
 class RecordedStructure(Asset):
-    """The FMU of a structure in motion: each step records accelerations and identifies the modes.
+    """The FMU of a vibrating structure: each step records accelerations and identifies the modes.
 
-    Each record begins in static equilibrium. The sensor readings are the identified features of
-    the modes with their covariance. The observation without noise has the features of the modes of
-    the model that was packed.
+    Each record begins in static equilibrium. The sensor readings are the identified features of the
+    modes with their covariance. The observation without noise has the features of the modes of the
+    packed model.
 
     Parameters
     ----------
@@ -143,9 +143,9 @@ class RecordedStructure(Asset):
         return AssetReading(true_features, monitors, sensed=sensed)
 
     def _simulate_record(self, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        """Return the noisy accelerations (N, A) of one step: N samples of A accelerometers [m/s^2].
+        """Return the noisy accelerations (N, A) of one step [m/s^2]: N samples of A accelerometers.
 
-        The structure is excited by white noise, or released from a held load.
+        The structure is excited by white noise, or released from a constant load.
         """
         record = self._record
         # A generator of its own for each step, so that a resumed run draws the same numbers.

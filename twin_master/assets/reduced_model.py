@@ -1,4 +1,4 @@
-"""The reduced model of a wing or structure: its predictions, and the model itself as an asset."""
+"""The reduced model of a wing or structure, as a source of predictions and as an asset."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 FIELD_NAME = "structure.vtu"
 UNITS = {"strain": "1", "displacement": "m", "frequency": "Hz"}
-"""The units of what a reduced model predicts, by role."""
+"""The units of the outputs of a reduced model, by role."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What a user can do about something that a structure does not have, for the messages.
+    """The advice of messages about something that a structure does not have.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Advice:
 
 
 class ChosenValue(NamedTuple):
-    """A value of a structure's input that a scenario chooses.
+    """A value that a scenario gives to an input of a structure.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class ChosenValue(NamedTuple):
 
 
 class NamedStructure(AssetSource):
-    """A structure from a file; checks that it has everything that the scenario names."""
+    """A structure from a file, with checks that it has everything that the scenario names."""
 
     section: Any  # each subclass has a section of its own
     advice: ClassVar[Advice] = Advice(
@@ -174,7 +174,7 @@ class NamedStructure(AssetSource):
         return True
 
     def _frequency_count(self) -> int:
-        """Return how many natural frequencies are observed; refuse more than a structure has."""
+        """Return how many natural frequencies are observed; refuse more than a model has."""
         observation = self._scenario.observation
         if observation.role != "frequency":
             return 0
@@ -187,7 +187,7 @@ class NamedStructure(AssetSource):
         return observation.count
 
     def _check_observed(self) -> None:
-        """Refuse observations that the structure does not have; raise `MissionInputError`."""
+        """Refuse a scenario whose observations the structure does not have."""
         modes = self._scenario.observation.modes
         if modes is None:
             self._check_observed_sensors()
@@ -208,7 +208,7 @@ class NamedStructure(AssetSource):
         check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
 
     def _check_observed_sensors(self) -> None:
-        """Refuse sensors that the structure does not have: their role, unit, number and titles."""
+        """Refuse sensors whose role, unit, number or titles do not fit the structure."""
         observation = self._scenario.observation
         role = observation.role
         sensors = {
@@ -243,10 +243,10 @@ class NamedStructure(AssetSource):
             )
 
     def _check_parameter(self, *, believed: bool) -> None:
-        """Refuse a calibration whose source, parameters or design are not those of the structure.
+        """Refuse a calibration whose source, parameters or design do not fit the structure.
 
-        The design is compared only if the twin believes the structure; a structure that only flies
-        may differ from the calibrated one.
+        The design is compared only if the twin believes the structure; the structure that flies may
+        differ from the calibrated one.
         """
         calibration = self._scenario.calibration
         if calibration.source == "static_test" and self.advice.static_test:
@@ -282,7 +282,7 @@ class NamedStructure(AssetSource):
                 )
 
     def _chosen_values(self, parameters: Mapping[str, float]) -> Iterator[ChosenValue]:
-        """Yield the values that the scenario chooses: levels, controls, loads and parameters."""
+        """Yield the values that the scenario chooses: parameters, loads, levels, controls, truth."""
         scenario = self._scenario
         for name, value in parameters.items():
             yield ChosenValue(f"parameter {name}", name, value)
@@ -307,7 +307,7 @@ class NamedStructure(AssetSource):
 
 
 class ReducedModelSource(NamedStructure):
-    """A reduced model, which is believed, or flies without an FMU.
+    """A reduced model that the twin believes, or that flies without an FMU.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ class ReducedModelSource(NamedStructure):
         self.check_model()
 
     def _build(self, progress: Progress) -> dict[str, str]:
-        """Reduce the structure; return the hash of its design."""
+        """Reduce the structure, and return the hash of its design."""
         self.model = self.model or self.load_reduced_model(progress)
         return {"design": self.model.design_hash}
 
@@ -452,7 +452,7 @@ class ReducedModelSource(NamedStructure):
         return reduced.vectors(input_values)
 
     def _observed_features(self, inputs: Float) -> Float:
-        """Return the observed frequencies or features of modes (G,) under the inputs (V,)."""
+        """Return the observed frequencies or features of modes (G,) for inputs (V,)."""
         observation = self._scenario.observation
         model = self.prepared_model
         if observation.modes is not None:

@@ -1,4 +1,4 @@
-"""The scenario with the overrides of the command line, and the sources of what it flies."""
+"""A scenario with the overrides of the command line, and the sources of its asset and model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from twin_master.scenario.section import Section, Table
 
 @dataclass(frozen=True)
 class Overrides:
-    """What the command line states otherwise than the scenario file.
+    """The settings of the command line that replace those of the scenario file.
 
     Attributes
     ----------
@@ -38,8 +38,8 @@ class Overrides:
     fmu, binding : Path or None
         The FMU to fly, and its binding.
     strain_library : Path or None
-        The strain library to fly instead of an FMU, as asset and model; if the scenario flies a
-        strain library anyway, the file of it.
+        The strain library that replaces an FMU, as asset and as model; or the file of the strain
+        library that the scenario flies.
     library : Path or None
         The observation library to believe.
     learnt : Path or None
@@ -53,7 +53,7 @@ class Overrides:
     ssp : Path or None
         The SSP file to fly instead of the scenario's asset.
     no_notices : bool
-        Whether the twin gives no notices and alarms, also if the scenario asks for them.
+        Whether the twin gives no notices and alarms, even if the scenario asks for them.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -175,7 +175,7 @@ def _override_asset(table: Table, overrides: Overrides) -> None:
 
 
 def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) -> None:
-    """Refuse overrides that contradict each other, or the table of the asset.
+    """Refuse overrides that contradict each other or the table of the asset.
 
     `file_count` is the number of overrides that replace the asset: an FMU, an SSP file, and a
     strain library.
@@ -206,10 +206,10 @@ def _design_tables(table: Table) -> list[Table]:
 
 
 def _use_calibrated_design(table: Table) -> None:
-    """Replace the designs in the table of a scenario by that of the calibration file.
+    """Replace designs in the table of a scenario by that of the calibration file, in place.
 
-    The design of the asset and the believed design are replaced. The design of a component is
-    replaced if it is the believed one. The table is changed.
+    These are the design of the asset, the believed design, and the designs of components that equal
+    it.
     """
     asset = table["asset"]
     belief = table["belief"]
@@ -228,14 +228,14 @@ def _use_calibrated_design(table: Table) -> None:
 
 
 _PREDICTION_COPIES = 8
-"""Copies of the predictions in memory: the table, the checked one, the one that is ordered for the
-likelihood, and those from which quantiles are taken."""
+"""Copies of the predictions in memory: the table, the checked one, the one ordered for the
+likelihood, and those sorted for quantiles."""
 _HISTORY_COPIES = 4
 """Copies of the beliefs: before and after the observation, its logarithm, and the smoothed one."""
 
 
 def scenario_bytes(scenario: Scenario) -> dict[str, float]:
-    """Estimate how much memory the arrays of a scenario's twin need.
+    """Return how much memory the arrays of a scenario's twin need, approximately.
 
     Returns
     -------
@@ -278,7 +278,7 @@ def check_scenario_fits(scenario: Scenario) -> None:
 
 
 def asset_source(scenario: Scenario) -> AssetSource:
-    """Return the source of the asset that flies and of the predictions that the twin believes.
+    """Return the source of a scenario's asset and of the twin's predictions.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def asset_source(scenario: Scenario) -> AssetSource:
 
 
 def believed_source(scenario: Scenario) -> AssetSource:
-    """Return the source of the predictions that the twin of a scenario believes.
+    """Return the source of the predictions of a scenario's twin.
 
     Parameters
     ----------
@@ -353,10 +353,10 @@ class LearntFile(Section):
 
 
 def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
-    """Replace assumptions of the twin in the table of a scenario by those that a fleet has learnt.
+    """Replace assumptions in the table of a scenario by what a fleet has learnt.
 
-    These are the transitions, the sensor noise and the distribution of the parameter. The truth
-    of the scenario stays the same.
+    These are the transitions, the sensor noise and the distribution of the parameter. The truth of
+    the scenario stays the same.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
 
 
 def _check_learnt_transition(table: JsonRecord, transition: JsonRecord, path: Path) -> None:
-    """Refuse learnt probabilities that are not for the controls and the kind of a scenario."""
+    """Refuse learnt probabilities that do not fit the controls and transitions of a scenario."""
     learnt_controls = transition.get("probability", {})
     controls = sorted(control["name"] for control in table["control"])
     kind = table["transition"]["kind"]
@@ -404,10 +404,9 @@ def _check_learnt_transition(table: JsonRecord, transition: JsonRecord, path: Pa
 
 
 def _normal_calibration(calibration: JsonRecord, learnt_parameter: object, path: Path) -> Table:
-    """Return the table `calibration` for a normal distribution, without parameter and moments.
+    """Return the table `calibration` for a normal distribution; the caller adds learnt keys.
 
-    The caller adds these from the file of learnt tables. An other learnt parameter than that of the
-    scenario is refused.
+    A learnt parameter other than that of the scenario is refused.
     """
     if learnt_parameter != calibration["parameter"]:
         raise MissionInputError(

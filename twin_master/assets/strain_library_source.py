@@ -284,7 +284,7 @@ class StrainLibrarySource(AssetSource):
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
-        """Return the values of the parameter at which the library was sampled."""
+        """Return the sampled values of the parameter."""
         values = self._library.young_modulus_factor
         return ParameterDraws(
             name=self._scenario.calibration.parameter,
@@ -309,7 +309,7 @@ class StrainLibrarySource(AssetSource):
         return strain_of_states[:, :, self._control_indices]
 
     def open(self) -> Asset:
-        """Return an asset with the strains at the mean of the parameter, noise-free.
+        """Return an asset with the noise-free strains at the mean of the parameter.
 
         The strains are interpolated between the damage levels of the library.
         """
@@ -327,9 +327,8 @@ class StrainLibrarySource(AssetSource):
 def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
     """Read a library from a file and return its source.
 
-    If either the asset or the believed model is not the library, the load factor of each control is
-    checked: the library states it in the control's name, such as `3g`, and the scenario as an
-    input.
+    If asset and believed model differ, the load factor of each control is checked: the library
+    states it in the control's name, such as `3g`, and the scenario as an input.
 
     Raises
     ------

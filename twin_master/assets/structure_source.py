@@ -1,4 +1,4 @@
-"""A structure from a mesh or matrices: reduced and packed as the asset, or believed as a model."""
+"""A structure from a mesh or matrices: packed as the FMU that flies, or believed as a model."""
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -98,7 +98,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
     parameters = FmuSource.parameters
 
     def binding(self) -> Binding:
-        """Return the binding of the user, or else one with the structure's inputs and outputs."""
+        """Return the binding of the user, or one made from the structure's inputs and outputs."""
         if self._folder is not None or self.section.binding:
             return super().binding()
         from fmu_asset.structures import structure_binding
@@ -115,7 +115,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
         """Return the positions of a role in the binding; none if features of modes are observed.
 
-        Features of modes are not outputs of the FMU. They are identified from its accelerations.
+        These are identified from the accelerations of the FMU, and are not outputs of it.
         """
         if self._scenario.observation.modes is None:
             return super()._observation_slice(binding, role)

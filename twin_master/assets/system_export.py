@@ -112,7 +112,7 @@ def export_scenario(
 
 
 def _with_packed_kind(scenario: Scenario, kind: PackedKind) -> Scenario:
-    """Return a scenario whose FMUs are packed from their designs in a way that the user chose.
+    """Return a scenario whose FMUs are packed from their designs as `kind`.
 
     Raises
     ------
@@ -229,9 +229,9 @@ def _with_values(
 
 
 def _parameter_names(wiring: Wiring, binding: Binding) -> dict[Endpoint, str]:
-    """Return the binding's name of each parameter and load, by the component variable it sets.
+    """Return the name in the binding of each parameter and load, by the component variable it sets.
 
-    A parameter that sets variables of several components is left out, as none of them is its own.
+    A parameter that sets variables of several components is left out: none of them is its own.
     """
     system = system_description(wiring)
     names = {}

@@ -1,4 +1,4 @@
-"""The laboratory experiments of the calibration, made with the wing FMU through FMI."""
+"""The laboratory experiments of the calibration, made on the wing FMU."""
 
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -117,5 +117,5 @@ class FmuTestBench(ExitStack):
         return time, SENSITIVITY * history.values[:, RECORDED_GAUGE - 1]
 
     def _open_session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
-        """Return the FMU with the true parameters of the wing, and those given in addition."""
+        """Return the FMU with the true parameters of the wing, and further ones."""
         return FmiAsset(self._fmu, binding, parameters=self._parameters | parameters)

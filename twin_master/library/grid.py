@@ -1,4 +1,4 @@
-"""The grid at whose points an FMU is sampled: from values that a user gives, or from a scenario."""
+"""The grid of points at which an FMU is sampled, from a user's values or from a scenario."""
 
 import itertools
 import math
@@ -28,8 +28,7 @@ STEP_TIMEOUT = 60.0
 _LONGEST_BLOCK = 4096
 """Largest number of points in a block."""
 _LEAST_BLOCKS = 64
-"""Least number of blocks into which a grid of enough points is divided, so that several workers
-share them."""
+"""Least number of blocks of a grid with enough points, so that several workers share them."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ class SamplingGrid:
         return tuple((first, min(first + length, self.size)) for first in firsts)
 
     def point(self, index: int) -> tuple[int, dict[str, float], str]:
-        """Return the index of the draw, the state and the name of the control of a grid point."""
+        """Return the index of the draw, the state, and the name of the control of a grid point."""
         draw, *levels, control = np.unravel_index(index, self.shape)
         state = {}
         for (name, values), level in zip(self.states.items(), levels, strict=True):
@@ -150,7 +149,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
 
 
 def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
-    """Return role and name of each input of a binding that the text NAME or ROLE.NAME can mean."""
+    """Return role and name of each input of a binding that NAME or ROLE.NAME can mean."""
     role, _, inner_name = name.partition(".")
     if role in _ROLES and inner_name in getattr(binding, role):
         return [(role, inner_name)]
@@ -185,7 +184,7 @@ def grid_of_fmu(
     role: str | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid over the values of an FMU's inputs that a user gives.
+    """Return the grid over a user's values of an FMU's inputs.
 
     The controls are all combinations of the values of the control inputs; an FMU without control
     inputs has a single control.
@@ -280,7 +279,7 @@ def grid_of_scenario(
     overrides: Overrides | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid at whose points the twin of a scenario needs observations.
+    """Return the grid of the points at which the twin of a scenario needs observations.
 
     The draws are those of the scenario's calibration and seed. The FMU of the scenario is prepared,
     which may pack it.
@@ -365,7 +364,7 @@ def grid_of_scenario(
 
 
 def _without_library(loaded_scenario: LoadedScenario) -> LoadedScenario:
-    """Return the scenario with the FMU as belief, if its twin believes an observation library.
+    """Return the scenario with another belief if its twin believes an observation library.
 
     The library is yet to be sampled. In its place the twin believes the wing design that the table
     `belief` names, or else the asset itself.

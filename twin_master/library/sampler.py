@@ -1,4 +1,4 @@
-"""An FMU that returns the observations at the points of a grid, block by block."""
+"""Sampling an FMU at the points of a grid, block by block."""
 
 import numpy as np
 
@@ -17,10 +17,10 @@ steps."""
 
 
 class GridSampler:
-    """An FMU that returns the observations of blocks of a grid.
+    """An FMU that is sampled at the points of a grid, block by block.
 
-    Every block begins with a reset of the FMU, so that its observations do not depend on which
-    blocks were sampled before.
+    Every block begins with a reset of the FMU, so that its observations do not depend on the blocks
+    before it.
 
     Raises
     ------
@@ -38,7 +38,7 @@ class GridSampler:
         self._asset.close()
 
     def observe_block(self, first: int, last: int) -> Float:
-        """Return the observations of a block of points, after a check that they are repeatable.
+        """Return the observations of a block of points, and check that they are repeatable.
 
         Parameters
         ----------
@@ -96,7 +96,7 @@ class GridSampler:
             raise self._error_at(error, point) from error
 
     def _observe(self, first: int, last: int) -> Float:
-        """Return the observations (last - first, G) at points of one draw, at the end of settling.
+        """Return the observations (last - first, G) at points of one draw, each after settling.
 
         All points are simulated in one run, with `settling_steps` steps, at least one, at each.
         """
@@ -129,7 +129,7 @@ class GridSampler:
         return history.values[steps_per_point - 1 :: steps_per_point, self._observation_slice]
 
     def _error_at(self, error: FmuError, point: int) -> FmuError:
-        """Return an error with the point at which it happened at the beginning of its message."""
+        """Return an error whose message begins with the point at which it happened."""
         # A worker that ends abruptly has reported its progress some steps earlier.
         is_located = isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
         where = "at" if is_located else "at or soon after"
@@ -147,14 +147,9 @@ class GridSampler:
         return ", ".join(settings)
 
     def _check_repeated_point(self, point: int, first_observation: Float) -> None:
-        """Observe a point again, and refuse the FMU if its observation changes too much.
+        """Observe a point again, and refuse the FMU if the observation (G,) has changed too much.
 
         An FMU without memory returns the same values, and an FMU that has settled nearly the same.
-
-        Parameters
-        ----------
-        first_observation : (G,) array
-            The first observation at the point.
         """
         settling_steps = self._grid.settling_steps
         repeated_observation = self._observe(point, point + 1)[0]

@@ -162,7 +162,7 @@ def _sample_blocks(
 ) -> None:
     """Sample blocks of points in several threads, each with an FMU in a process of its own.
 
-    If a thread fails, the others end as well; finished blocks stay in `rows`.
+    If a thread fails, the others end too; finished blocks stay in `rows`.
 
     Parameters
     ----------
@@ -224,9 +224,9 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
 
 
 def _library_record(grid: SamplingGrid) -> JsonObject:
-    """Return all that determines a library: the grid, the hashes of the files, and the version.
+    """Return everything that determines a library: the grid, the hashes of the files, the version.
 
-    The time limit of a step has no influence, and is left out.
+    The time limit of a step is left out, as it has no influence.
     """
     record: JsonObject = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
@@ -284,8 +284,8 @@ def _differing_keys(former_plan: bytes, record: JsonObject) -> str:
 def _rows_on_disk(folder: Path, shape: tuple[int, int]) -> Float:
     """Return the observations (N, G) as an array that is mapped to a file.
 
-    Values that are assigned to it are written to the file, so that they survive an interruption.
-    Points that were not sampled yet are NaN. A missing or damaged file is made anew.
+    Assigned values are written to the file, so that they survive an interruption. Points that were
+    not sampled yet are NaN. A missing or damaged file is made anew.
     """
     path = folder / ROWS_NAME
     is_sound = False

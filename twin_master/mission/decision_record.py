@@ -1,4 +1,4 @@
-"""The decision in a line of a journal, as a record and in words for the operator."""
+"""Decisions in a journal, as records and in words for the operator."""
 
 from reporting.json_file import JsonObject, JsonRecord
 from twin_master.mission.journal_packing import array_from_json
@@ -14,8 +14,8 @@ _KEYS_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
 def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalModel) -> JsonObject:
     """Return the decision in a line of a journal; empty if the line contains none.
 
-    A decision always states the probability of its control. If no state is believed, because most
-    probably none explains the sensors, mean and standard deviation of the state are None.
+    A decision always states the probability of its control. If most probably no state explains the
+    sensors, mean and standard deviation of the state are None.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def decision_from_line(line: JsonRecord, scenario: Scenario, model: GraphicalMod
 
 
 def _step_by_messages(line: JsonRecord, numbers_per_step: int) -> int | None:
-    """Return the number that messages give to the step of a line; None if they count no steps."""
+    """Return the number of a line's step in the messages; None if they do not count steps."""
     counter = line.get("intake", {}).get("counter")
     if counter is None:
         return None

@@ -1,4 +1,4 @@
-"""What a flight earns: rewards, the discounted return, and steps beyond the limit.
+"""Earned rewards of a flight, its discounted return, and its steps beyond the limit.
 
 This is the only computation of earned rewards: runs, fleets and watches store its result.
 """
@@ -19,7 +19,7 @@ from twin_master.scenario.schema import Scenario
 
 @dataclass(frozen=True)
 class Earnings:
-    """What the controls of flights earn in each of T steps; NaN in steps that were not flown.
+    """The earnings of flights in each of T steps; NaN in steps that were not flown.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ FIELDS = ("reward", "health", "beyond_limit", "needless")
 
 
 def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) -> Earnings:
-    """Return what controls earn, in the true state or, where it is unknown, under the belief.
+    """Return the earnings of controls in the true state or, where it is unknown, under the belief.
 
     Between the levels of the state, rewards are interpolated, and the best control is that of the
     nearest level.
@@ -66,24 +66,24 @@ def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) 
     """
     states = knowledge.model.states
     controls = len(knowledge.model.controls)
-    # The rewards of a state side by side: those of all controls, then their health rewards.
+    # Columns of each state: the rewards of all controls, then their health rewards.
     rewards = np.hstack(
         [knowledge.planning_reward, knowledge.rewards.planning_reward(1.0, 0.0)]
     )  # (S, 2 U)
-    steps_to_table = np.hstack([rewards, knowledge.is_beyond_limit, knowledge.is_needless])
+    columns_by_state = np.hstack([rewards, knowledge.is_beyond_limit, knowledge.is_needless])
     is_flown = control >= 0
     is_state_known = is_flown & np.isfinite(state).all(axis=-1)
-    of_all_controls = np.full((*control.shape, 4 * controls), np.nan)
+    earned_by_controls = np.full((*control.shape, 4 * controls), np.nan)
     known_states = state[is_state_known]
-    of_all_controls[is_state_known] = np.hstack(
+    earned_by_controls[is_state_known] = np.hstack(
         [
             states.interpolate(rewards, known_states),
-            steps_to_table[states.nearest(known_states), 2 * controls :],
+            columns_by_state[states.nearest(known_states), 2 * controls :],
         ]
     )
     is_believed = is_flown & ~is_state_known
-    of_all_controls[is_believed] = product_of_each(belief[is_believed], steps_to_table)
-    by_field = of_all_controls.reshape(*control.shape, 4, controls)
+    earned_by_controls[is_believed] = product_of_each(belief[is_believed], columns_by_state)
+    by_field = earned_by_controls.reshape(*control.shape, 4, controls)
     in_force = np.maximum(control, 0)[..., None, None]
     reward, health, beyond_limit, needless = np.moveaxis(
         np.take_along_axis(by_field, in_force, axis=-1).squeeze(axis=-1), -1, 0
@@ -92,7 +92,7 @@ def earnings(knowledge: Knowledge, control: Index, belief: Float, state: Float) 
 
 
 def discounted_return(scenario: Scenario, reward: Float, control: Index) -> Float:
-    """Return the sum of the rewards of the steps of flights, each discounted: (..., T) -> (...).
+    """Return the discounted sum of the rewards of flights: (..., T) -> (...).
 
     Steps that were not flown earn nothing; a flight without a step has the return NaN.
 
@@ -114,10 +114,10 @@ def discounted_return(scenario: Scenario, reward: Float, control: Index) -> Floa
 
 
 def promised_return(knowledge: Knowledge) -> ComparedPolicy:
-    """Return the returns of the policy of a twin in missions that its own model simulates.
+    """Return the returns of a twin's policy in missions that are simulated with its own model.
 
     They are what `uav-twin plan` expects of a policy. A flight earns something else if damage grows
-    otherwise than the model says, or if sensors do not show what it says.
+    otherwise than in the model, or if the sensors are not those of the model.
     """
     returns = simulate_decisions(
         knowledge.scenario, knowledge.problem, _SimulatedDecisions(knowledge).decide
@@ -126,24 +126,25 @@ def promised_return(knowledge: Knowledge) -> ComparedPolicy:
 
 
 def promise_of_return(knowledge: Knowledge) -> tuple[Reference, ...]:
-    """Return what is promised of the return of a mission, to stand beside it in the summary.
+    """Return the expected return of a mission as a reference value for the summary.
 
-    The result is empty unless the policy was planned on the belief, goes by risk or was given. One
-    mission differs from the expected return by chance, so that the range of 95 % of the simulated
-    missions stands with it.
+    The result is empty unless the policy was planned on the belief, goes by risk or was given. The
+    range of 95 % of the simulated missions is given too, as one mission differs from the mean by
+    chance.
     """
     if knowledge.plan.on_belief is None and knowledge.policy is None:
         return ()
     promised = promised_return(knowledge)
     low, high = np.quantile(promised.returns, [0.025, 0.975]).tolist()
-    spread = float(promised.returns.std())
-    value = f"{rounded(promised.mean, spread)} on average, {between(low, high, spread)} in 95 %"
+    deviation = float(promised.returns.std())
+    mean_text = rounded(promised.mean, deviation)
+    value = f"{mean_text} on average, {between(low, high, deviation)} in 95 %"
     source = f"{len(promised.returns)} missions under this policy, simulated by the twin's model"
     return (Reference(figure="return", value=value, source=source),)
 
 
 class _SimulatedDecisions:
-    """The decisions of B twins in simulated missions, with what a twin keeps for its `Hold`."""
+    """The decisions of B twins in simulated missions, with the proposals that a `Hold` counts."""
 
     def __init__(self, knowledge: Knowledge) -> None:
         scenario = knowledge.scenario

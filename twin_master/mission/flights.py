@@ -1,7 +1,7 @@
-"""The flight of a mission, and of many side by side, which give the same results to the last bit.
+"""The flight of one mission, and of many side by side.
 
-The results of a twin do not depend on the number of twins: sums run over the states, sensors and
-draws of one twin, never over twins.
+Both give the same results to the last bit: sums run over the states, sensors and draws of one twin,
+never over twins.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ from twin_master.scenario.schema import Scenario
 _logger = module_logger(__name__)
 
 _MOST_NUMBERS_TOGETHER = 10_000_000
-"""Numbers of four bytes in the beliefs about gauges of the twins that fly together."""
+"""Largest number of entries in the gauge beliefs of the twins that fly side by side."""
 
 
 def fly(
@@ -50,7 +50,7 @@ def fly(
 ) -> History:
     """Fly a mission to its end, from the step that twin and plant have reached.
 
-    An asset that ends its simulation early ends the mission; this is a notice to the operator.
+    If the asset ends its simulation early, the mission ends with a notice to the operator.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def fly(
 
 @dataclass
 class Flights:
-    """The histories of B twins.
+    """The steps of B twins.
 
     After a twin has failed or ended, its values are NaN and its control is -1.
 
@@ -136,7 +136,7 @@ class Flights:
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
-        """Return B missions before their first step."""
+        """Return the arrays of B missions before their first step."""
         scenario = knowledge.scenario
         steps = scenario.mission.steps
         states = knowledge.model.states.size
@@ -155,7 +155,7 @@ class Flights:
 
     @classmethod
     def concatenate(cls, flights: Sequence["Flights"]) -> "Flights":
-        """Return the flights of several formations as those of one, formation after formation."""
+        """Return the flights of several groups of twins as one, group after group."""
         if len(flights) == 1:
             return flights[0]  # without a copy of its arrays
         return cls(
@@ -172,7 +172,7 @@ class Flights:
         )
 
     def fail(self, twin: int, sentence: str) -> None:
-        """Note the error that ends the flight of a twin."""
+        """Record the error that ends the flight of a twin."""
         self.failure[twin] = sentence
         self.is_flying[twin] = False
 
@@ -209,7 +209,7 @@ class Flights:
 def fly_side_by_side(
     knowledge: Knowledge, truths: Sequence[Truth], assets: Sequence[Asset]
 ) -> Flights:
-    """Fly B missions of one scenario, step by step together, or one by one if assets have a memory.
+    """Fly B missions of one scenario: side by side, or one by one if an asset has a memory.
 
     Parameters
     ----------
@@ -262,7 +262,7 @@ def fly_formation(knowledge: Knowledge, plant: Plant, source: Source["TwinsSideB
 
 @dataclass(frozen=True)
 class StepOfTwins:
-    """What B twins conclude in a step.
+    """The beliefs of B twins after a step.
 
     Attributes
     ----------
@@ -365,7 +365,7 @@ class TwinsSideBySide:
     def _watch_gauges(
         self, watch: GaugeWatch, checked: CheckedReadings, model_beliefs: Filtered
     ) -> WatchState:
-        """Return the state of the watch after a step, and note the notices of flying twins.
+        """Update the watch over the gauges, record notices of flying twins, and return its state.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class TwinsSideBySide:
         return state
 
     def _decide(self, beliefs: Float, unexplained: Float) -> Index:
-        """Return the next control of each of B twins, within the budget of inspections."""
+        """Return the next control (B,) of each twin, within the budget of inspections."""
         probability = self._twin.control_probabilities(beliefs, self.previous_control, unexplained)
         if self._twin.hold is not None:
             probability, self._proposals = self._twin.hold.apply(
@@ -415,9 +415,7 @@ class TwinsSideBySide:
 def fly_one_by_one(
     knowledge: Knowledge, truths: Sequence[Truth], asset_of: Callable[[int, bool], Asset]
 ) -> Flights:
-    """Fly B missions one after the other with `fly`.
-
-    This is needed for assets with a memory, and for twins that learn.
+    """Fly B missions one after the other, as assets with a memory and twins that learn need it.
 
     Parameters
     ----------

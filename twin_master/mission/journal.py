@@ -5,9 +5,9 @@ process was killed while it wrote, the last line has no line feed and is dropped
 that does not match its hash was changed or is damaged. The file is read line by line, so that its
 length does not matter.
 
-Lines are short (`journal_packing`). Most of them leave out their large parts, which two files
-beside the journal have for the last steps (`recent_parts`). Readers get records in their full form,
-with the large parts if the line or these files have them.
+Lines are short (`journal_packing`). Most of them leave out the large parts of their record: two
+files beside the journal contain these for the last steps (`recent_parts`). Readers get full
+records, with the large parts if the line or these files contain them.
 """
 
 import base64
@@ -107,18 +107,18 @@ def decode_state(text: str) -> bytes:
 NoiseFree = Callable[[int, Float], Float]
 """Returns the readings of a step (G,) without their noise and drift, up to rounding [SI]."""
 LARGE_PARTS = ("asset_state", "learnt", "settled", "suspicion")
-"""The entries of a record that most lines leave out, or have only in part."""
+"""The entries of a record that most lines leave out, or contain only in part."""
 _LONGEST_DIFFERENCE = 9
 """Mean number of digits up to which differences are shorter than the values in base 64."""
 KEPT_OF_SUSPICION = ("none_of_these", "hypotheses", "decided_by")
-"""The entries of a suspicion that every line has: viewers and decisions need them."""
+"""The entries of a suspicion that every line contains, for viewers and decisions."""
 
 
 def step_record(step: MissionStep) -> JsonObject:
     """Return the record of a step for the journal.
 
-    The record also contains the belief, so that a viewer need not filter the observations again.
-    Beliefs and evidence are rounded, see `rounded_probabilities` and `rounded`.
+    It contains the belief, so that a viewer need not filter the observations again. Beliefs and
+    evidence are rounded, see `rounded_probabilities` and `rounded`.
     """
     twin_step = step.twin_step
     record: JsonObject = {
@@ -169,7 +169,7 @@ def short_record(
     is_whole: bool,
     kept_of_suspicion: Sequence[str] = KEPT_OF_SUSPICION,
 ) -> JsonObject:
-    """Return a record without its large parts, as a line of the journal has it.
+    """Return a record without its large parts, as most lines of the journal contain it.
 
     Parameters
     ----------
@@ -190,11 +190,11 @@ def short_record(
 
 
 def with_short_truth(record: JsonObject, noise_free: NoiseFree) -> JsonObject:
-    """Return the record of a simulated step with a short form of its true observation.
+    """Return the record of a simulated step with its true observation in a short form.
 
-    The true observation is the observed one without noise and drift, up to rounding. The difference
-    in units in the last place is a small number for each sensor, unless the sensor is lost. If the
-    asset has noise of its own, the record is returned as it is.
+    The true observation is the observed one without noise and drift, up to rounding. Their
+    difference in units in the last place is a small number for each sensor, unless the sensor is
+    lost. If the asset has noise of its own, the record is returned as it is.
 
     Parameters
     ----------
@@ -247,9 +247,9 @@ def reading_from_line(record: JsonObject, noise_free: NoiseFree | None = None) -
 
 
 class JournalFile:
-    """The journal of a run folder that this process holds, to which it appends.
+    """The journal of a run folder, for the one process that appends to it.
 
-    The file is opened for each line and closed again, so that a process can have any number of
+    The file is opened for each line and closed again, so that a process can write any number of
     journals.
 
     Parameters
@@ -385,7 +385,7 @@ def check_header(path: Path, config_hash: str) -> None:
 
 
 def records(path: Path, begin: int = 0, recent: RecentParts | None = None) -> Iterator[JournalLine]:
-    """Yield the lines of a journal in their order; the header is left out.
+    """Yield the lines of a journal in order, without the header.
 
     A journal that does not exist, or whose header was cut off, has no lines.
 
@@ -394,7 +394,7 @@ def records(path: Path, begin: int = 0, recent: RecentParts | None = None) -> It
     begin : int
         The position of the first line to read, in bytes.
     recent : RecentParts, optional
-        The large parts of the last lines; if they are given, the records have them.
+        The large parts of the last lines, which are added to the records.
 
     Raises
     ------
@@ -409,7 +409,7 @@ def records(path: Path, begin: int = 0, recent: RecentParts | None = None) -> It
 def records_in_file(
     file: BinaryIO, path: Path, begin: int = 0, recent: RecentParts | None = None
 ) -> Iterator[JournalLine]:
-    """Yield the lines of an open journal in their order, as `records` does."""
+    """Yield the lines of an open journal in order, as `records` does."""
     file.seek(begin)
     for line in file:
         if not line.endswith(b"\n"):
@@ -425,14 +425,14 @@ def records_in_file(
 
 
 def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -> JsonObject | None:
-    """Return the record of a line, or None if the line does not match the hash that it begins with.
+    """Return the record of a line, or None if the line does not match its hash.
 
-    If the line was written by an earlier version, its keys are replaced by their present names.
+    Keys of earlier versions are replaced by their present names.
 
     Parameters
     ----------
     recent : RecentParts, optional
-        The large parts of the last lines; if they are given, the record has them.
+        The large parts of the last lines, which are added to the record.
 
     Raises
     ------
@@ -461,7 +461,7 @@ def record_of_line(line: bytes, path: Path, recent: RecentParts | None = None) -
 def records_backwards(
     path: Path, end: int | None = None, recent: RecentParts | None = None
 ) -> Iterator[JournalLine]:
-    """Yield the lines of a journal from the last one back to the header.
+    """Yield the lines of a journal from the last one back to the first; the header is left out.
 
     A journal that does not exist has no lines. The file is read and checked only as far back as the
     caller iterates.
@@ -471,7 +471,7 @@ def records_backwards(
     end : int, optional
         The end of the last line to read, in bytes; the end of the file if left out.
     recent : RecentParts, optional
-        The large parts of the last lines; if they are given, the records have them.
+        The large parts of the last lines, which are added to the records.
 
     Raises
     ------
@@ -512,7 +512,7 @@ def _lines_backwards(file: BinaryIO, end: int) -> Iterator[bytes]:
 
 
 def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
-    """Return the last step of a journal that is at most a limit, and the end of its last line.
+    """Return the last step of a journal that is at most `limit`, and the end of its last line.
 
     Parameters
     ----------
@@ -539,7 +539,7 @@ def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
 
 
 def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError:
-    """Return the error that names a damaged line and counts the undamaged lines around it.
+    """Return the error that names a damaged line, with the number of valid lines around it.
 
     Parameters
     ----------
@@ -569,7 +569,7 @@ def damaged_line_error(path: Path, begin: int, reason: str) -> NotResumableError
 
 
 def _lines_before(file: BinaryIO, end: int) -> Iterator[bytes]:
-    """Yield the lines of a file that begin before a byte, and leave the file behind them."""
+    """Yield the lines of a file that begin before byte `end`, and leave the file after them."""
     position = 0
     while position < end:
         line = file.readline()

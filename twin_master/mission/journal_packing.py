@@ -1,9 +1,9 @@
-"""The short form in which records stand in the lines of a journal, and the full form of readers.
+"""The short form of records in the lines of a journal, and their full form for readers.
 
-A year of steps at 1 Hz is 32 million lines. So readings stand in a line as the bits of their
-numbers in base 64, which are half as long as decimals and are read back to the same bits; beliefs
-leave out the states that are ruled out; and what is usual is left out of the position in the
-stream. Lines of earlier versions have the full form already, and are read unchanged.
+A year of steps at 1 Hz is 32 million lines. So readings are written as doubles in base 64, which
+are half as long as decimals and are read back to the same bits; beliefs leave out impossible
+states; and the position in the stream leaves out usual values. Lines of earlier versions have the
+full form already, and are read unchanged.
 """
 
 import base64
@@ -69,7 +69,7 @@ def unpack_numbers(text: str) -> list[float | None]:
 
 
 def _pack_belief(belief: list[float]) -> object:
-    """Return the states that are not ruled out, by index; or all in base 64, if that is shorter."""
+    """Return the possible states by index; or all states in base 64, if that is shorter."""
     possible_states: dict[str, float] = {}
     length = 0
     for index, probability in enumerate(belief):
@@ -93,7 +93,7 @@ def _unpack_belief(packed: Mapping[str, float] | str) -> list[float | None]:
 
 
 def _pack_learnt(learnt: Mapping[str, Mapping[str, object]]) -> JsonObject:
-    """Return names and units of learnt quantities, and the numbers of each, one after another."""
+    """Return names, units and all numbers of the learnt quantities."""
     figures = []
     for quantity in learnt.values():
         for name in ("mean", "standard_deviation", "lower", "upper"):
@@ -122,7 +122,7 @@ def _unpack_learnt(packed: JsonObject) -> JsonObject:
 
 
 def _pack_suspicion(suspicion: JsonObject) -> JsonObject:
-    """Return a suspicion without `none_of_these`, if that is one of its hypotheses, too."""
+    """Return a suspicion without `none_of_these` if the same number is among its hypotheses."""
     if suspicion.get("hypotheses", {}).get(_NONE_OF_THESE) != suspicion.get("none_of_these"):
         return suspicion
     return {name: value for name, value in suspicion.items() if name != "none_of_these"}
@@ -136,7 +136,7 @@ def _unpack_suspicion(packed: JsonObject) -> JsonObject:
 
 
 def _pack_intake(intake: JsonObject) -> JsonObject:
-    """Return the position in the stream of messages without what is zero or unknown.
+    """Return the position in the stream of messages without values that are zero or unknown.
 
     The statuses of the last steps are written as runs, such as `2*50` for fifty times 2.
     """
@@ -172,10 +172,10 @@ _PACK: dict[str, Callable[..., object]] = {
 
 
 def packed_record(record: Mapping[str, object]) -> JsonObject:
-    """Return the short form of a record, as it stands in a line of the journal.
+    """Return the short form of a record, for a line of the journal.
 
-    The step of an observation is left out if it is that of the line. The position at which a line
-    begins stands in it directly, if there is nothing else in its table `standing`.
+    The step of an observation is left out if it is that of the line. A table `standing` with the
+    key `begin` alone is replaced by that key.
     """
     packed: JsonObject = dict(record)
     for name, pack in _PACK.items():
@@ -191,9 +191,9 @@ def packed_record(record: Mapping[str, object]) -> JsonObject:
 
 
 def full_record(packed: JsonObject) -> JsonObject:
-    """Return the full form of a record, as readers use it, from its short form in a line.
+    """Return the full form of a record from its short form in a line.
 
-    An entry with another layout is returned as it is; who uses it refuses it.
+    An entry of another layout is returned as it is, to be refused where it is used.
     """
     record = dict(packed)
     for name, unpack, packed_type in (

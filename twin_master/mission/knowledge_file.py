@@ -1,4 +1,4 @@
-"""What a twin knew before its flight, in the files of a run folder."""
+"""Files of a run folder with the model, draws and policy of a twin before its flight."""
 
 import io
 import json
@@ -20,7 +20,7 @@ from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
 KNOWLEDGE_NAME = "twin.npz"
-"""The file of a run folder with what the twin knew before its flight."""
+"""The file of a run folder with the knowledge of the twin before its flight."""
 EARLIER_KNOWLEDGE = "twin_{}.npz"
 """The same for the models that a watch believed earlier, by their numbers from 0."""
 CALIBRATION_NAME = "calibration.json"
@@ -28,14 +28,14 @@ CALIBRATION_NAME = "calibration.json"
 
 
 def save_knowledge(folder: Path, knowledge: Knowledge, number: int | None = None) -> None:
-    """Write what a twin knows before its flight to a file; equal knowledge gives equal bytes.
+    """Write the knowledge of a twin before its flight to a file; equal knowledge gives equal bytes.
 
     If the calibration has a record, it is written to a second file.
 
     The arrays are `predicted` (E, S, U, G), SI, `draws` (E,) and `policy` (S, U); with a policy on
-    the belief also `belief_vectors` (N, S) and `belief_control` (N,), or `risk_beyond_limit`
-    (S, U), `risk_hardest_first` (U,) and `risk_level`; and `true` (E, S, U, G), SI, if the sensors
-    do not show the values of the structure itself.
+    the belief also `belief_vectors` (N, S) and `belief_control` (N,), or `risk_beyond_limit` (S,
+    U), `risk_hardest_first` (U,) and `risk_level`; and `true` (E, S, U, G), SI, if the sensors do
+    not show the values of the structure itself.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def link_knowledge(folder: Path, other_folder: Path) -> None:
 def load_knowledge(
     folder: Path, scenario: Scenario, number: int | None = None, parts: TwinParts = NO_PARTS
 ) -> Knowledge:
-    """Return the knowledge that the twin of a run had before its flight.
+    """Return the knowledge of a run's twin before its flight, from the files of the run folder.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
-"""Parts of a twin that a user gives in the place of those of the scenario, as objects or by name.
+"""A user's policy, sensor model or estimator in place of that of the scenario, or their names.
 
 A name is that of an entry point of an installed package, ``MODULE:NAME`` for an object of a module,
-or ``FILE.py:NAME`` for one of a file. Names and objects are never stored in a form that would be
-run later: a run folder only records how they are called, and whoever resumes the run gives them
-again.
+or ``FILE.py:NAME`` for one of a file. A run folder never contains code that would be run later:
+it only records the names, and whoever resumes the run gives the objects again.
 """
 
 import importlib.util
@@ -38,7 +37,7 @@ ENTRY_POINT_GROUPS = {
 
 
 class TwinBeforeFlight(Protocol):
-    """What a function that makes a part is given: a `Knowledge` without that part."""
+    """The argument of a function that makes a part: a `Knowledge` without that part."""
 
     @property
     def scenario(self) -> Scenario:
@@ -88,27 +87,30 @@ class TwinParts:
 
     @property
     def is_any_given(self) -> bool:
-        """Whether any part is not that of the scenario."""
+        """Whether any part replaces that of the scenario."""
         return self.policy is not None or self.replace_filter
 
     @property
     def replace_filter(self) -> bool:
-        """Whether the belief is not that of the scenario's own sensor model and estimator."""
+        """Whether the sensor model or the estimator replaces that of the scenario."""
         return self.sensor_model is not None or self.estimator is not None
 
     def record(self) -> dict[str, str]:
-        """Return how sensor model and estimator are called, for ``config.json``."""
+        """Return the names of sensor model and estimator, for ``config.json``."""
         given_parts = {"sensor_model": self.sensor_model, "estimator": self.estimator}
         return {role: description(part) for role, part in given_parts.items() if part is not None}
 
     def in_scenario(self, scenario: Scenario) -> tuple[Scenario, "TwinParts"]:
-        """Return a scenario with the policy of scenarios that is named, and the other parts."""
+        """Put a policy that is named by one of the scenario's words into the scenario.
+
+        Return the scenario and the other parts.
+        """
         if isinstance(self.policy, str) and is_policy_name(self.policy):
             return scenario.with_policy(self.policy), replace(self, policy=None)
         return scenario, self
 
     def with_objects(self) -> "TwinParts":
-        """Return the parts with objects in the place of names.
+        """Return the parts with each name replaced by its object.
 
         Raises
         ------
@@ -128,7 +130,7 @@ class TwinParts:
         return parts
 
     def policy_for(self, model: GraphicalModel) -> Float | BeliefPolicy | None:
-        """Return the policy for the states and controls of a model; None if none is given.
+        """Return the given policy for the states and controls of a model; None if none is given.
 
         Raises
         ------
@@ -245,7 +247,7 @@ NO_PARTS = TwinParts()
 
 
 def _is_name_of_policy(text: str) -> bool:
-    """Return whether a text is the name of a policy, and not the file of one."""
+    """Return whether a text is the name of a policy and not the path of a file."""
     return ":" in text or text in plug_in_names(ENTRY_POINT_GROUPS["policy"])
 
 
@@ -256,7 +258,7 @@ def _is_estimator(part: object) -> bool:
 
 
 def description(part: object) -> str:
-    """Return how a part is called in records and sentences."""
+    """Return the name of a part for records and sentences."""
     if isinstance(part, str):
         return part
     named_object = part if hasattr(part, "__qualname__") else type(part)
@@ -265,7 +267,7 @@ def description(part: object) -> str:
 
 
 def object_by_name(role: str, name: str) -> object:
-    """Return the object that a name stands for.
+    """Return the object with a name.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The plan of a scenario on the belief: its expected return, and that of simpler rules."""
+"""Planning on the belief for a scenario, and the returns of the plan and of simpler rules."""
 
 import io
 import zipfile
@@ -29,7 +29,7 @@ INSPECTION_PERIODS = (2, 3, 5, 8, 12, 20)
 _GAP = 0.005
 """Relative gap between the bounds of a plan at which its search ends."""
 _GAP_OF_PRICED_PLANS = 0.06
-"""The same if several prices are tried to keep a health limit, which is coarser to save time."""
+"""The same, coarser to save time, if several prices are tried to keep a health limit."""
 _LARGEST_PRICE = 2.0**12
 """Largest price of a step beyond the health limit, in rewards."""
 _BISECTIONS = 4
@@ -43,7 +43,7 @@ def discounts(scenario: Scenario) -> Float:
 
 
 class PricedPlan(NamedTuple):
-    """A plan, and the price of a step beyond the health limit that it was made with.
+    """A plan, and the price of a step beyond the health limit for which it was made.
 
     Attributes
     ----------
@@ -60,12 +60,11 @@ class PricedPlan(NamedTuple):
 def plan_within_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
 ) -> PricedPlan:
-    """Return the plan on the belief that exceeds the health limit as rarely as the scenario asks.
+    """Return the plan on the belief that exceeds the health limit no more often than allowed.
 
     The scenario may bound the fraction of steps beyond the limit (`planner.limit_probability`).
-    Such a constraint on a mean is met by a Lagrange multiplier (Altman 1999): a price that each
-    step beyond the limit costs. Of the prices that are tried, the plan has the lowest for which the
-    bound holds.
+    Such a constraint on a mean is met by a Lagrange multiplier (Altman 1999): a price of each step
+    beyond the limit. The plan has the lowest of the tried prices for which the bound holds.
 
     Parameters
     ----------
@@ -140,7 +139,7 @@ def share_beyond_limit(
 
 
 def encode_policy(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> bytes:
-    """Return the content of a policy file.
+    """Return a policy as the content of a policy file.
 
     A policy by states is an NPY file with one array (S, U). A policy on the belief is an NPZ
     archive with an array for each field of `BeliefPolicy`, and `controls`, the names of its
@@ -155,7 +154,7 @@ def encode_policy(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> by
 
 
 def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
-    """Return the policy in a file of `encode_policy`, for the states and controls of a model.
+    """Return the policy in a policy file, for the states and controls of a model.
 
     Raises
     ------
@@ -196,7 +195,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
 
 @dataclass(frozen=True)
 class ComparedPolicy:
-    """The returns of a rule in simulated missions, or their difference to those of another rule.
+    """The returns of a rule in simulated missions, or their differences to those of another rule.
 
     Attributes
     ----------

@@ -38,11 +38,11 @@ _STATUS_OF_FAULT = {
     "stuck": SensorStatus.STUCK,
     "dropout": SensorStatus.LOST,
 }
-"""The status of a sensor with a fault of each kind; a later one hides those before it."""
+"""The status of a sensor with a fault of each kind; a later kind hides the earlier ones."""
 
 
 class TrueState(NamedTuple):
-    """The true state of a mission, or of B missions: then (...) is (B,), else ().
+    """The true state of one mission, or of B missions: (...) is () or (B,).
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class Truth:
     def next_state(
         self, step: int, previous: TrueState | None, previous_control: ArrayLike | None
     ) -> TrueState:
-        """Return the true state of a step; it is not a number if the asset itself carries damage.
+        """Return the true state of a step; NaN if the asset itself carries the damage.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Truth:
         return TrueState(index, self._states.coordinates[index])
 
     def state_of_values(self, values: Float) -> TrueState:
-        """Return the true state with values (F,) of the state factors, SI, in all missions."""
+        """Return the true state of all missions from values (F,) of the state factors, SI."""
         values = np.asarray(values)
         grows_at_random = self._scripted_states is None and not self.in_asset
         index = self._states.index(tuple(values)) if grows_at_random else 0
@@ -167,18 +167,18 @@ class Truth:
 
     @classmethod
     def stack(cls, truths: Sequence["Truth"]) -> "Truth":
-        """Return one truth for B missions of one scenario.
+        """Return one ground truth for B missions of one scenario.
 
-        Its random numbers have the shape (T, B, ...). Script, drift and losses are those of the
-        scenario, the same in all missions.
+        Its random numbers have the shape (T, B, ...). Script, drift and losses are the same in all
+        missions.
         """
-        stacked = copy(truths[0])  # script, drift and losses are the same in all missions
+        stacked = copy(truths[0])
         for name in ("noise", "uniform", "reading_noise"):
             setattr(stacked, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
         return stacked
 
     def sense(self, step: int, observation: Float, previous: Float | None) -> Float:
-        """Return an observation (..., G) with noise and drift, and the faults of its sensors.
+        """Return an observation (..., G) with noise, drift and the faults of its sensors.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Truth:
         observation : (..., G) array
             The observation without noise, SI.
         previous : (..., G) array or None
-            What was sensed in the step before, SI; None in the first step.
+            The sensed values of the step before, SI; None in the first step.
 
         Returns
         -------
@@ -205,7 +205,7 @@ class Truth:
     def noise_free(self, step: int, sensed: Float) -> Float:
         """Return sensed values (G,) without noise and drift, up to rounding; 0 for lost sensors.
 
-        Stuck sensors have any value.
+        The values of stuck sensors mean nothing.
         """
         return np.asarray(np.nan_to_num(sensed - self.drift[step] - self.noise[step]))
 
@@ -236,14 +236,14 @@ class Truth:
 
 
 class _NextStates(NamedTuple):
-    """The states that may follow a state under a control, and their cumulative probability."""
+    """The possible next states of a state under a control, and their cumulative probability."""
 
     cumulative_probability: Float
     state_indices: Index
 
 
 class DamageGrowth:
-    """Damage that follows the prior and the transitions of a model."""
+    """Random growth of damage that follows the prior and the transitions of a model."""
 
     def __init__(self, model: GraphicalModel) -> None:
         self._model = model
@@ -251,7 +251,7 @@ class DamageGrowth:
         self._next_states: dict[tuple[int, int], _NextStates] = {}
 
     def next_states(self, control: Index | None, state: Index | None, uniform: Float) -> Index:
-        """Return the indices (...) of the states that follow states under controls.
+        """Draw the indices (...) of the states that follow states under controls.
 
         Parameters
         ----------
@@ -314,12 +314,12 @@ class FlownTwins(Protocol):
 
 
 def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
-    """Return the sentence that an action of the twin is the reason of an early end."""
+    """Return the sentence that an action of the twin ended the mission."""
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 
 class Plant(Source[FlownTwins]):
-    """The simulated asset of a mission, driven by its truth and flown under given controls.
+    """The simulated assets of one mission or of B missions, with damage, noise and sensor faults.
 
     The assets of B missions fly side by side if they have no memory. Then the arrays of controls,
     states and readings have a leading axis B; (...) stands for it, and is empty for one mission.
@@ -353,7 +353,7 @@ class Plant(Source[FlownTwins]):
         self._asset_of_mission = asset_of_mission.reshape(truth.shape)
         self._state: TrueState | None = None
         self._sensed: Float | None = None
-        # What the assets of several missions show under a control in a state.
+        # The readings of memoryless assets by asset, control and state.
         self._known_readings: dict[tuple[int, int, bytes], AssetReading] = {}
         self._ends_mission = np.array(
             [scenario.ends(index) for index in range(len(scenario.control))]
@@ -364,9 +364,9 @@ class Plant(Source[FlownTwins]):
         self.failures: dict[int, str] = {}
 
     def read(self, twin: FlownTwins) -> Reading | None:
-        """Fly the next step of all missions and return the observation; None at their ends.
+        """Fly the next step of all missions and return the observation; None when all have ended.
 
-        This is `Source.read` of simulated assets. A mission ends in three cases:
+        A mission ends in three cases:
 
         - All its steps are flown.
         - The twin has decided on an action that ends it.
@@ -441,7 +441,7 @@ class Plant(Source[FlownTwins]):
             readings.append(self._read_asset(mission, missions, control, state))
         observation = np.stack([reading.values for reading in readings])[group]
 
-        # What the sensors show of it; the asset of a single mission may have sensors of its own.
+        # The sensor values; the asset of a single mission may have sensors of its own.
         sensed = None
         monitors: Mapping[str, float] = {}
         if group.ndim == 0:
@@ -466,9 +466,10 @@ class Plant(Source[FlownTwins]):
     def _read_asset(
         self, mission: int, missions: Index, control: Index, state: TrueState
     ) -> AssetReading:
-        """Return the reading of the asset of a mission, which other missions share.
+        """Return the reading of a mission's asset, which other missions share.
 
-        A failure of the asset is noted for all of them. Nothing is read if none of them flies.
+        If the asset fails, the error is kept in `failures` for all of them. If none of them flies,
+        nothing is read.
         """
         no_reading = AssetReading(np.full(self._scenario.observation.count, np.nan))
         if len(missions) == 0:
@@ -497,7 +498,7 @@ class Plant(Source[FlownTwins]):
         return reading
 
     def _checked_values(self, reading: AssetReading, control_index: int) -> Float:
-        """Return the observation (G,) that an asset gave in this step, SI.
+        """Return the observation (G,) of an asset in this step, SI.
 
         Raises
         ------
@@ -521,7 +522,7 @@ class Plant(Source[FlownTwins]):
         return values
 
     def _state_in_asset(self, reading: AssetReading) -> Float:
-        """Return the F true state factors that an asset with damage of its own reports."""
+        """Return the true state factors (F,) that an asset with damage of its own reports."""
         if reading.state is None:
             raise MissionInputError(
                 f"step {self.step}: the asset does not report its damage, which the table `truth` "

@@ -1,4 +1,4 @@
-"""What a twin knows before its flight, made from a scenario, a source and a seed."""
+"""The knowledge of a twin before its flight, made from a scenario, an asset source and a seed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -50,7 +50,7 @@ _DIGITS_OF_HEALTH = 9
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What the twin knows before it flies.
+    """What the twin knows before its flight: model, draws, predictions, policy.
 
     S is the number of states, U that of controls, G that of sensors, E that of draws of the
     calibrated parameter.
@@ -184,7 +184,7 @@ class Knowledge:
         """The rank of each control by its load, larger for a harder one: (U,).
 
         A control is harder if its health reward, averaged over all states, is smaller; controls of
-        equal load have equal ranks. No control has a smaller rank than the safest one.
+        equal load have equal ranks. No control ranks below the safest one.
         """
         mean_health = self.rewards.planning_reward(1.0, 0.0).mean(axis=0)
         _, rank = np.unique(-np.round(mean_health, _DIGITS_OF_HEALTH), return_inverse=True)
@@ -251,7 +251,7 @@ class Knowledge:
 
     @cached_property
     def learning(self) -> LearningFilter | None:
-        """The learning filter, without the watch for gauge faults; None if nothing is learnt.
+        """The learning filter, without the watch over the gauges; None if nothing is learnt.
 
         Raises
         ------
@@ -282,10 +282,10 @@ class Knowledge:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The estimator of the belief: the given one, the exact filter, or the learning filter.
+        """The estimator of the belief: the given one, the learning filter, or the exact filter.
 
-        If no estimator is given and the scenario asks for notices, the estimator also watches for
-        gauge faults.
+        If no estimator is given and the scenario asks for notices, the estimator also watches the
+        gauges.
 
         Raises
         ------
@@ -412,7 +412,7 @@ class Knowledge:
 def _inspected_sensor_model(
     scenario: Scenario, model: GraphicalModel
 ) -> "partial[InspectedSensorModel]":
-    """Return the constructor of the sensor model, with the noise of the scenario's inspections.
+    """Return the constructor of a sensor model with the scenario's inspections.
 
     An inspection reads one factor of the state, with noise of a stated standard deviation.
     """
@@ -515,7 +515,7 @@ def prepare_twin(
 def prepare_without_folder(
     scenario: Scenario, source: AssetSource, progress: Progress | None = None
 ) -> Knowledge:
-    """Return the knowledge of a twin without a run folder; the source uses a temporary folder."""
+    """Return the knowledge of a twin without a run folder: the source uses a temporary folder."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())

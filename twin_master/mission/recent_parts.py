@@ -1,15 +1,15 @@
-"""The large parts of the last lines of a journal, in two files that are begun anew by turns.
+"""The large parts of the last lines of a journal, in two files that are overwritten in turn.
 
 What was learnt, the suspicion of each sensor and the states from which a run or watch resumes are
-ten times as long as the rest of a line, and soon nobody reads them any more. So the journal has
-them only now and then (`is_whole_step`), and these files have them for the last `BLOCK_STEPS` steps
-at least: `recent_0.jsonl` and `recent_1.jsonl`.
+ten times as long as the rest of a line, and are soon not needed any more. So the journal contains
+them only now and then (`is_whole_step`), and the files `recent_0.jsonl` and `recent_1.jsonl`
+contain them for at least the last `BLOCK_STEPS` steps.
 
 A line of these files is a hash, a blank and a JSON object, as in the journal. Its key `line` is the
-hash of the line of the journal that it belongs to. It is written before that line. So after a kill
-each line of the journal has its parts, and parts without a line belong to nothing. The files are
-not flushed to the disk: after a loss of power, or without them, a run is resumed from the last
-whole line of its journal, with the same result.
+hash of the journal's line that it belongs to. It is written before that line. So after a kill each
+line of the journal has its parts, and parts without a line are ignored. The files are not flushed
+to the disk: after a loss of power, or without them, a run is resumed from the last whole line of
+its journal, with the same result.
 """
 
 import json
@@ -24,7 +24,7 @@ from reporting.json_file import JsonObject
 
 RECENT_NAMES = ("recent_0.jsonl", "recent_1.jsonl")
 BLOCK_STEPS = 64
-"""Number of successive steps whose parts one of the two files has."""
+"""Number of successive steps whose parts are in one file."""
 _EARLY_STEPS = (1, 4, 16)
 _HASH_LENGTH = 64
 _NAME_OF_LINE = re.compile(rb'"line":"([0-9a-f]{64})"')
@@ -32,10 +32,10 @@ _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":
 
 
 def is_whole_step(step: int) -> bool:
-    """Return whether the line of a step has what was learnt itself.
+    """Return whether the journal's line of a step itself contains what was learnt.
 
-    Every `BLOCK_STEPS`-th step has, and the steps of `_EARLY_STEPS`: what is learnt changes by much
-    at first.
+    That is every `BLOCK_STEPS`-th step, and the steps of `_EARLY_STEPS`, as much is learnt at
+    first.
     """
     return step % BLOCK_STEPS == 0 or step in _EARLY_STEPS
 
@@ -56,10 +56,10 @@ def _decode(line: bytes) -> JsonObject | None:
 
 
 def _size_to_keep(path: Path, step: int, line_hash: bytes) -> int:
-    """Return the size of the parts of earlier lines in a file, before those of a line are written.
+    """Return the size of the parts in a file that belong to lines before the one to be written.
 
-    Parts of later steps, and of this line, were written by a process that was killed before it
-    wrote their lines, or whose lines were dropped.
+    Parts of this line or of later steps are left from a process that was killed before it wrote
+    their lines, or their lines were dropped.
     """
     size = 0
     with suppress(FileNotFoundError), path.open("rb") as file:
@@ -74,7 +74,7 @@ def _size_to_keep(path: Path, step: int, line_hash: bytes) -> int:
 
 
 class RecentParts:
-    """The parts of the last lines of a journal, as a reader finds them.
+    """The large parts of the last lines of a journal, for readers.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class RecentParts:
         return record | self.parts_of(line_hash)
 
     def parts_of(self, line_hash: bytes) -> JsonObject:
-        """Return the parts of a line of the journal by its hash; empty if they are not there."""
+        """Return the parts of a line of the journal by its hash; empty if the files lack them."""
         for index, path in enumerate(self._paths):
             if line_hash not in self._entries[index]:
                 self._read_if_changed(index, path)
@@ -136,7 +136,7 @@ class RecentParts:
 
 
 class RecentPartsFile(RecentParts):
-    """The parts of the last lines of a journal, as the process has them that writes the journal."""
+    """The large parts of the last lines of a journal, for the process that writes the journal."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -171,11 +171,11 @@ class RecentPartsFile(RecentParts):
         self._forget_files()
 
     def pass_over(self, line_hash: bytes) -> None:
-        """Note the newest line of the journal, which has no parts."""
+        """Set the newest line of the journal to one that has no parts."""
         self._newest = (line_hash, {})
 
     def size_before(self, step: int) -> int:
-        """Return the size of the file to which the parts of a step are appended [bytes]."""
+        """Return the size, in bytes, of the file to which the parts of a step are appended."""
         return self._size if step // BLOCK_STEPS == self._block else 0
 
     def parts_of(self, line_hash: bytes) -> JsonObject:

@@ -1,6 +1,6 @@
-"""The steps of a journal, filtered again: for a run or watch that is resumed, taught or stored.
+"""Filtering the steps of a journal again, when a run or watch is resumed, taught or stored.
 
-A mission writes its steps into the journal with states of its asset, from which it is resumed.
+A mission writes states of its asset into the journal, from which it is resumed.
 """
 
 import math
@@ -35,14 +35,10 @@ from twin_master.network.twin import Twin
 
 @dataclass(frozen=True)
 class BelievedModel:
-    """A model, and the step from which on the twin filters with it.
+    """A model, and the first step that the twin filters with it.
 
     Attributes
     ----------
-    from_step : int
-        The first step that is filtered with the model.
-    knowledge : Knowledge
-        The knowledge of a twin with this model, such as the predicted observations.
     patch : Path or None
         The file of its patch, if the model is patched.
     """
@@ -79,8 +75,8 @@ def replay(
 ) -> tuple[History, JsonObject]:
     """Filter the steps of a journal again, with late observations at the steps they belong to.
 
-    The journal is read backwards to the last settled state of the twin before the first step that
-    is asked for. The steps after that state are filtered again.
+    The journal is read backwards to the last settled state of the twin before all steps that are
+    needed. The steps after that state are filtered again.
 
     Parameters
     ----------
@@ -134,7 +130,7 @@ def replay(
 
 
 class _BackwardScan:
-    """The readings, decisions and settled state in a journal, which is read from its end backwards.
+    """The readings, decisions and settled state in a journal that is read backwards.
 
     Attributes
     ----------
@@ -154,7 +150,7 @@ class _BackwardScan:
         self._path = path
         self._required_steps = required_steps
         self._next_controls: dict[int, int] = {}
-        # Decisions of steps from this one on were revised by lines that come later in the journal.
+        # Later lines of the journal revised the decisions from this step on.
         self._first_revised_step = math.inf
         self._later_step: int | None = None
         self._later_begin = 0
@@ -186,7 +182,7 @@ class _BackwardScan:
         raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
 
     def _take_in_settled_state(self, record: JsonObject) -> None:
-        """Keep the settled state of a record if none is kept yet and it is early enough."""
+        """Keep the settled state of a record if it is early enough and none is kept yet."""
         if self.settled is not None or "settled" not in record:
             return
         step = int(record["settled"]["step"])
@@ -196,7 +192,7 @@ class _BackwardScan:
             self.settled = SettledState(step, decode_state(state))
 
     def _take_in_change(self, record: JsonObject, step: int) -> None:
-        """Keep the reading in a record, and the step from which on the record revises decisions.
+        """Keep the reading of a record, and the first step whose decisions the record revises.
 
         An adopted model and a late observation revise all decisions from their step on.
         """
@@ -230,8 +226,8 @@ class _BackwardScan:
 def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
     """Return the models with which the steps are filtered, in the order of the steps.
 
-    `models` are in the order of their adoption. A model is replaced by a model that was adopted
-    later, if that holds from an earlier step or the same step on.
+    `models` are in the order of their adoption. A model is dropped if a later one holds from the
+    same or an earlier step on.
     """
     in_force = []
     for index, model in enumerate(models):
@@ -242,7 +238,7 @@ def models_in_force(models: Sequence[BelievedModel]) -> list[BelievedModel]:
 
 
 class _StoredReadings(Source[Twin]):
-    """The readings of consecutive steps, up to a step whose reading belongs to another model."""
+    """The readings of consecutive steps, up to the first step of the next model."""
 
     def __init__(self, readings: Mapping[int, Reading], end: float) -> None:
         self._readings = readings
@@ -259,7 +255,7 @@ def refilter(
     lag: int | None = None,
     settled: SettledState | None = None,
 ) -> History:
-    """Return the steps that a twin filters from the readings of consecutive steps.
+    """Filter the readings of consecutive steps, each with the model in force, and return the steps.
 
     Parameters
     ----------
@@ -296,7 +292,7 @@ def refilter(
 def spans_of_models(
     history: History, models: Sequence[BelievedModel]
 ) -> list[tuple[Knowledge, slice]]:
-    """Return the knowledge of each model in force, and the slice of steps filtered with it.
+    """Return the knowledge of each model in force, with the slice of steps filtered with it.
 
     Parameters
     ----------
@@ -313,10 +309,10 @@ def spans_of_models(
 
 
 STATE_ALLOWANCE = 16_000_000
-"""Size of a file up to which every state of the asset is kept in it, in bytes.
+"""Size of a file up to which it keeps every state of the asset, in bytes.
 
-This holds for the files of recent parts, which have the state of every step, and for the journal,
-which has those of every `BLOCK_STEPS`-th step.
+This holds for the files of recent parts, to which the state of every step belongs, and for the
+journal, to which that of every `BLOCK_STEPS`-th step belongs.
 """
 STATE_SHARE = 4_000
 """Largest size of a state beyond it, in bytes for each step since the last state that was kept.
@@ -328,10 +324,9 @@ again when a mission is resumed.
 
 
 def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
-    """Return the steps of an earlier process, and set plant and journal to the end of these steps.
+    """Return the steps of an earlier process, and set plant and journal to their end.
 
-    Lines after the last saved state of the asset are removed from the journal; their steps must be
-    flown again.
+    The journal is cut after the last saved state of the asset; later steps must be flown again.
 
     Raises
     ------
@@ -355,7 +350,7 @@ def restore_flight(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> 
 
 
 def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
-    """Return a sink that appends steps to a journal, and the state of the asset after each.
+    """Return a sink that appends each step to a journal, with the state of the asset after it.
 
     If the process is killed, the steps after the last state are flown again, with the same results
     to the last bit. A state is left out if it would make the files too large.
@@ -381,6 +376,6 @@ def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
 
 
 def _may_keep(state: str, file_size: int, steps_since_state: int) -> bool:
-    """Return whether a state is small enough for a file of a size, see `STATE_ALLOWANCE`."""
+    """Return whether a state is small enough for a file of this size, see `STATE_ALLOWANCE`."""
     is_within_allowance = file_size + len(state) <= STATE_ALLOWANCE
     return is_within_allowance or len(state) <= STATE_SHARE * steps_since_state

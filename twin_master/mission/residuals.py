@@ -1,4 +1,4 @@
-"""What a twin expects of its sensors in the steps of a history, and the residuals."""
+"""Expected sensor values and rewards in the steps of a history, and the residuals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,9 +46,9 @@ def expected_ahead(
 ) -> tuple[Expectation, Float]:
     """Return the predicted observations and rewards in the H steps after each step of a history.
 
-    The control of each step is the one that the policy takes in its state (Kapteyn et al. 2021,
-    eqs. (37) to (39)). Where the twin has learnt while it flew, its predictions start from what it
-    had learnt up to each step; otherwise they are those of its model.
+    The control of each predicted step follows the policy in its state (Kapteyn et al. 2021, eqs.
+    (37) to (39)). If the twin has learnt during the flight, the predictions use what it had learnt
+    up to each step.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def expected_ahead(
     (T, H, U) array
         The probability of each control.
     """
-    # (T, S, U); the safest control as far as readings fit no state
+    # (T, S, U), with the safest control by the probability that no state explains the sensors
     policy = knowledge.policy_with_doubt(history.unexplained)
     state_and_control = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U)
     control_probability = state_and_control.sum(axis=-2)
@@ -83,8 +83,8 @@ def residual_summary(
 ) -> dict[str, float | None]:
     """Return root mean square residual and log evidence of the steps from `from_step` on.
 
-    The residuals are in standard deviations of the noise that the twin assumes or has learnt. Both
-    values are None if nothing was observed in these steps.
+    The residuals are in standard deviations of the assumed or learnt noise. Both values are None if
+    nothing was observed in these steps.
 
     Parameters
     ----------

@@ -1,11 +1,10 @@
-"""Which sensors to install: those with the most expected information about the state.
+"""The choice of sensors with the most expected information about the state.
 
 The information of a set of sensors is the expected logarithm of the posterior probability of the
 true state over its prior probability. The expectation is over simulated readings, with all states
 equally probable. Effects that move all sensors together (a damage between two levels, the
-calibrated parameter) count as common, not as independent noise. A structure may have candidates
-in addition to the gauges of its file. Each gauge is a sensor; a scenario names sensors by their
-numbers from 1.
+calibrated parameter) count as common, not as independent noise. A structure may have candidate
+gauges in addition to those of its file. Scenarios count sensors from 1.
 
 The axes of arrays are N drawn readings, S states, G sensors and F common effects.
 """
@@ -38,17 +37,16 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 SAMPLES = 300
-"""About how many readings are drawn for each control.
+"""Approximate number of readings that are drawn for each control.
 
-Up to this number of states, each state has as many readings as fit; otherwise this number of states
-is drawn, and each has one reading.
+They are spread evenly over the states; if there are more states, this number of them is drawn.
 """
 _LEAST_GAIN = 1e-9
-"""Least information that the exchange of two sensors must gain, in bits."""
+"""Least gain of information for which two sensors are exchanged, in bits."""
 
 
 class _LikelihoodTerms(NamedTuple):
-    """For each sensor, the terms of the likelihood that are summed over a set of sensors.
+    """For each sensor, the terms of the likelihood, which are summed over a set of sensors.
 
     Attributes
     ----------
@@ -67,7 +65,7 @@ class _LikelihoodTerms(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawnReadings:
-    """Readings of all G sensors that were drawn under one control, N times, in S possible states.
+    """N readings of all G sensors, drawn under one control in S possible states.
 
     Attributes
     ----------
@@ -106,9 +104,9 @@ class DrawnReadings:
         """
         log_density = self._log_density(sensors)
         states = log_density.shape[1]
-        log_density_of_truth = log_density[np.arange(len(self.state)), self.state]
+        true_log_density = log_density[np.arange(len(self.state)), self.state]
         log_mean_density = logsumexp(log_density, axis=1) - np.log(states)
-        return float((log_density_of_truth - log_mean_density).mean() / np.log(2.0))
+        return float((true_log_density - log_mean_density).mean() / np.log(2.0))
 
     def _log_density(self, sensors: Sequence[int]) -> Float:
         """Return the log density (N, S) of each drawn reading of a set of sensors, in each state.
@@ -142,7 +140,7 @@ class DrawnReadings:
 
 
 def draw_readings(knowledge: Knowledge) -> tuple[DrawnReadings, ...]:
-    """Return drawn readings for each control that is not an action of the twin on its asset."""
+    """Draw readings for each control that is not an action of the twin on its asset."""
     random_numbers = generator(knowledge.scenario.mission.seed, "planning")
     # The actions stand after the other controls.
     controls = len(knowledge.scenario.control) - len(knowledge.scenario.action)
@@ -161,7 +159,7 @@ def _draw_under_control(
     control: int,
     random_numbers: np.random.Generator,
 ) -> DrawnReadings:
-    """Return readings under a control, drawn in all states, or in some if there are many."""
+    """Draw readings under a control, in all states or, if there are many, in some of them."""
     if states <= SAMPLES:
         drawn_states = np.arange(states)
     else:
@@ -181,10 +179,10 @@ def _draw_under_control(
 
 
 def _loading_of_parameter(sensors: GaussianSensorModel, control: int) -> Float:
-    """Return the change of G sensors in S states by the calibrated parameter, (S, G, 1), SI.
+    """Return the change of sensors by one deviation of the calibrated parameter, (S, G, 1), SI.
 
-    If the sensors depend on the parameter linearly, its draws move them along one direction. This
-    is the first singular vector of the deviations of the draws, times its singular value.
+    If the sensors depend on the parameter linearly, its draws move them along one direction: the
+    first singular vector of the deviations of the draws, times its singular value.
     """
     deviation_of_draws = sensors.value_per_draw - sensors.mean
     weight = np.sqrt(sensors.draw_weight)[:, None, None]
@@ -218,8 +216,8 @@ def choose_sensors(
 ) -> SensorDesign:
     """Choose the sensors with the most information about the state.
 
-    They are added one after the other; then a chosen sensor is exchanged for another candidate as
-    long as that gains information.
+    They are added one by one; then a chosen sensor is exchanged for another candidate as long as
+    that gains information.
 
     Parameters
     ----------
@@ -278,10 +276,7 @@ def _add_greedily(
 def _exchange(
     readings: Sequence[DrawnReadings], candidates: Sequence[int], chosen_sensors: list[int]
 ) -> list[int]:
-    """Return the chosen sensors, improved by exchanging one at a time for another candidate.
-
-    It ends if no exchange gains information.
-    """
+    """Improve the choice by exchanging one sensor at a time until no exchange gains information."""
     information = _mean_information(readings, chosen_sensors)
     while len(candidates) > len(chosen_sensors):
         other_sensors = [sensor for sensor in candidates if sensor not in chosen_sensors]
@@ -305,7 +300,7 @@ def level_separations(
 ) -> dict[tuple[str, int], float]:
     """Return how well a set of sensors separates each level of a state factor from the next one.
 
-    The separation is in standard deviations of the readings, under the control that separates most,
+    A separation is in standard deviations of the readings, under the control that separates most,
     with the other factors at their lowest levels.
 
     Parameters
@@ -352,7 +347,7 @@ def _squared_distance(
 
 
 def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
-    """Return the scenario with further gauges on its structure, all of which are sensors.
+    """Return the scenario with candidate gauges on its structure, and all gauges as sensors.
 
     The new gauges stand after the gauges of the structure file and before those of its rosettes.
 
@@ -406,7 +401,7 @@ def add_candidate_gauges(scenario: Scenario, candidates: str, folder: Path) -> S
 
 
 def _extensible_structure(scenario: Scenario) -> tuple[StructureBelief, MeshDesign]:
-    """Return the believed structure and its design, if the scenario can have candidates."""
+    """Return the believed structure and its design, or refuse a scenario that has none."""
     observation = scenario.observation
     belief = scenario.belief
     settings = (
@@ -440,17 +435,15 @@ def _with_all_gauges(
 ) -> Scenario:
     """Return the scenario with all gauges of its structure as sensors.
 
-    The reward for health still reads the same gauges. The tables `learning` and `notice` are
+    The reward for health still uses the same gauges. The tables `learning` and `notice` are
     removed, because their settings hold for the declared gauges alone.
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario, with the declared gauges as sensors.
     declared_gauges : sequence of str
         The names of the gauges of the user's structure, in the order of the sensors.
     all_gauges : sequence of str
-        Their names after candidate gauges were added to compare them, in the new order.
+        The names of these and of the candidates, in the new order.
     """
     observation = scenario.observation
     titles = dict(zip(declared_gauges, observation.titles or declared_gauges, strict=True))
@@ -482,7 +475,7 @@ def _with_all_gauges(
 
 
 def _candidate_gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
-    """Return the gauges of evenly placed rosettes, given their number, or those of a TOML file."""
+    """Return the gauges of a number of evenly placed rosettes, or those of a TOML file."""
     if candidates.isdecimal():
         rosettes = evenly_placed_rosettes(mesh, int(candidates))
         return tuple(gauge for rosette in rosettes for gauge in rosette.gauges())

@@ -1,4 +1,4 @@
-"""The steps of a mission or a watch, their history, and the loop that makes them."""
+"""The loop of a mission or watch: a twin assimilates observations step by step, and decides."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +23,7 @@ StepT = TypeVar("StepT", covariant=True)
 
 
 class GroundTruth(NamedTuple):
-    """What really happened in a step: for store and journal, never for the twin.
+    """The true state and values of a step, for store and journal; the twin never sees them.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class GroundTruth(NamedTuple):
     observation : (G,) or (B, G) array
         The observation without noise, SI.
     monitors : dict of str to float
-        The figures that the asset of a single mission reports of itself, such as an error bound.
+        Quantities that the asset of a single mission reports of itself, such as an error bound.
     """
 
     state: Float
@@ -42,7 +42,7 @@ class GroundTruth(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """An observation that the twin is to assimilate.
+    """An observation for the twin to assimilate.
 
     Attributes
     ----------
@@ -50,9 +50,9 @@ class Reading:
         The values of G sensors and I inspections, SI; NaN where nothing was received. B missions
         that fly side by side have a row each.
     control : int or None
-        The index of the control in force; None is the one that the twin proposed.
+        The index of the control in force; None for the one that the twin proposed.
     revises : int or None
-        The earlier step that the observation belongs to; None is the next step.
+        The earlier step that the observation belongs to; None for the next step.
     unreadable : dict of int to str
         The content that a sensor sent in the place of a number, by the index of the sensor.
     ground_truth : GroundTruth or None
@@ -70,13 +70,13 @@ AnyTwin = TypeVar("AnyTwin", contravariant=True)
 
 
 class Source(Protocol[AnyTwin]):
-    """Where observations come from: simulated assets, a file, a broker, a journal."""
+    """A source of observations: simulated assets, a file, a broker, a journal."""
 
     def read(self, twin: AnyTwin) -> Reading | None:
         """Act on the decision of the twin, and return its next observation; None at the end."""
 
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return the observation that replaces one that the twin refused, or raise the error."""
+        """Return an observation in place of one that the twin refused, or raise the error."""
         raise error
 
 
@@ -115,7 +115,7 @@ class _StackedAttribute:
 
 @dataclass
 class History:
-    """The steps of one twin in their order.
+    """The steps of one twin in order.
 
     T is the number of steps, G that of sensors, I that of values after them in a row.
 
@@ -202,7 +202,7 @@ class History:
 
     @property
     def monitors(self) -> dict[str, Float]:
-        """The figures that the asset reports of itself, each as an array (T,)."""
+        """Quantities that the asset reports of itself, each as an array (T,)."""
         records = []
         for step in self.steps:
             if step.reading.ground_truth is not None:
@@ -242,7 +242,7 @@ class SteppedTwin(Protocol[StepT]):
     """A `Twin`, or `TwinsSideBySide`: it assimilates an observation and decides."""
 
     def step(self, observation: ArrayLike, control: int | None = None) -> StepT:
-        """Return estimate and decision after an observation; a control left out is the proposed."""
+        """Return the twin's step after an observation; by default under the proposed control."""
 
 
 StepSink = Callable[[MissionStep], None]
@@ -293,7 +293,7 @@ def operate(
 
 
 def _assimilate(twin: SteppedTwin[StepT], reading: Reading) -> StepT:
-    """Let the twin take in a reading, as its next step or as the revision of an earlier one."""
+    """Let the twin assimilate a reading, as its next step or as the revision of an earlier one."""
     if reading.revises is not None and isinstance(twin, Twin):
         return twin.revise(reading.revises, reading.observed, reading.control)
     return twin.step(reading.observed, reading.control)

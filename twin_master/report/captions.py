@@ -18,7 +18,7 @@ WORDS = Words("twin_master.report")
 """The texts of the report."""
 
 MISSION_NOW = "mission_now"
-"""The name of the figure with past and prediction as they are known at a chosen present step."""
+"""The name of the figure of past and prediction at a chosen present step."""
 MISSION_WHOLE = "mission_whole"
 """The name of the same figure at the last step, with all observations of the mission."""
 NETWORK = "network"

@@ -265,9 +265,9 @@ def _draw_part(
 
 
 def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
-    """Return estimates up to the step in row `now` and predictions after it, (n,) in SI units.
+    """Return estimates up to the step in row `now` and predictions after it, (n,), SI.
 
-    If the step is the last one, past estimates are smoothed, given all observations; otherwise they
+    Past estimates are smoothed, given all observations, if the step is the last one; otherwise they
     are filtered, each given the observations up to its own step.
     """
     past_group = "smoothed" if now == run.step_count - 1 else "filtered"

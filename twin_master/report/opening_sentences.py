@@ -13,7 +13,7 @@ from twin_master.store.mission_result import LearntQuantity
 from twin_master.store.summary import Fallback, control_changes, find_fallback
 
 _MOST_FACTORS = 4
-"""Largest number of factors of the state whose estimates are named."""
+"""Largest number of state factors whose estimates are named."""
 _LEAST_DEPARTURE = 0.05
 """Difference of the residuals' standard deviation from 1 below which it is not mentioned."""
 _DEVIATIONS_OF_CHANCE = 3.3

@@ -1,4 +1,4 @@
-"""Everything that a mission yields, before it is stored, and what its twin has learnt."""
+"""The results of a mission before they are stored, and what its twin has learnt."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ _NAME_WITH_SENSOR = re.compile(r"(?P<quantity>\w+)\[(?P<sensor>\d+)\]")
 
 
 class QuantityTitles(NamedTuple):
-    """What a learnt quantity is called.
+    """The titles of a learnt quantity.
 
     Attributes
     ----------
@@ -232,7 +232,7 @@ def _worsening_probabilities(
 
 
 def printed_unit_of_quantity(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
-    """Return how a learnt quantity is printed.
+    """Return the printed unit of a learnt quantity, and the factor from its stored unit.
 
     Parameters
     ----------
@@ -290,18 +290,14 @@ def _by_moment(moments: Float) -> dict[str, Float]:
 
 @dataclass(frozen=True)
 class MissionResult:
-    """Everything that a mission yields, before it is stored.
+    """The results of a mission before they are stored.
 
     Attributes
     ----------
-    scenario : Scenario
-        What was flown.
     knowledge : Knowledge
-        What the twin knew before its flight.
-    flight : History
-        The steps.
+        The knowledge of the twin before its flight.
     truth : Truth or None
-        What the sensors really did; None for a real asset.
+        Noise, drift and faults of the sensors; None for a real asset.
     units : mapping of str to str
         The units of control inputs, monitors and parameters; those that are not named are
         dimensionless.
@@ -319,13 +315,13 @@ class MissionResult:
 
     @property
     def spans(self) -> list[tuple[Knowledge, slice]]:
-        """What the twin knew, each with the steps in which it did."""
+        """The knowledge of the twin in successive spans of steps."""
         models = self.models or [BelievedModel(0, self.knowledge)]
         return spans_of_models(self.flight, models)
 
     @cached_property
     def earned(self) -> Earnings:
-        """What the controls earn in each step, by the model that the twin believed in it."""
+        """The earnings of the controls in each step, by the model that the twin believed in it."""
         flight = self.flight
         step_count = len(flight.steps)
         state = np.full((step_count, len(self.scenario.state)), np.nan)

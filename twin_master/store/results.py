@@ -113,7 +113,7 @@ def _observed_entries(result: MissionResult) -> Iterator[Entry]:
 
 
 def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
-    """Return the filtered belief, with decisions, evidence and residuals."""
+    """Return the filtered belief with decisions, evidence and residuals."""
     flight = result.flight
     expectation = _expected_in_flight(result, flight.filtered, is_smoothed=False)
     residual = flight.observed - expectation.mean
@@ -157,9 +157,7 @@ def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
-    """Return the sensors and rewards expected in each step of a flight.
-
-    Each step is evaluated with the model that the twin believed in it.
+    """Return the sensors and rewards expected in each step of a flight, by the model of that step.
 
     Parameters
     ----------
@@ -212,7 +210,7 @@ def _learnt_entries(result: MissionResult) -> Iterator[Entry]:
 
 
 def _notice_variables(result: MissionResult) -> Mapping[str, ArrayLike]:
-    """Return how well the model explained the sensors in each step."""
+    """Return the suspicion of each step: how well the model explained the sensors."""
     suspicions = result.flight.suspicion
     values = {}
     for name in SCHEMA["notice"]:

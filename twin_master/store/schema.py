@@ -77,7 +77,7 @@ def variable_paths(role: str) -> list[str]:
 
 
 def scenario_fields(scenario: Scenario) -> dict[str, str]:
-    """Return the words of a scenario that take the place of fields in braces of the schema.
+    """Return the words of a scenario that replace fields in braces of the schema.
 
     They are the role of the observation and the units of sensors and state. Sensors of different
     units have the unit `SEVERAL_UNITS`, and factors of different units all of these with commas.
@@ -126,7 +126,10 @@ def observed_entries(scenario: Scenario, rows: AnyArray) -> Iterator[Entry]:
 def described_variable(
     row: Iterable[str], values: ArrayLike, fields: Mapping[str, str]
 ) -> Variable:
-    """Return a variable with axes, unit and title of a row of the schema, fields filled in."""
+    """Return a variable with axes, unit and title from a row of the schema.
+
+    The fields in braces of the row are filled in.
+    """
     axes, unit, title = (template.format(**fields) for template in row)
     units = {"units": unit} if unit else {}
     return Variable(tuple(axes.split()), np.asarray(values), {**units, "long_name": title})
@@ -135,10 +138,10 @@ def described_variable(
 def described_variables(
     group: str, entries: Iterable[Entry], fields: Mapping[str, str]
 ) -> dict[str, Variable]:
-    """Return the variables of entries of a group of `run.nc`, by their paths.
+    """Return the variables of a group of `run.nc` by their paths.
 
-    The fields in braces of the schema are filled with those of the mission, of the group, and of
-    the entry; a later one replaces an earlier one of the same name.
+    Fields in braces of the schema are filled with those of the mission, of the group, and of the
+    entry; a later one replaces an earlier one of the same name.
     """
     rows = rows_of_group(group)
     variables = {}

@@ -25,7 +25,7 @@ from twin_master.store.mission_result import (
 from twin_master.store.schema import SEVERAL_UNITS
 
 _MOST_CHANGES = 3
-"""The number of changes of the control that the summary names."""
+"""Largest number of changes of the control that the summary names."""
 TRUTH_IS_OFF = 3.0
 """Standard deviations beyond which the flown asset is not the one that was calibrated."""
 _MEAN = MOMENTS.index("mean")
@@ -63,7 +63,7 @@ class Figure:
     title : str
         Its name for people.
     value : float, int, str or None
-        The figure; None if the mission gave none.
+        None if the mission gave no value.
     unit : str
         The unit of `value` and `reference`, as printed.
     reference : float, str or None
@@ -82,7 +82,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Fallback:
-    """How the control fell back to the gentler one.
+    """The fallback of a mission from its initial control to a gentler one.
 
     Attributes
     ----------
@@ -128,8 +128,8 @@ def find_fallback(
     """Return when the policy calls for another control than the initial one, and when it is flown.
 
     A level of the policy stands for all true values that are nearest to it. So the true state calls
-    for another control from the middle between the two levels on between which the policy changes.
-    All steps are counted from the first step of the run.
+    for another control once it passes the middle between the two levels between which the policy
+    changes. All steps are counted from the first step of the run.
 
     T is the number of steps, S the number of states, and F the number of state factors.
 
@@ -174,7 +174,7 @@ def _first_true(condition: NDArray[np.bool_]) -> int | None:
 
 
 class PolicySwitch(NamedTuple):
-    """Where a policy leaves a control.
+    """The level of a state factor at which a policy leaves a control.
 
     Attributes
     ----------
@@ -195,10 +195,10 @@ class PolicySwitch(NamedTuple):
 def find_policy_switch(
     states: StateSpace, policy_index: Index, first_control: int
 ) -> PolicySwitch | None:
-    """Return the state factor and its level from which on a policy leaves its first control.
+    """Return the level of a state factor from which on a policy leaves its first control.
 
-    None is returned if the policy never leaves it, if it depends on several factors, or if it
-    returns to the first control at a higher level of the factor.
+    The result is None if the policy never leaves it, depends on several factors, or returns to the
+    first control at a higher level of the factor.
 
     Parameters
     ----------

@@ -138,8 +138,8 @@ def _root_attributes(
 ) -> dict[str, object]:
     """Return the attributes of the root of `run.nc`.
 
-    They tell where the results come from: seed, hashes of the inputs and of the source code,
-    versions, the calibrated parameter, and the asset and the twin's model in words.
+    They state the origin of the results: seed, hashes of inputs and source code, versions,
+    calibrated parameter, and asset and model in words.
     """
     provenance = config["provenance"]
     mission = result.scenario.mission
@@ -161,10 +161,10 @@ def _root_attributes(
 
 
 def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int) -> JsonObject:
-    """Return the entries of the summary that precede its figures.
+    """Return the entries of the summary before its figures.
 
-    They are the mission, its control changes, what was flown and what the twin believed, what was
-    learnt, and the notices.
+    They are the mission, its control changes, asset and believed model, learnt quantities, and
+    notices.
     """
     scenario = result.scenario
     mission = scenario.mission

@@ -1,8 +1,8 @@
-"""A flight as viewers see it: its steps, beliefs, decisions and predictions, from its journal.
+"""A flight for its viewers: its steps, beliefs, decisions and predictions, from the journal.
 
-The run or the watch itself computes nothing for its viewers. Beliefs and decisions stand in the
-journal. What follows from them is computed here by the same functions, so that every number is that
-of the run.
+The run or watch itself computes nothing for its viewers. The journal contains beliefs and
+decisions; predictions and expected values are computed here from them by the functions of the
+run, so that every number is that of the run.
 """
 
 import os
@@ -45,7 +45,7 @@ StepRecord = JsonObject
 
 
 class StepBeliefs(NamedTuple):
-    """What is believed in each of n steps, over S states and U controls.
+    """The beliefs in each of n steps, over S states and U controls.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class ForceDrawing(NamedTuple):
 
 
 def find_force_drawing(step: int, verdict_folder: Path) -> ForceDrawing | None:
-    """Return the drawing of a missing force in the folder of a verdict.
+    """Return the drawing of a missing force from the folder of a verdict.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def find_force_drawing(step: int, verdict_folder: Path) -> ForceDrawing | None:
 
 @dataclass
 class _StepLines:
-    """Where the lines of a step begin in the journal [bytes].
+    """The positions of the lines of a step in the journal [bytes].
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class _StepLines:
 
 
 class _JournalledKnowledge(NamedTuple):
-    """The knowledge of the twin, and the line of the journal from which on it holds.
+    """The knowledge of the twin, and the first line of the journal for which it holds.
 
     Attributes
     ----------
@@ -145,9 +145,8 @@ class _JournalledKnowledge(NamedTuple):
 class Flight:
     """A run or a watch, read from its journal, with the beliefs and decisions of each step.
 
-    Each step has the belief and the decision that the twin had at the time of the step. What was
-    learnt is that of the last step up to it whose line in the journal has it; for the last steps,
-    it is their own.
+    Each step has the belief and the decision that the twin had at that time. The learnt quantities
+    of a step are those of the last line up to it that contains them.
 
     Parameters
     ----------
@@ -179,7 +178,7 @@ class Flight:
         self._start_with_file(0)
 
     def _start_with_file(self, inode: int) -> None:
-        """Forget all steps, and read the journal from its beginning on.
+        """Forget all steps, and read the journal from its beginning.
 
         Parameters
         ----------
@@ -192,8 +191,8 @@ class Flight:
         self._add_model(0)
         self._lines_of_steps: list[_StepLines] = []
         self._recent = RecentParts(self.folder)
-        self._learnt_steps: list[int] = []  # whose own lines have what was learnt
-        self._last_learnt: tuple[int, JsonObject] = (-1, {})  # where its line begins, and its entry
+        self._learnt_steps: list[int] = []  # whose own lines contain what was learnt
+        self._last_learnt: tuple[int, JsonObject] = (-1, {})  # begin of its line, and its entry
         # Notices of lines that are not steps, by the step before them
         self._later_notices: defaultdict[int, list[StepRecord]] = defaultdict(list)
         self.drawings: list[ForceDrawing] = []
@@ -205,7 +204,7 @@ class Flight:
         Parameters
         ----------
         begin : int
-            Where the first line of the journal begins that was written with this model [bytes].
+            The position of the first journal line that was written with this model [bytes].
         """
         knowledge = load_knowledge(self.folder, self.scenario, len(self._models))
         self._models.append(_JournalledKnowledge(begin, knowledge))
@@ -216,12 +215,12 @@ class Flight:
         return self._models[-1].knowledge
 
     def _knowledge_in(self, record: StepRecord) -> Knowledge:
-        """Return the knowledge that the twin had when it wrote the belief of a step."""
+        """Return the knowledge with which the twin computed the belief of a step."""
         begin = self._lines_of_steps[record["step"]].belief
         return next(model.knowledge for model in reversed(self._models) if model.begin <= begin)
 
     def _has_other_file(self, status: os.stat_result) -> bool:
-        """Return whether another file took the place of the journal, or lines were removed."""
+        """Return whether the journal was replaced by another file, or lines were removed."""
         return status.st_ino != self._inode or status.st_size < self._end
 
     @property
@@ -230,7 +229,7 @@ class Flight:
         return len(self._lines_of_steps)
 
     def update(self) -> bool:
-        """Read the new lines of the journal, `MOST_NEW_LINES` at most.
+        """Read the new lines of the journal, at most `MOST_NEW_LINES`.
 
         Returns
         -------
@@ -349,7 +348,7 @@ class Flight:
         return record
 
     def _learnt_in(self, file: BinaryIO, begin: int) -> JsonObject:
-        """Return what was learnt up to the line that begins at a byte of the journal.
+        """Return what was learnt from the line that begins at a byte of the journal.
 
         The last result is kept, because successive steps ask for the same line.
         """
@@ -362,7 +361,7 @@ class Flight:
     def _record_at(self, file: BinaryIO, begin: int) -> StepRecord:
         """Return the record of the line that begins at a byte of the journal.
 
-        It has what was learnt only if its line or the files of recent parts have it.
+        It contains what was learnt only if its line or the files of recent parts do.
         """
         record, _, _ = next(records_in_file(file, self._path, begin, self._recent))
         return record
@@ -380,10 +379,7 @@ class Flight:
         )
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return the belief of the twin in each of n steps at the time of the step.
-
-        Each step is evaluated with the knowledge that the twin had in it.
-        """
+        """Return the beliefs of the twin in n steps, each at the time of the step."""
         parts = []
         # Groups of successive steps with the same knowledge
         for _, records_of_group in groupby(records, lambda record: id(self._knowledge_in(record))):
@@ -401,7 +397,7 @@ class Flight:
         )
 
     def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
-        """Return the belief of the twin in n steps, in all of which it had the given knowledge."""
+        """Return the beliefs of the twin in n steps that share the same knowledge."""
         filtered_beliefs = np.array([record["filtered"] for record in records])
         controls = [record["control_index"] for record in records]
         joint = known_control(
@@ -442,7 +438,7 @@ class Flight:
         return concatenate_expectations(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
-        """Return the predictions that the twin made after one step, for each of the n next steps.
+        """Return the predictions of the twin for the n steps after one step.
 
         n is the number of steps that the scenario predicts (`mission.prediction_steps`).
         """
@@ -472,7 +468,7 @@ class Flight:
 
 
 def _unexplained_probability(record: StepRecord) -> float:
-    """Return the probability in a step that no state of the model explains the sensors."""
+    """Return the probability that no state of the model explains the sensors in a step."""
     hypotheses = record.get("suspicion", {}).get("hypotheses", {})
     return float(hypotheses.get("none of these", 0.0))
 
@@ -480,7 +476,7 @@ def _unexplained_probability(record: StepRecord) -> float:
 def _expectation_without_learning(
     knowledge: Knowledge, joint: Float, rows: Float | None
 ) -> Expectation:
-    """Return the sensors and rewards expected under beliefs, by a twin that learns nothing.
+    """Return the sensors and rewards that a twin expects under beliefs if it learns nothing.
 
     Parameters
     ----------
@@ -495,7 +491,7 @@ def _expectation_without_learning(
 
 
 def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
-    """Return the posterior of each quantity that the twin has learnt up to a step, by name."""
+    """Return the posterior of each quantity that the twin had learnt by a step."""
     return {name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()}
 
 

@@ -1,8 +1,8 @@
 """The page of a flight: its HTML, and the answers to the requests of its viewers.
 
-A viewer says in a request which steps it has and which step it shows. The answer follows from the
-request alone. So a viewer that was away, or is slow, gets all that it lacks at once, and nothing is
-kept for it.
+A request says which steps the viewer has and which step it shows, and the answer depends on the
+request alone. So a slow viewer, or one that was away, gets everything that it lacks at once, and
+the server keeps no state for it.
 """
 
 import json
@@ -33,7 +33,7 @@ from twin_master.viewer.part_picture import part_picture
 WINDOW_STEPS = 240
 """Number of steps that a page shows at once."""
 LATEST = -1
-"""The number that a request has in the place of a step if it asks for the last one."""
+"""The number in a request that stands for the last step."""
 TALLEST_BAR = 0.82
 """Height of the bar of a probability of 1, if the row of a control has the height 1."""
 
@@ -178,8 +178,8 @@ class FlightPage:
     def answer(self, request: Request) -> str | None:
         """Return the answer to a request as JSON; None if there is nothing new for the viewer.
 
-        The answer has the past steps that the viewer lacks (`past`), and, if another step is shown
-        than before, the prediction after it (`ahead`).
+        The answer contains the past steps that the viewer lacks (`past`) and, if another step is
+        shown than before, the prediction after it (`ahead`).
         """
         flight = self._flight
         # The step to be shown
@@ -216,9 +216,9 @@ class FlightPage:
         return json.dumps(plain(answer), allow_nan=False)  # NaN becomes null
 
     def _drawing_at(self, step: int) -> dict[str, str] | None:
-        """Return the address of the last drawing of a missing force up to a step, and its verdict.
+        """Return address and verdict of the last drawing of a missing force up to a step.
 
-        None is returned if no verdict up to this step has a drawing.
+        The result is None if no verdict up to this step has a drawing.
         """
         numbers = []
         for number, drawing in enumerate(self._flight.drawings):
@@ -233,7 +233,7 @@ class FlightPage:
         }
 
     def _past_values(self, records: Sequence[StepRecord]) -> dict[str, object]:
-        """Return the values that the page plots of past steps, each with a row for each step."""
+        """Return the values of past steps that the page plots, each with a row for each step."""
         flight = self._flight
         beliefs = flight.beliefs_in(records)
         values = self._plotted_values(beliefs, flight.observations_in(records))
@@ -320,7 +320,7 @@ class FlightPage:
 
 
 def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
-    """Return sensors whose readings are shown in standard deviations of the expected reading."""
+    """Return the sensors with readings in standard deviations of the expected reading."""
     units = ("standard deviations",) * len(sensors.titles)
     return replace(sensors, quantity="deviation", units=units, scale=1.0)
 
@@ -328,8 +328,8 @@ def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
 def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:
     """Return the first step that must be sent to a viewer.
 
-    The page shows a window of `WINDOW_STEPS` steps. If the viewer has the first part of the window,
-    only the rest is sent; else the whole window.
+    The page shows a window of `WINDOW_STEPS` steps. A viewer that has the first part of the window
+    gets the rest, and any other viewer the whole window.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A structure from a mesh as the view draws it: its outer faces, seen from one side."""
+"""The picture of a meshed structure in the view: its outer faces, seen from one side."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -13,14 +13,14 @@ from twin_master.report.structure import structure_camera
 from twin_master.scenario.schema import Scenario
 
 _MOST_FACES = 5000
-"""Faces that a page draws at most; a finer mesh has no picture."""
+"""Largest number of faces that a page draws; a finer mesh has no picture."""
 NO_REGION = -1
 """Region of a face outside of all damage regions of the scenario."""
 _DIGITS = 5
 
 
 class PartPicture(NamedTuple):
-    """The faces of a structure that a viewer sees, in a picture plane.
+    """The visible faces of a structure in a picture plane.
 
     Attributes
     ----------
@@ -41,8 +41,8 @@ class PartPicture(NamedTuple):
 def part_picture(folder: Path, scenario: Scenario) -> PartPicture | None:
     """Return the picture of the structure of a flight, or None if there is none to draw.
 
-    There is none without a structure from a mesh, if the mesh is too fine for a page, or if the
-    number of its gauges is not that of the scenario's sensors.
+    There is none if the structure has no mesh, if the mesh is too fine for a page, or if it has
+    another number of gauges than the scenario has sensors.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def part_picture(folder: Path, scenario: Scenario) -> PartPicture | None:
 
 
 def _faces_viewer(corners: Float, cell_centre: Float, to_viewer: Float) -> bool:
-    """Return whether a face (n, 3) of a cell is seen, and not the inside of it."""
+    """Return whether a face (n, 3) of a cell turns its outer side to the viewer."""
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     outwards = corners.mean(axis=0) - cell_centre
     if normal @ outwards < 0.0:

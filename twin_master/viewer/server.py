@@ -23,17 +23,17 @@ from twin_master.viewer.flight_page import FlightPage, Request
 
 ADDRESS = "127.0.0.1"
 POLL_SECONDS = 0.015
-"""Seconds between two checks of the run folder for new lines; a check takes microseconds."""
+"""Seconds between two checks of the run folder for new lines, each of some microseconds."""
 LONGEST_REQUEST = 4096
 """Greatest length of a request [bytes]."""
 _INVALID_MESSAGE = 1003
 """The code with which a WebSocket is closed after a message that is not a request."""
 
 HOST_NAMES = r"(localhost|127\.0\.0\.1)(:\d+)?"
-"""The host names that are answered.
+"""The host names to which the server answers.
 
-The page of another site may let its own name point to this machine. Its requests come with that
-name, and are not answered.
+The page of another site may let its own name point to this machine (DNS rebinding). Its requests
+come with that name, and are refused.
 """
 HEADERS = {
     "Content-Security-Policy": (

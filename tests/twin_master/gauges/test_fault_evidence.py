@@ -116,11 +116,11 @@ def test_free_gains_by_products_weigh_as_by_logarithms(free_probability):
     arguments = (observation, model, densities, np.full(GAUGES, free_probability), believed, belief)
     by_products = weigh_free_gains(*arguments)
     weight = by_products.weight.copy()
-    free_part = by_products.free_part.copy()
+    free_probability = by_products.free_probability.copy()
     with np.errstate(divide="ignore"):
         log_scale = weigh_free_gains_in_logs(*arguments, by_products)
     np.testing.assert_allclose(weight, by_products.weight * np.exp(log_scale), rtol=SINGLE, atol=1e-30)
-    np.testing.assert_allclose(free_part, by_products.free_part, rtol=SINGLE, atol=1e-12)
+    np.testing.assert_allclose(free_probability, by_products.free_probability, rtol=SINGLE, atol=1e-12)
 
 
 @pytest.mark.parametrize("deviation", [3.0, 1e60])
