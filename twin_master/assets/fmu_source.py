@@ -436,7 +436,7 @@ class FmuSource(AssetSource):
         return positions
 
     def _slice_of_role(self, binding: Binding, role: str) -> slice:
-        """Return the positions of the values of a role; refuse a number other than the scenario's."""
+        """Return the positions of the values of a role, whose number must be the scenario's."""
         expected_count = self._scenario.observation.count
         positions = binding.observation_slice(role)
         count = positions.stop - positions.start

@@ -282,7 +282,7 @@ class NamedStructure(AssetSource):
                 )
 
     def _chosen_values(self, parameters: Mapping[str, float]) -> Iterator[ChosenValue]:
-        """Yield the values that the scenario chooses: parameters, loads, levels, controls, gains."""
+        """Yield the values that the scenario gives to inputs of the structure."""
         scenario = self._scenario
         for name, value in parameters.items():
             yield ChosenValue(f"parameter {name}", name, value)
