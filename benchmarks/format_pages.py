@@ -1,15 +1,23 @@
 """The JSON Schemas of all file formats, and the pages that list their keys.
 
 ``python -m benchmarks.format_pages`` writes them anew from the classes that read and write the
-formats.
+formats. With ``--check`` it writes nothing, but lists the files that are not up to date.
 """
 
+import json
+import sys
 from collections.abc import Iterator
+from functools import reduce
+from importlib import import_module
+from inspect import isfunction
+from operator import or_
 from pathlib import Path
 
+from reporting import known_keys
 from reporting.files import atomic_write_text
+from reporting.format_schema import JsonSchema, format_schema
 from reporting.format_tables import PrintedTable, format_page, printed_tables
-from uav_twin.formats import FORMATS, FileFormat
+from uav_twin.formats import FORMATS, SCHEMA_FOLDER, FileFormat
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "reference" / "formats"
@@ -53,11 +61,12 @@ def pages() -> Iterator[tuple[Path, str]]:
     # formats that are explained together, such as a verdict and its patch, share tables
     printed_of_topic: dict[str, list[PrintedTable]] = {}
     for file_format in FORMATS.values():
+        schema = schema_of_classes(file_format)
         page = FOLDER / f"{file_format.name}.md"
         printed = printed_of_topic.setdefault(file_format.page, [])
-        yield page, _page_of(file_format, printed)
-        printed += printed_tables(file_format.schema(), file_format.notation, page.name, printed)
-        yield file_format.schema_file, file_format.schema_text()
+        yield page, _page_of(file_format, schema, printed)
+        printed += printed_tables(schema, file_format.notation, page.name, printed)
+        yield file_format.schema_file, json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
         name = Path(file_format.page).stem.replace("_", " ")
         rows.append(
             f"| {file_format.title} | {file_format.notation.upper()} | "
@@ -66,7 +75,19 @@ def pages() -> Iterator[tuple[Path, str]]:
     yield FOLDER / "index.md", _INTRODUCTION + "".join(rows)
 
 
-def _page_of(file_format: FileFormat, printed: list[PrintedTable]) -> str:
+def schema_of_classes(file_format: FileFormat) -> JsonSchema:
+    """Return the JSON Schema of a format, from the classes that read or write its files."""
+    objects = []
+    for source in file_format.sources:
+        module, _, name = source.partition(":")
+        objects.append(getattr(import_module(module), name))
+    if isfunction(objects[0]):
+        schema: JsonSchema = objects[0]()
+        return schema
+    return format_schema(reduce(or_, objects), file_format.title)
+
+
+def _page_of(file_format: FileFormat, schema: JsonSchema, printed: list[PrintedTable]) -> str:
     """Return the page of a format, without tables that are printed on pages before it."""
     title = file_format.title[:1].upper() + file_format.title[1:]
     name = Path(file_format.page).stem.replace("_", " ")
@@ -76,10 +97,24 @@ def _page_of(file_format: FileFormat, printed: list[PrintedTable]) -> str:
         f"{file_format.name}` prints the JSON Schema. There is a [list of all "
         "formats](index.md).\n\n"
     )
-    return head + format_page(file_format.schema(), file_format.notation, printed)
+    return head + format_page(schema, file_format.notation, printed)
+
+
+def outdated_files(files: dict[Path, str]) -> list[Path]:
+    """Return the files of both folders whose text is not the given one, or that are superfluous."""
+    present = {path for folder in (FOLDER, SCHEMA_FOLDER) for path in folder.iterdir()}
+    outdated = present - files.keys()
+    for path, text in files.items():
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            outdated.add(path)
+    return sorted(outdated)
 
 
 if __name__ == "__main__":
-    for path, text in pages():
+    known_keys.TEXTS_ARE_READ = True
+    files = dict(pages())
+    if sys.argv[1:] == ["--check"]:
+        sys.exit("\n".join(str(path.relative_to(ROOT)) for path in outdated_files(files)) or None)
+    for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_text(path, text)

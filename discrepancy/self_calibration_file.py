@@ -45,7 +45,7 @@ class StoredOutcomes:
 
 @dataclass(frozen=True)
 class StoredConfusion:
-    """How often each verdict was reached for each hidden effect."""
+    """The numbers of simulated campaigns by hidden effect and verdict."""
 
     hidden: tuple[str, ...]
     """Names of the rows: the hidden effects."""

@@ -1,23 +1,22 @@
 """The JSON Schema of a file format, from the class that reads or writes the format.
 
-The description of a key is the text below the field in its class, or the entry of the key in the
-section *Attributes* of the class's docstring. The unit of a value stands in brackets at the end of
-a clause of its description, as in "Length of the record [s].", or in `json_schema_extra` of the
-field's type.
+The description of a key is the text below the field in its class. The unit of a value stands in
+brackets at the end of a clause of this text, as in "Length of the record [s].", or in
+`json_schema_extra` of the field's type. The texts of models are there only if
+`reporting.known_keys.TEXTS_ARE_READ` was set before they were defined.
 """
 
-import ast
-import inspect
 import re
-from collections.abc import Mapping
+from dataclasses import is_dataclass
 from functools import cache
+from inspect import cleandoc
 from math import isfinite
-from textwrap import dedent
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import TypeAdapter, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, TypeAdapter, WithJsonSchema
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue, JsonSchemaWarningKind
 from pydantic_core import core_schema
+from typing_extensions import is_typeddict
 
 from reporting.json_file import JsonObject
 
@@ -50,74 +49,25 @@ def format_schema(model: Any, title: str) -> JsonSchema:
     title : str
         What a file of this format is, for people: "scenario".
     """
-    schema = TypeAdapter(model).json_schema(schema_generator=_DescribedSchema)
+    schema = _schema_of(model)
     return {"$schema": DIALECT, "title": title, **{**schema, "title": title}}
 
 
-def attribute_descriptions(cls: type) -> dict[str, str]:
-    """Return the description of each attribute of a class, own or inherited, by name."""
-    descriptions: dict[str, str] = {}
-    # A TypedDict has its bases beside the order in which methods are looked up.
-    bases = (*cls.__dict__.get("__orig_bases__", ()), *cls.__mro__)
-    for base in reversed(bases):
-        if isinstance(base, type) and base.__module__.partition(".")[0] not in (
-            "builtins",
-            "typing",
-            "pydantic",
-            "enum",
-        ):
-            descriptions |= _own_descriptions(base)
-    return descriptions
-
-
-@cache
-def _own_descriptions(cls: type) -> Mapping[str, str]:
-    """Return the descriptions of attributes that the text of a class itself contains."""
-    return {**_entries_of_docstring(cls.__dict__.get("__doc__") or ""), **_texts_below_fields(cls)}
-
-
-def _entries_of_docstring(docstring: str) -> dict[str, str]:
-    """Return the entries of the section *Attributes* of a docstring, by the attribute's name."""
-    pieces = _SECTION_OF_DOCSTRING.split(inspect.cleandoc(docstring))
-    # The pieces after the text are pairs: a heading and the text of its section.
-    sections = dict(zip(pieces[1::2], pieces[2::2], strict=True))
-    entries: dict[str, str] = {}
-    names: list[str] = []
-    for line in sections.get("Attributes", "").splitlines():
-        if line and not line.startswith(" "):
-            names = [name.strip() for name in line.partition(" : ")[0].split(",")]
-            entries |= dict.fromkeys(names, "")
-            continue
-        for name in names:
-            entries[name] = f"{entries[name]} {line.strip()}".strip()
-    return entries
-
-
-def _texts_below_fields(cls: type) -> dict[str, str]:
-    """Return the texts that stand below fields in the source of a class, by the field's name."""
-    try:
-        source = dedent(inspect.getsource(cls))
-    except (OSError, TypeError):  # a class that was made at run time has no source
-        return {}
-    (definition,) = ast.parse(source).body
-    texts: dict[str, str] = {}
-    if not isinstance(definition, ast.ClassDef):
-        return texts
-    for statement, next_statement in zip(definition.body, definition.body[1:], strict=False):
-        if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
-            continue
-        if not isinstance(next_statement, ast.Expr):
-            continue
-        text = next_statement.value
-        if isinstance(text, ast.Constant) and isinstance(text.value, str):
-            texts[statement.target.id] = " ".join(text.value.split())
-    return texts
+def _schema_of(model: Any) -> JsonSchema:
+    """Return the JSON Schema of a class, or of a union of classes."""
+    # pydantic takes a configuration for a list of records, but not for a record itself
+    adapter = TypeAdapter(list[model], config=ConfigDict(use_attribute_docstrings=True))
+    schema = adapter.json_schema(schema_generator=_DescribedSchema)
+    definitions = schema.get("$defs", {})
+    root = schema["items"]
+    if "$ref" in root:
+        root = definitions.pop(root["$ref"].rpartition("/")[2])
+    return {"$defs": definitions, **root} if definitions else root
 
 
 def summary_of_class(cls: type) -> str:
     """Return the text of a class's own docstring before its first section, in one paragraph."""
-    docstring = inspect.cleandoc(cls.__dict__.get("__doc__") or "")
-    text = _SECTION_OF_DOCSTRING.split(docstring)[0]
+    text, *_ = _SECTION_OF_DOCSTRING.split(cleandoc(cls.__doc__ or ""))
     return " ".join(text.split())
 
 
@@ -140,9 +90,7 @@ class _DescribedSchema(GenerateJsonSchema):
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> JsonSchemaValue:
         """Return the schema of a dataclass."""
-        fields: Any = schema["schema"].get("fields", [])
-        names = {field.get("validation_alias", field["name"]): field["name"] for field in fields}
-        return _described(super().dataclass_schema(schema), schema["cls"], names)
+        return _described(super().dataclass_schema(schema), schema["cls"])
 
     def typed_dict_schema(self, schema: core_schema.TypedDictSchema) -> JsonSchemaValue:
         """Return the schema of a `TypedDict`."""
@@ -153,25 +101,20 @@ class _DescribedSchema(GenerateJsonSchema):
         return {"not": {}}
 
 
-def _described(
-    schema: JsonSchemaValue, cls: type, attribute_of_key: Mapping[str, str] | None = None
-) -> JsonSchemaValue:
-    """Return the schema of a class with the descriptions and units of its keys.
+def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
+    """Return the schema of a class with the units of its keys, and without keys that no file has.
 
-    Keys that no file contains are left out.
+    A key without a text below its field has the text of the base class.
 
     Parameters
     ----------
     schema : dict
-        The schema of the class without descriptions.
+        The schema of the class as pydantic makes it.
     cls : type
         The class.
-    attribute_of_key : mapping of str to str, optional
-        The attribute of each key; by default a key has the name of its attribute.
     """
     if "properties" not in schema:
         return schema
-    descriptions = attribute_descriptions(cls)
     required = list(schema.get("required", []))
     properties: JsonSchema = {}
     for key, key_schema in schema["properties"].items():
@@ -184,21 +127,43 @@ def _described(
         default = described.get("default")
         if isinstance(default, float) and not isfinite(default):  # JSON has no such number
             del described["default"]
-        attribute = (attribute_of_key or {}).get(key, key)
-        if attribute in descriptions:
-            described |= _description_and_unit(descriptions[attribute])
+        text = described.pop("description", None)
+        if text is None:
+            described |= _descriptions_of_bases(cls).get(key, {})
+        else:
+            described |= _description_and_unit(text)
         properties[key] = described
     described_schema = {**schema, "properties": properties}
-    summary = summary_of_class(cls)
-    if summary:
-        described_schema["description"] = summary
+    described_schema["description"] = summary_of_class(cls)
     if required:
         described_schema["required"] = [key for key in properties if key in required]
     return described_schema
 
 
+@cache
+def _descriptions_of_bases(cls: type) -> dict[str, JsonSchema]:
+    """Return description and unit of each key that the base classes have.
+
+    pydantic reads the texts below the fields that a class itself declares, and gives them on to
+    subclasses of a model only as long as these do not declare the field anew.
+    """
+    descriptions: dict[str, JsonSchema] = {}
+    # a TypedDict has its bases beside the order in which methods are looked up
+    for base in (*cls.__dict__.get("__orig_bases__", ()), *reversed(cls.__mro__[1:])):
+        if is_dataclass(base) or is_typeddict(base):
+            for key, key_schema in _schema_of(base)["properties"].items():
+                names = ("description", "unit")
+                descriptions[key] = {name: key_schema[name] for name in names if name in key_schema}
+        elif isinstance(base, type) and issubclass(base, BaseModel):
+            for name, field in base.model_fields.items():
+                if field.description:
+                    descriptions[field.alias or name] = _description_and_unit(field.description)
+    return descriptions
+
+
 def _description_and_unit(text: str) -> JsonSchema:
     """Return the description of a key without the unit in brackets, and the unit, if it has one."""
+    text = " ".join(text.split())
     match = _UNIT.search(text)
     if match is None:
         return {"description": text}

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from reporting.format_schema import JsonSchema
-from reporting.json_file import JsonRecord
 from reporting.words import listing
 
 Notation = Literal["toml", "json"]
@@ -385,9 +384,3 @@ def _basic_types(node: JsonSchema, root: JsonSchema) -> set[str]:
     for entry in _inner_schemas(node):
         types |= _basic_types(entry, root)
     return types
-
-
-def keys_of_format(schema: JsonRecord) -> set[str]:
-    """Return the names of all keys of a format."""
-    tables = _TableFinder(dict(schema), "json").tables
-    return {key for table in tables for key in table.schema["properties"]}

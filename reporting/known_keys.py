@@ -7,8 +7,15 @@ from typing import Annotated, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
 
+TEXTS_ARE_READ = False
+"""Whether pydantic reads the texts below the fields of models, which describe their keys.
 
-def known_keys(model: object, location: tuple[int | str, ...]) -> list[str]:
+It reads them when a model is defined, from its source: 0.2 s for those of a scenario. Only
+`benchmarks.format_pages`, which writes the JSON Schemas, sets this, before it imports the models.
+"""
+
+
+def keys_of_table(model: object, location: tuple[int | str, ...]) -> list[str]:
     """Return the keys that the table at a location of a file may have; empty if it is not known.
 
     Parameters

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Self, TypeAlias, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from reporting import known_keys
 from reporting.choices import nearest_word
-from reporting.known_keys import known_keys
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 from reporting.words import counted, is_or_are, listing, small
 
@@ -246,7 +246,12 @@ Check = tuple[object, str]
 class Section(BaseModel):
     """The model of a table in a file; it refuses unknown keys, and converts no text to a number."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        use_attribute_docstrings=known_keys.TEXTS_ARE_READ,
+    )
 
     def checks(self) -> Iterator[Check]:
         """Yield (has failed, message) of each check of the table.
@@ -419,7 +424,7 @@ def _unknown_keys_message(
         return f"{listing(keys)} are not keys of {what}; remove them or correct their spelling"
     *table_location, key = faults[0]["loc"]
     # A key that a record has, but no file, is known; it must not be proposed in its own place.
-    other_keys = {*known_keys(model, tuple(table_location))} - {key}
+    other_keys = {*known_keys.keys_of_table(model, tuple(table_location))} - {key}
     nearest_key = nearest_word(str(key), sorted(other_keys))
     if nearest_key is not None:
         return f"{keys[0]} is not a key of {what}; the nearest is `{nearest_key}`"

@@ -2,16 +2,12 @@
 
 import json
 from dataclasses import dataclass
-from functools import reduce
-from importlib import import_module
-from inspect import isfunction
-from operator import or_
 from pathlib import Path
 
 from reporting.choices import did_you_mean
 from reporting.errors import InvalidChoiceError
-from reporting.format_schema import JsonSchema, format_schema
 from reporting.format_tables import Notation
+from reporting.json_file import JsonObject
 
 SCHEMA_FOLDER = Path(__file__).with_name("schemas")
 """The folder of the JSON Schemas that are shipped, for editors."""
@@ -42,25 +38,19 @@ class FileFormat:
     notation: Notation
     page: str
 
-    def schema(self) -> JsonSchema:
-        """Return the JSON Schema of the format."""
-        objects = []
-        for source in self.sources:
-            module, _, name = source.partition(":")
-            objects.append(getattr(import_module(module), name))
-        if isfunction(objects[0]):
-            schema: JsonSchema = objects[0]()
-            return schema
-        return format_schema(reduce(or_, objects), self.title)
+    @property
+    def schema_file(self) -> Path:
+        """The file with the JSON Schema, which `benchmarks.format_pages` makes from the classes."""
+        return SCHEMA_FOLDER / f"{self.name}.schema.json"
 
     def schema_text(self) -> str:
         """Return the JSON Schema of the format as text."""
-        return json.dumps(self.schema(), indent=1, ensure_ascii=False) + "\n"
+        return self.schema_file.read_text(encoding="utf-8")
 
-    @property
-    def schema_file(self) -> Path:
-        """The file with the shipped JSON Schema."""
-        return SCHEMA_FOLDER / f"{self.name}.schema.json"
+    def schema(self) -> JsonObject:
+        """Return the JSON Schema of the format."""
+        schema: JsonObject = json.loads(self.schema_text())
+        return schema
 
 
 def _toml(name: str, title: str, page: str, *models: str) -> FileFormat:

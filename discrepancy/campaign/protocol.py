@@ -22,10 +22,11 @@ from pydantic_core import PydanticKnownError
 from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
 from reporting.format_schema import MUST_BE_STATED, NeverInFile
+from reporting.known_keys import TEXTS_ARE_READ
 from reporting.toml_file import Name, NotNegative, Number, Positive
 
 MOST_MODES = 100
-IN_FILES = ConfigDict(extra="forbid", strict=False)
+IN_FILES = ConfigDict(extra="forbid", strict=False, use_attribute_docstrings=TEXTS_ARE_READ)
 """How a table of a file becomes a record: unknown keys are refused, and types are converted."""
 LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """Turns a list of the file into a tuple before it is checked."""

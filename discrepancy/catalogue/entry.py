@@ -12,11 +12,14 @@ from discrepancy.campaign.records import Campaign, FloatArray, TrialKind
 from discrepancy.system.interface import Model
 from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
+from reporting.known_keys import TEXTS_ARE_READ
 
 NINETY_PERCENT_QUANTILE = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 Number = Annotated[float, Strict()]
-ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
+ROW = ConfigDict(
+    extra="forbid", allow_inf_nan=False, str_min_length=1, use_attribute_docstrings=TEXTS_ARE_READ
+)
 """How a table of a file of effects is checked as one of these records."""
 FARTHEST_VALUE, FARTHEST_NORMAL = 8.0, 30.0
 """Largest standard normal variables that are fitted: of log-normal and uniform values, and of
