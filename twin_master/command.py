@@ -339,11 +339,11 @@ def _outcome_record(outcome: "RunOutcome") -> "JsonObject":
 
 def print_outcome(outcome: "RunOutcome") -> None:
     """Print the figures of a run next to their reference values, and where the report is."""
-    from twin_master.store.writing import printed_figures
+    from twin_master.store.writing import printed_values
 
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
-    texts = printed_figures(outcome.figures)
+    texts = printed_values(outcome.figures)
     for figure, (value, reference) in zip(outcome.figures, texts, strict=True):
         if reference and not isinstance(figure.reference, str):  # a text has its unit in it
             reference = f"{reference} {figure.unit}".strip()

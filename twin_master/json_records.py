@@ -1,6 +1,6 @@
 """The JSON records that runs and watches write, key by key, for their schemas and pages.
 
-A key with `NotRequired` is in the record only if there is something to say.
+A key with `NotRequired` is left out of a record in which it would be empty.
 """
 
 from typing import Annotated, NotRequired
@@ -12,10 +12,10 @@ WholeNumberInQuotes = Annotated[str, Field(pattern=r"^[0-9]+(\.0*)?$")]
 
 
 class NoticeRecord(TypedDict):
-    """Something that the operator should know."""
+    """A notice to the operator."""
 
     kind: str
-    """What the notice is about, such as "alarm" or "gauge_left_out"."""
+    """The kind of notice, such as "alarm" or "gauge_left_out"."""
     sensors: list[int]
     """The sensors that the notice concerns, numbered from 1."""
     value: float | None
@@ -42,7 +42,7 @@ class LearntRecord(TypedDict):
 
 
 class FactorRecord(TypedDict):
-    """What the twin believes of a factor of the state."""
+    """The belief about one factor of the state."""
 
     mean: float | None
     """Mean; null if no state is believed [unit of the entry]."""
@@ -72,7 +72,7 @@ class DecisionRecord(TypedDict):
     log_evidence: NotRequired[float]
     """Logarithm of the probability density of the observation given the earlier ones [nat]."""
     notices: list[NoticeRecord]
-    """What the operator should know."""
+    """The notices to the operator."""
     none_of_these: NotRequired[float]
     """Probability that no state explains the sensors; only if the twin gives notices [1]."""
     hypotheses: NotRequired[dict[str, float]]
@@ -80,11 +80,11 @@ class DecisionRecord(TypedDict):
     decided_by: NotRequired[str]
     """The hypothesis that decided; only if the twin gives notices."""
     learnt: NotRequired[dict[str, LearntRecord]]
-    """What was learnt so far, by the name of the quantity; only if the twin learns."""
+    """The quantities learnt so far, by name; only if the twin learns."""
     revised_by_step: NotRequired[int]
     """The step whose late message changed the decision."""
     message_step: NotRequired[int]
-    """The step by the count of the messages, if that differs from `step`."""
+    """The number of the step in the messages, if that differs from `step`."""
     told_again: NotRequired[bool]
     """Whether the decision may have been sent before."""
     asset: NotRequired[str]
@@ -100,7 +100,7 @@ class ObservationMessage(TypedDict):
     """
 
     step: NotRequired[int | WholeNumberInQuotes]
-    """Whole number of the step, also in quotes; the first message says where counting begins.
+    """Whole number of the step, also in quotes; counting begins with that of the first message.
     Without `step` and `time` the message is the next step.
     """
     time: NotRequired[float | str]
@@ -151,7 +151,7 @@ class RejectedRecord(TypedDict):
     message: int
     """Number of the message among those of the watch, from 1."""
     reason: str
-    """Why it was refused."""
+    """The reason of the refusal."""
     text: str
     """The first 200 characters of the message."""
 
@@ -178,7 +178,7 @@ class SuspicionRecord(TypedDict):
 
 
 class PackedLearntRecord(TypedDict):
-    """What was learnt so far."""
+    """The quantities learnt so far."""
 
     names: list[str]
     """Names of the quantities."""
@@ -249,17 +249,17 @@ class JournalRecord(TypedDict):
     observation: NotRequired[str]
     """True values at the sensors without noise, in base 64, if that is shorter [SI]."""
     monitors: NotRequired[dict[str, float | None]]
-    """What a simulated asset reports beside, by name [unit of the binding]."""
+    """Further quantities that a simulated asset reports, by name [unit of the binding]."""
     asset_state: NotRequired[str]
     """State of the asset after the step, compressed and in base 64; only in every 64th step."""
     learnt: NotRequired[PackedLearntRecord]
-    """What was learnt so far; only in the steps 1, 4, 16 and every 64th step."""
+    """The quantities learnt so far; only in the steps 1, 4, 16 and every 64th step."""
     notices: NotRequired[list[NoticeRecord]]
-    """What the operator should know."""
+    """The notices to the operator."""
     suspicion: NotRequired[PackedSuspicionRecord]
     """How well the model explains the sensors."""
     observation_step: NotRequired[int]
-    """The step that the message was about, if it is not `step`; only in a watch."""
+    """The step that the message belongs to, if it is not `step`; only in a watch."""
     control_in_force: NotRequired[int]
     """Index of the control of the last step, if a late message changed an earlier step; only in a
     watch.
@@ -271,9 +271,9 @@ class JournalRecord(TypedDict):
     watch, in every 2048th step.
     """
     begin: NotRequired[int]
-    """Where the line begins in the file, if it has no `standing`; only in a watch [bytes]."""
+    """Position of the line in the file, if it has no `standing`; only in a watch [bytes]."""
     standing: NotRequired[dict[str, object]]
-    """Where the line begins in the file, and the state of the search for causes before the line;
+    """Position of the line in the file, and the state of the search for causes before the line;
     only in a watch, in the steps with `learnt` and in events.
     """
     quiet: NotRequired[DecisionRecord]
@@ -289,7 +289,7 @@ class JournalRecord(TypedDict):
 class RecentRecord(TypedDict):
     """A line of `recent_0.jsonl` or `recent_1.jsonl` after its hash.
 
-    It has what a line of the journal leaves out. Which entries there are depends on the twin.
+    It contains the entries that a line of the journal leaves out. They depend on the twin.
     """
 
     line: str
@@ -299,7 +299,7 @@ class RecentRecord(TypedDict):
     asset_state: NotRequired[str]
     """State of the asset after the step, compressed and in base 64, from which a run resumes."""
     learnt: NotRequired[dict[str, LearntRecord]]
-    """What was learnt so far, by the name of the quantity."""
+    """The quantities learnt so far, by name."""
     settled: NotRequired[dict[str, object]]
     """The state of the twin before all steps that a late message can still change; only in a
     watch, in every 32nd step.
@@ -309,20 +309,20 @@ class RecentRecord(TypedDict):
 
 
 class FigureRecord(TypedDict):
-    """A figure of a mission, beside its reference."""
+    """A result of a mission, with its reference."""
 
     key: str
-    """Name of the figure for programs."""
+    """Name of the result for programs."""
     title: str
-    """Name of the figure for people."""
+    """Name of the result for people."""
     value: float | str | None
-    """The figure; null if the mission gave none [unit of the entry]."""
+    """The result; null if the mission gave none [unit of the entry]."""
     unit: str
     """Unit of `value` and `reference`, as printed."""
     reference: float | str | None
     """The value that the scenario states to compare with [unit of the entry]."""
     reference_source: str
-    """Where the reference comes from."""
+    """Source of the reference."""
 
 
 class SummaryNotice(NoticeRecord):
@@ -333,7 +333,7 @@ class SummaryNotice(NoticeRecord):
 
 
 class LearntSummary(TypedDict):
-    """What was learnt of a quantity; lists have an entry for each sensor."""
+    """The posterior of a learnt quantity; lists have an entry for each sensor."""
 
     title: str
     """The quantity in words."""
@@ -359,17 +359,17 @@ class SummaryRecord(TypedDict):
     steps: int
     """Number of steps that were flown."""
     control: str
-    """When the control changed, in words."""
+    """The changes of the control, in words."""
     asset: str
-    """What was flown, in words."""
+    """The asset that flew, in words."""
     twin_model: str
-    """What the twin believed, in words."""
+    """The model that the twin believed, in words."""
     asset_and_model_differ: bool
-    """Whether the model that flew is known to differ from the one that the twin believed."""
+    """Whether the asset is known to differ from the model that the twin believed."""
     figures: list[FigureRecord]
-    """The figures of the mission."""
+    """The results of the mission."""
     learnt: NotRequired[dict[str, LearntSummary]]
-    """What was learnt, by the name of the quantity; only if the twin learns."""
+    """The learnt quantities by name; only if the twin learns."""
     notices: NotRequired[list[SummaryNotice]]
     """The notices that the operator received."""
 
@@ -384,7 +384,7 @@ class FileHash(TypedDict):
 
 
 class ProvenanceRecord(TypedDict):
-    """From which program and inputs results come."""
+    """The program and the inputs that made the results."""
 
     seed: int
     """Seed of all random numbers."""
@@ -405,9 +405,9 @@ class ConfigRecord(TypedDict):
     format: int
     """Version of the format."""
     kind: str
-    """The words "uav-twin run" of a run or a watch, "uav-twin fleet" of a fleet."""
+    """The words "uav-twin run" for a run or a watch, "uav-twin fleet" for a fleet."""
     provenance: ProvenanceRecord
-    """From which program and inputs the results come."""
+    """The program and the inputs that made the results."""
     scenario: NotRequired[dict[str, object]]
     """The resolved scenario of a run, in SI; its keys are those of a scenario file."""
     scenario_file: NotRequired[FileHash]

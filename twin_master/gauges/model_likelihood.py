@@ -103,9 +103,9 @@ def model_likelihood(
     scale_squares : (G,) array
         Degrees of freedom plus the expected sum of squared residuals before the observation.
     density : (N,) array
-        The density at all pairs under the model, over a factor.
+        The density at all pairs under the model, divided by a factor.
     log_factor : float
-        The log of this factor, up to a constant of the step.
+        The log of that factor, up to a constant of the step.
     """
     count = len(pair)
     relative_density = np.empty(count)

@@ -60,7 +60,7 @@ def factor_tables(scenario: Scenario, leaving_factor: float = 1.0) -> dict[str, 
     Parameters
     ----------
     leaving_factor : float
-        The factor on the probabilities of each factor of the state to leave a level.
+        The factor by which all probabilities of leaving a level are multiplied.
     """
     tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
     if leaving_factor != 1.0:
@@ -96,7 +96,7 @@ def build_graphical_model(scenario: Scenario, leaving_factor: float = 1.0) -> Gr
     Parameters
     ----------
     leaving_factor : float
-        The factor on the probabilities of each factor of the state to leave a level.
+        The factor by which all probabilities of leaving a level are multiplied.
 
     Raises
     ------

@@ -59,7 +59,7 @@ class Course(NamedTuple):
         return Course(factor * self.mean, factor * self.lower, factor * self.upper)
 
 
-def default_now(run: Run) -> int:
+def default_present_row(run: Run) -> int:
     """Return the row of the step that is the present of the mission's figure by default.
 
     It lies `_STEPS_BEFORE_CHANGE` steps before the flown control first changes, so that this

@@ -20,7 +20,7 @@ from twin_master.report.calibration import calibrated_moments, calibration_figur
 from twin_master.report.captions import MISSION_NOW, MISSION_WHOLE, NETWORK, WORDS
 from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
 from twin_master.report.learnt import learnt_figure
-from twin_master.report.mission import default_now, mission_figure
+from twin_master.report.mission import default_present_row, mission_figure
 from twin_master.report.opening_sentences import opening_sentences
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
@@ -124,7 +124,7 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
 
 
 def _present_row(run: Run, now: int | None) -> int:
-    """Return the row of the step with the number `now`, or else with `default_now`.
+    """Return the row of the step with the number `now`, or else with `default_present_row`.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def _present_row(run: Run, now: int | None) -> int:
         If the number is not that of a step of the run.
     """
     if now is None:
-        return default_now(run)
+        return default_present_row(run)
     first_step = run.first_step
     last_step = first_step + run.step_count - 1
     if not first_step <= now <= last_step:
@@ -186,7 +186,7 @@ def render_page(
     _add_outcome(page, run)
     pictures_of_outcome = ["structure" if "structure" in figures else MISSION_NOW]
     pictures.add(*pictures_of_outcome)
-    tables.add_figures_table(page, run)
+    tables.add_summary_table(page, run)
     page.add_section("The mission")
     pictures.add(*(name for name in _MISSION_PICTURES if name not in pictures_of_outcome))
     page.add_section("What the twin believes")
@@ -301,10 +301,10 @@ def _true_parameter_sentence(run: Run) -> str:
 
 
 def _add_calibration(page: Page, run: Run) -> None:
-    """Add the calibrated figures, the findings, and which model was calibrated."""
+    """Add the calibrated values, the findings, and which model was calibrated."""
     tables.add_calibrated_table(page, run)
     sentences: list[str] = []
-    if tables.calibrated_figures(run.calibration):
+    if tables.calibrated_values(run.calibration):
         sentences += run.calibration.get("findings", [])
     asset = run.summary.get("asset")
     twin_model = run.summary.get("twin_model")

@@ -18,8 +18,8 @@ from twin_master.report.learnt import (
 )
 from twin_master.report.reading import Run, moments_of
 from twin_master.store.mission_result import LearntQuantity
-from twin_master.store.summary import Figure
-from twin_master.store.writing import printed_figures
+from twin_master.store.summary import SummaryEntry
+from twin_master.store.writing import printed_values
 
 _HASH_DIGITS = 12
 _MICROSTRAIN = 1.0e6
@@ -48,23 +48,20 @@ def _add_table(
         page.add_table(Table(columns, cells), **WORDS.words("tables", name, **fields))
 
 
-def add_figures_table(page: Page, run: Run) -> None:
-    """Add the table of the run's key figures, with reference values if the scenario has any.
-
-    A `Figure` is a number of the summary with its title and unit, not a drawing.
-    """
-    figures = [Figure(**record) for record in run.summary.get("figures", [])]
-    has_references = any(figure.reference is not None for figure in figures)
+def add_summary_table(page: Page, run: Run) -> None:
+    """Add the table of the run's results, with reference values if the scenario has any."""
+    entries = [SummaryEntry(**record) for record in run.summary.get("figures", [])]
+    has_references = any(entry.reference is not None for entry in entries)
     columns = [PageColumn("result"), number_column("this run"), PageColumn("unit")]
     if has_references:
         # a reference may be a text, such as "at most 2 steps", which has to wrap
         columns += [PageColumn("reference"), PageColumn("source of the reference")]
     rows = []
-    for figure, (value, reference) in zip(figures, printed_figures(figures), strict=True):
+    for entry, (value, reference) in zip(entries, printed_values(entries), strict=True):
         # Only numbers are rounded for print: title and unit are those of the summary.
-        row = [figure.title, value, figure.unit]
+        row = [entry.title, value, entry.unit]
         if has_references:
-            row += [reference, figure.reference_source]
+            row += [reference, entry.reference_source]
         rows.append(row)
     references = ", beside their references" if has_references else ""
     _add_table(page, "figures", columns, rows, references=references)
@@ -146,7 +143,7 @@ def add_learnt_sensors_table(page: Page, run: Run) -> None:
 
 
 def add_calibrated_table(page: Page, run: Run) -> None:
-    """Add the table of calibrated figures: parameters of a model, or figures of a healthy wing."""
+    """Add the table of calibrated parameters, or of the quantities of a healthy wing."""
     record = run.calibration
     columns = [
         PageColumn("figure"),
@@ -156,13 +153,13 @@ def add_calibrated_table(page: Page, run: Run) -> None:
         PageColumn("unit"),
     ]
     rows = []
-    for figure in calibrated_figures(record):
+    for quantity in calibrated_values(record):
         row = [
-            figure["title"],
-            number(figure["mean"]),
-            number(figure["standard_deviation"]),
-            " to ".join(number(end) for end in figure["interval_95"]),
-            "" if figure["unit"] == "1" else figure["unit"],
+            quantity["title"],
+            number(quantity["mean"]),
+            number(quantity["standard_deviation"]),
+            " to ".join(number(end) for end in quantity["interval_95"]),
+            "" if quantity["unit"] == "1" else quantity["unit"],
         ]
         rows.append(row)
     if not rows:
@@ -176,23 +173,23 @@ def add_calibrated_table(page: Page, run: Run) -> None:
     _add_table(page, "calibrated", columns, rows, kind=kind, asset=record["asset"], origin=origin)
 
 
-def calibrated_figures(record: JsonRecord) -> list[JsonRecord]:
-    """Return the figures in the record of a calibration: parameters first, then quantities.
+def calibrated_values(record: JsonRecord) -> list[JsonRecord]:
+    """Return the calibrated values in the record of a calibration: parameters, then quantities.
 
-    Empty if the run was not calibrated from a file.
+    The list is empty if the run was not calibrated from a file.
 
     Parameters
     ----------
     record : mapping
-        The record in `calibration.json`. Its table `state` has a figure for each parameter, its
+        The record in `calibration.json`. Its table `state` has a value for each parameter, its
         table `quantities` one for each derived quantity. JSON does not preserve their order, which
         `correlation.names` and `names.quantities` give.
     """
     parameter_names = record.get("correlation", {}).get("names", ())
     quantity_names = record.get("names", {}).get("quantities", ())
-    figures = [record["state"][name] for name in parameter_names]
-    figures += [record["quantities"][name] for name in quantity_names]
-    return figures
+    values = [record["state"][name] for name in parameter_names]
+    values += [record["quantities"][name] for name in quantity_names]
+    return values
 
 
 def add_run_table(page: Page, run: Run, seed: object) -> None:

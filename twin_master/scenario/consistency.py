@@ -31,12 +31,12 @@ from twin_master.scenario.tables import (
 )
 
 LARGEST_STRAIN_NOISE = 0.1
-"""Standard deviation of a strain gauge above which the number was meant in microstrain [1]. Usual
-gauges break at a strain of a few percent."""
+"""A larger standard deviation of a strain gauge was meant in microstrain [1]. Usual gauges break at
+a strain of a few percent."""
 
 
 class InspectionReading(NamedTuple):
-    """A reading of one state factor that is taken in an inspection.
+    """The reading of one state factor in an inspection.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class ScenarioTables(Section):
     format: Literal[2]
     """Version of the format; files of format 1 are still read."""
     mission: Mission
-    """What is flown, and for how long."""
+    """Name, length, first control and seed of the mission."""
     state: Annotated[tuple[StateFactor, ...], Field(min_length=1)]
     """The factors of the hidden state, the outermost first."""
     control: Annotated[tuple[Control, ...], Field(min_length=1)]
@@ -72,23 +72,24 @@ class ScenarioTables(Section):
     action: tuple[Action, ...] = ()
     """Inspections, repairs and the end of the mission, in addition to the controls."""
     observation: ObservationSection
-    """What is observed, and how well."""
+    """The observed quantity, the sensors, and their assumed noise."""
     transition: Transition
     """How the state changes in a step."""
     rewards: Rewards
-    """What the policy maximises."""
+    """The rewards that the policy maximises."""
     planner: Planner
     """How the twin decides."""
     asset: SerializeAsAny[AssetSection]
-    """What flies; left out if a real asset is watched."""
+    """The asset that flies; left out if a real asset is watched."""
     belief: SerializeAsAny[BeliefSection]
     """The model that predicts the observations of the twin."""
     calibration: Calibration
     """The uncertain parameter of the model, and its distribution."""
     truth: TruthSection
-    """What really happens, unseen by the twin; left out if a real asset is watched."""
+    """True damage, noise and sensor faults, which the twin never sees; left out if a real asset is
+    watched."""
     learning: Learning | None = None
-    """What the twin learns during the mission; nothing without the table."""
+    """Quantities that the twin learns during the mission; none without the table."""
     notice: NoticingOrNot = None
     """When an alarm is raised; `notice = false` switches alarms off."""
     watch: WatchSection = WatchSection()
@@ -99,10 +100,10 @@ class ScenarioTables(Section):
     @model_validator(mode="before")
     @classmethod
     def _complete_table(cls, table: object) -> object:
-        """Add a control for each action, and the tables of an asset that is only watched.
+        """Add a control for each action, and the missing tables of an asset that is only watched.
 
-        A scenario without `[asset]` and `[truth]` is for a real asset, whose observations are
-        received from outside. It gets an asset of the kind `watched` and a truth that is not used.
+        A scenario without `[asset]` and `[truth]` is for a real asset. It gets an asset of the kind
+        `watched` and a truth that is not used.
         """
         if not isinstance(table, Mapping):
             return table
@@ -125,10 +126,10 @@ class ScenarioTables(Section):
 
     @property
     def inspection_readings(self) -> tuple[InspectionReading, ...]:
-        """The quantities that inspections read, in the order of the actions of the scenario.
+        """The readings of all inspections, in the order of the actions of the scenario.
 
-        In the record of a mission, the row of each step holds the values of the sensors and then
-        one value for each of these readings. It is NaN if the step is without the inspection.
+        The row of a step has the values of the sensors and then one value for each of these
+        readings, which is NaN in a step without the inspection.
         """
         all_readings = []
         # `self.action` holds all tables `[[action]]`; each action is also a control of its name.
@@ -177,7 +178,7 @@ class ScenarioTables(Section):
         yield from self.transition.checks_beside(controls, level_counts)
 
     def _several_incomplete_tables_check(self) -> Check:
-        """Return the fault that several tables lack an entry for a control, with one joint message.
+        """Return the fault that several tables lack an entry for a control, in one message.
 
         The separate checks would report only the first of these tables.
         """
@@ -311,7 +312,7 @@ class ScenarioTables(Section):
             )
 
     def _strain_noise_check(self, key: str, noise: float | tuple[float, ...]) -> Check:
-        """Return the fault that a noise of strains is given in microstrain without that unit.
+        """Return the fault that a noise of strains seems to be in microstrain without that unit.
 
         A standard deviation above `LARGEST_STRAIN_NOISE` as a strain can only be a number in
         microstrain. Smaller mistakes are found later, when the predicted strains are known.

@@ -100,14 +100,14 @@ class FileSection(Section):
 
 
 class KindSection(FileSection):
-    """A table whose `kind` decides which subclass it is."""
+    """A table whose `kind` decides which subclass it belongs to."""
 
     kind: str
     """The kind of the table, which decides its other keys."""
     entry_point_group: ClassVar[str]
     """Group of the entry points of kinds: the name is the kind, the object is its class."""
     has_unique_model: ClassVar[bool] = False
-    """Whether its observations come from a model that no other kind flies or believes."""
+    """Whether no other kind has the model of its observations."""
 
     @property
     def is_known_to_differ(self) -> bool:
@@ -192,7 +192,7 @@ _Section = TypeVar("_Section", bound=KindSection)
 
 
 class BeliefSection(KindSection):
-    """What the twin believes: the model that predicts its observations."""
+    """The model that predicts the observations of the twin."""
 
     entry_point_group = "uav_twin.beliefs"
 
@@ -215,7 +215,7 @@ class BeliefSection(KindSection):
 
 
 class AssetSection(KindSection):
-    """What flies."""
+    """The asset that flies."""
 
     entry_point_group = "uav_twin.assets"
     is_fmu: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""The tables of a scenario on the mission, its states and controls, and the calibration."""
+"""The tables of a scenario about the mission, its states and controls, and the calibration."""
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -13,14 +13,14 @@ from twin_master.scenario.tables import ROW_SUM_TOLERANCE
 
 
 class Mission(Section):
-    """What is flown, and for how long."""
+    """The name of the mission, its length, first control and seed."""
 
     name: Name
     """Name of the mission, of letters, digits, `_`, `.` and `-`."""
     title: str = ""
     """Title in the report; by default the name."""
     description: str = ""
-    """What the mission shows, for people."""
+    """Purpose of the mission, in words."""
     steps: Count
     """Number of steps of the mission."""
     prediction_steps: Count = 10
@@ -85,14 +85,14 @@ class Control(Section):
 
 
 class Reference(Section):
-    """A value that is printed beside a figure of the summary, and where it comes from."""
+    """A reference value for an entry of the summary, and its source."""
 
     figure: Name
-    """Name of a figure of the summary."""
+    """Key of an entry of the summary."""
     value: Number | str
-    """The value to compare with, in the unit of the figure [unit of the figure]."""
+    """The value to compare with, in the unit of the entry [unit of the figure]."""
     source: str
-    """Where the value comes from."""
+    """Source of the value."""
 
 
 CALIBRATION_COPY = "asset/calibration.nc"
@@ -100,12 +100,12 @@ CALIBRATION_COPY = "asset/calibration.nc"
 
 
 class Calibration(FileSection):
-    """The uncertain parameter of the model, and where its distribution comes from."""
+    """The uncertain parameter of the model, and its distribution."""
 
     parameter: Name
     """Name of the uncertain parameter."""
     source: Literal["static_test", "normal", "fixed", "file"]
-    """Where the distribution of the parameter comes from: a static test of the wing, a normal
+    """Source of the distribution of the parameter: a static test of the wing, a normal
     distribution, one fixed value, or a calibration file."""
     file: str | None = None
     """A calibration (`calibration.nc`). If `mean` and `standard_deviation` are given, the file is

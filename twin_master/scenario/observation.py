@@ -1,4 +1,4 @@
-"""The tables of a scenario about its observations: sensors, or modes of a record."""
+"""The tables of a scenario about its observations: sensors, or modes identified from a record."""
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -40,7 +40,7 @@ def row_width(sensors: int) -> int:
 
 
 class ModesSection(Section):
-    """Which modes are observed, and which of their features.
+    """The observed modes, and which of their features are observed.
 
     A value is observed for each mode and each feature that has a standard deviation. The features
     are the frequency, the damping ratio, and the shape at each accelerometer but the first, divided
@@ -54,9 +54,8 @@ class ModesSection(Section):
     numbers: tuple[Count, ...] = ()
     """Number of each mode in the model, in rising order; 1, 2, ... by default."""
     standard_deviation: dict[FeatureKind, Positive]
-    """Standard deviation of each kind of feature, in addition to that of the identification: what
-    changes between records, and the error of the model [Hz for frequencies and 1 for the
-    others]."""
+    """Standard deviation of each kind of feature, in addition to that of the identification: for
+    changes between records and the error of the model [Hz for frequencies and 1 for the others]."""
 
     def checks(self) -> Iterator[Check]:
         """Yield (is present, message) of each possible fault: bands, numbers and features."""
@@ -165,7 +164,7 @@ class ModesSection(Section):
 
 
 class RecordSection(Section):
-    """How the record of each step is made, for a simulated asset."""
+    """The record of each step of a simulated asset."""
 
     kind: Literal["ambient", "decay"]
     """`ambient`: white noise excites the input; `decay`: the input is held and then released."""
@@ -182,7 +181,7 @@ class RecordSection(Section):
 
 
 class ObservationSection(Section):
-    """What is observed (a role of the binding), and the sensor noise that the twin assumes."""
+    """The observed quantity (a role of the binding), and the sensor noise that the twin assumes."""
 
     units: ClassVar[Mapping[str, str]] = {
         "standard_deviation": "microstrain",
@@ -191,7 +190,7 @@ class ObservationSection(Section):
     filled_in: ClassVar[tuple[str, ...]] = ("count", "standard_deviation")
 
     role: Name = "strain"
-    """What is observed: an observation of the binding, or `modes`."""
+    """The observed quantity: an observation of the binding, or `modes`."""
     count: Count
     """Number of sensors; it follows from the modes if the role is `modes`."""
     titles: tuple[str, ...] = ()
@@ -209,8 +208,8 @@ class ObservationSection(Section):
     """Whether the truth may lie between the levels of the states, which then stand for
     intervals."""
     average_over_draws: Literal["outside", "inside"] = "outside"
-    """Where the average over the draws of the parameter stands: outside the product over the
-    sensors as in the integral (30), or inside it as eq. (32) is printed."""
+    """Whether the average over the draws of the parameter is taken outside the product over the
+    sensors, as in the integral (30), or inside it, as eq. (32) is printed."""
     modes: ModesSection | None = None
     """The observed modes, if the role is `modes`; count, titles, unit and standard deviation follow
     from it."""

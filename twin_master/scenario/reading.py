@@ -1,4 +1,4 @@
-"""Reading scenario files: from TOML to a checked `Scenario`; a fault raises a `ScenarioError`."""
+"""Reading scenario files, from TOML to a checked `Scenario`."""
 
 import hashlib
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ PRESENT_NAMES = {
     "planner.inspections_a_turn": "inspections_per_step",
     "watch.seconds_per_turn": "seconds_per_step",
 }
-"""The present name of each key of a scenario, by the location that it had before."""
+"""The present name of each renamed key of a scenario, by its former path."""
 
 _KEYS_OF_COUPLED_FMUS = ("component", "connection", "algorithm", "iterations", "tolerance")
 _KEYS_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
@@ -100,7 +100,7 @@ def _asset_of_format_1(former_table: Mapping[str, object]) -> Table:
 
 
 def _table_of_design(design: object) -> Table:
-    """Return the table that names a wing design; without a name, the schema reports its absence."""
+    """Return the table that names a wing design; the schema reports a missing name."""
     if design == CALIBRATED_DESIGN_NAME:
         return {"kind": "calibration"}
     if design is None:

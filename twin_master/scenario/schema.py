@@ -18,17 +18,17 @@ from reporting.toml_file import Check
 from twin_master.scenario.consistency import ScenarioTables
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.section import Section, Table, unknown_name_check
-from twin_master.scenario.tables import FigureGroup
+from twin_master.scenario.tables import SummaryKeys
 
 _GAIN_DECIMALS = 12
 """Decimals to which sums of scripted gains are rounded, so that ten times 2 % and 40 % are 60 %;
 if a state is small in its unit, to as many significant digits."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards of eqs. (9)-(11)."""
-FIGURES: dict[str, dict[str, tuple[str, str]]] = tomllib.loads(
+SUMMARY_TITLES: dict[str, dict[str, tuple[str, str]]] = tomllib.loads(
     Path(__file__).with_name("figures.toml").read_text(encoding="utf-8")
 )
-"""Title and unit of each figure of the summary, by group and key."""
+"""Title and unit of each entry of the summary, by group and key."""
 
 
 class Scenario(ScenarioTables):
@@ -49,48 +49,48 @@ class Scenario(ScenarioTables):
         return self.observation.width + len(self.inspection_readings)
 
     def ends(self, control_index: int) -> bool:
-        """Return whether the mission ends with a step under a control."""
+        """Return whether a step under a control ends the mission."""
         name = self.control_names[control_index]
         return any(action.ends for action in self.action if action.name == name)
 
     @property
-    def figure_names(self) -> tuple[str, ...]:
-        """The names of all figures that the summary can contain, and a reference can name."""
+    def summary_keys(self) -> tuple[str, ...]:
+        """All keys that the summary can contain, and that a reference can name."""
         names = []
-        for group in self._figure_groups():
-            for name in FIGURES[group.name]:
+        for group in self._summary_groups():
+            for name in SUMMARY_TITLES[group.name]:
                 names.append(name.format(**group.fields))
         return tuple(names)
 
-    def _figure_groups(self) -> list[FigureGroup]:
-        """Return the groups of figures that the summary of this scenario can contain."""
-        groups = [FigureGroup("fallback", {})]
-        groups += [FigureGroup("error", {"state": name}) for name in self.state_names]
-        groups += [FigureGroup("reward", {"reward": name}) for name in REWARD_NAMES]
-        groups.append(FigureGroup("earned", {}))
-        groups += self._parameter_figure_groups()
-        groups.append(FigureGroup("evidence", {}))
+    def _summary_groups(self) -> list[SummaryKeys]:
+        """Return the groups of keys that the summary of this scenario can contain."""
+        groups = [SummaryKeys("fallback", {})]
+        groups += [SummaryKeys("error", {"state": name}) for name in self.state_names]
+        groups += [SummaryKeys("reward", {"reward": name}) for name in REWARD_NAMES]
+        groups.append(SummaryKeys("earned", {}))
+        groups += self._parameter_groups()
+        groups.append(SummaryKeys("evidence", {}))
         if self.learning is not None:
-            groups += self.learning.figure_groups()
+            groups += self.learning.summary_groups()
         has_dropout = any(fault.kind == "dropout" for fault in self.truth.sensor_faults)
         if has_dropout or self.truth.received:
-            groups += [FigureGroup("lost", {}), FigureGroup("blind", {})]
+            groups += [SummaryKeys("lost", {}), SummaryKeys("blind", {})]
         if self.models_differ:
-            groups.append(FigureGroup("misfit", {}))
+            groups.append(SummaryKeys("misfit", {}))
         if set(self.observation.sensor_units) == {"1"}:
-            groups.append(FigureGroup("bound", {}))
+            groups.append(SummaryKeys("bound", {}))
         if self.notice is not None:
-            groups.append(FigureGroup("notice", {}))
+            groups.append(SummaryKeys("notice", {}))
         return groups
 
-    def _parameter_figure_groups(self) -> list[FigureGroup]:
-        """Return the groups of figures on the calibrated parameter."""
+    def _parameter_groups(self) -> list[SummaryKeys]:
+        """Return the keys of the summary about the calibrated parameter."""
         fields = {"parameter": self.calibration.parameter}
         if self.learning is None or not self.learning.parameter:
-            return [FigureGroup("parameter", fields)]
-        groups = [FigureGroup("parameter_learnt", fields)]
+            return [SummaryKeys("parameter", fields)]
+        groups = [SummaryKeys("parameter_learnt", fields)]
         if self.calibration.parameter in self.asset.true_parameters:
-            groups.append(FigureGroup("parameter_true", fields))
+            groups.append(SummaryKeys("parameter_true", fields))
         return groups
 
     def scripted_history(self) -> Float:
@@ -120,7 +120,7 @@ class Scenario(ScenarioTables):
 
     @property
     def models_differ(self) -> bool:
-        """Whether the model that flies is known to differ from the one that the twin believes."""
+        """Whether the asset's model is known to differ from the one that the twin believes."""
         believes_asset = self.belief.kind == "asset"
         has_known_difference = self.asset.is_known_to_differ or self.belief.is_known_to_differ
         return has_known_difference and not believes_asset
@@ -143,7 +143,7 @@ class Scenario(ScenarioTables):
         return self.with_changes("mission", seed=seed)
 
     def with_changes(self, table: str, **changes: object) -> Self:
-        """Return the scenario with other values in one of its tables; they are not checked.
+        """Return the scenario with other values in one of its tables, which are not checked.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Scenario(ScenarioTables):
         return self.model_copy(update={"planner": self.planner.with_policy(name)})
 
     def _file_tables(self) -> dict[str, FileSection]:
-        """Return the tables whose files a run folder has copies of, by name."""
+        """Return the tables of whose files a run folder has copies, by name."""
         return {"asset": self.asset, "belief": self.belief, "calibration": self.calibration}
 
     def to_dict(self) -> Table:
@@ -183,7 +183,7 @@ class Scenario(ScenarioTables):
         names = [entry.figure for entry in self.reference]
         for name in names:
             yield unknown_name_check(
-                name, self.figure_names, "reference.figure", "figure of the summary"
+                name, self.summary_keys, "reference.figure", "figure of the summary"
             )
             yield (
                 names.count(name) > 1,

@@ -1,4 +1,4 @@
-"""What all tables of a scenario file have in common, and the types of the values in them.
+"""The base class of all tables of a scenario file, and the types of their values.
 
 A key may carry its unit in its name (`levels_percent`); the value is converted to SI.
 """
@@ -18,19 +18,19 @@ Table: TypeAlias = toml_file.TomlTable
 """A table of a TOML or JSON file before it is checked: values of any type by key."""
 
 _BOUNDS_OF_SCHEMA = ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum", "default")
-"""Keys of a JSON Schema whose numbers have the unit of the value."""
+"""Keys of a JSON Schema whose numbers are in the unit of the value."""
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
-"""By how much a value in a unit is divided to be in SI."""
+"""The divisor that converts a value in a unit to SI."""
 
 LARGEST_COUNT = 1_000_000
-"""Largest number of steps, draws or sensors: a machine has no room for longer arrays."""
+"""Largest number of steps, draws or sensors; longer arrays do not fit in memory."""
 LARGEST_SEED = 2**63 - 1
 """The largest integer that the files of a run can hold."""
 
 
 def _limit_validator(limit: int, reason: str) -> AfterValidator:
-    """Return a validator that refuses a larger number than the limit, and states the reason."""
+    """Return a validator that refuses numbers above a limit, and states the reason."""
 
     def check(value: int) -> int:
         if value > limit:
@@ -148,7 +148,7 @@ class Section(toml_file.Section):
 
 
 def _add_keys_with_units(table: Table, units: Mapping[str, str]) -> None:
-    """Add a key with a unit in its name beside each key that may carry one, to a table's schema."""
+    """Add to a table's schema, beside each key that may carry a unit, the key with its unit."""
     properties: Table = {}
     alternatives = []
     for key, key_schema in table["properties"].items():
@@ -174,12 +174,12 @@ def _relax_required_keys(table: Table, keys: set[str]) -> None:
 
 
 def _schema_in_unit(schema: JsonDocument, divisor: float) -> JsonDocument:
-    """Return the JSON Schema of a value in SI for the same value in a unit.
+    """Return the JSON Schema of a value in a unit, given that of the value in SI.
 
     Parameters
     ----------
     divisor : float
-        By how much a value in the unit is divided to be in SI.
+        The divisor that converts a value in the unit to SI.
     """
     if isinstance(schema, list):
         return [_schema_in_unit(entry, divisor) for entry in schema]
@@ -208,7 +208,7 @@ def _check_percentage(key: object, value: object) -> None:
 
 
 def _convert_to_si(value: object, divisor: float) -> object:
-    """Return a number, or a list of them, divided by the divisor; anything else stays as it is."""
+    """Divide a number, or each of a list, by the divisor; return anything else as it is."""
     if isinstance(value, list | tuple):
         return [_convert_to_si(entry, divisor) for entry in value]
     if isinstance(value, bool) or not isinstance(value, int | float):

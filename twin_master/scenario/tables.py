@@ -31,15 +31,15 @@ ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of a sum of probabilities from one; the graphical model has the same."""
 
 
-class FigureGroup(NamedTuple):
-    """A group of figures of the summary, whose names and titles are in `figures.toml`.
+class SummaryKeys(NamedTuple):
+    """Keys of the summary that belong together; their titles are in `figures.toml`.
 
     Attributes
     ----------
     name : str
         The name of the group's table in `figures.toml`.
     fields : dict of str to str
-        The texts that replace the fields in braces in the names of the figures.
+        The texts that replace the fields in braces in the keys.
     """
 
     name: str
@@ -178,7 +178,7 @@ class Span(Section):
 
 
 class Gain(Span):
-    """How much one factor of the true state grows in each step of a span."""
+    """The growth of one factor of the true state in each step of a span."""
 
     units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
     state: Name
@@ -224,7 +224,7 @@ class SensorFault(Span):
 
 
 class TruthSection(Section):
-    """What really happens, unseen by the twin: damage, sensor noise and faults.
+    """The true damage, sensor noise and sensor faults, which the twin never sees.
 
     If the kind is `asset`, all of it happens inside the asset, and is read for scoring only.
     """
@@ -232,7 +232,7 @@ class TruthSection(Section):
     kind: Literal["scripted", "random_growth", "asset"]
     """Whether the damage follows a script, grows at random, or happens inside the asset."""
     gains: tuple[Gain, ...] = ()
-    """`scripted`: how the true factors of the state grow."""
+    """`scripted`: the growth of the true factors of the state."""
     probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """`random_growth`: the true probabilities to worsen, as in `transition`; by default those that
     the twin assumes [1]."""
@@ -276,7 +276,7 @@ class TruthSection(Section):
 
 
 class InspectedState(NamedTuple):
-    """A reading that an action takes of a state factor.
+    """The reading of a state factor by an action.
 
     Attributes
     ----------
@@ -304,7 +304,7 @@ class Action(Section):
     control: Name
     """The control whose loads act on the asset in that step."""
     cost: NotNegative
-    """By how much the reward of the step is lower than under the control alone [1]."""
+    """Difference by which the reward of the step is lower than under the control alone [1]."""
     inspects: tuple[Name, ...] = ()
     """The state factors that are read in that step, and only then."""
     standard_deviation: PerSensor | None = None
@@ -352,7 +352,7 @@ _POLICY_NAME = re.compile(
 )
 """The name of a policy, such as "qmdp" or "risk 0.05, hold 3"."""
 POLICY_NAMES = "'mode', 'qmdp', 'belief' or 'risk 0.05', each also with ', hold 3'"
-"""These names, for messages."""
+"""The names of policies, for messages."""
 
 
 def is_policy_name(text: str) -> bool:
@@ -361,7 +361,7 @@ def is_policy_name(text: str) -> bool:
 
 
 class Planner(Section):
-    """How the twin decides: value iteration, eq. (36), or planning on the belief."""
+    """The rule by which the twin decides: value iteration, eq. (36), or planning on the belief."""
 
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
     """Discount factor of the rewards of later steps [1]."""
@@ -395,9 +395,9 @@ class Planner(Section):
         return name if self.hold == 1 else f"{name}, hold {self.hold}"
 
     def with_policy(self, name: str) -> "Planner":
-        """Return the table with the policy of a name, see `policy_name`.
+        """Return the table with the named policy, see `policy_name`.
 
-        A name without a policy, such as "hold 3", keeps that of the table.
+        A name without a policy, such as "hold 3", keeps the policy of the table.
 
         Raises
         ------
@@ -484,7 +484,7 @@ def _add_control_of_action(table: Table, action: Table) -> None:
 
 
 class Learning(Section):
-    """What is learnt, each with its prior; everything else stays as the scenario states it."""
+    """The learnt quantities, each with its prior; all others stay as the scenario states them."""
 
     units: ClassVar[Mapping[str, str]] = {
         "gauge_gain": "percent",
@@ -522,24 +522,24 @@ class Learning(Section):
             "`learning.transition_factors` needs two or more factors to choose from",
         )
 
-    def figure_groups(self) -> list[FigureGroup]:
-        """Return the groups of figures on all learnt quantities except the parameter."""
+    def summary_groups(self) -> list[SummaryKeys]:
+        """Return the keys of the summary about all learnt quantities except the parameter."""
         groups = []
         if self.saturation > 0.0:
-            groups.append(FigureGroup("learnt", {"quantity": "saturation"}))
+            groups.append(SummaryKeys("learnt", {"quantity": "saturation"}))
         if self.transition_factors:
-            groups.append(FigureGroup("learnt", {"quantity": "transition_factor"}))
+            groups.append(SummaryKeys("learnt", {"quantity": "transition_factor"}))
         if self.noise:
-            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "noise_scale"}))
+            groups.append(SummaryKeys("learnt_of_sensors", {"quantity": "noise_scale"}))
         if _has_positive(self.gauge_offset):
-            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "gauge_offset"}))
+            groups.append(SummaryKeys("learnt_of_sensors", {"quantity": "gauge_offset"}))
         if _has_positive(self.gauge_gain):
-            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "gauge_gain"}))
+            groups.append(SummaryKeys("learnt_of_sensors", {"quantity": "gauge_gain"}))
         return groups
 
 
 def _has_positive(value: float | tuple[float, ...]) -> bool:
-    """Return whether a number, or one of several, is above zero."""
+    """Return whether a number, or any of several, is above zero."""
     numbers = value if isinstance(value, tuple) else (value,)
     return any(number > 0.0 for number in numbers)
 

@@ -1,4 +1,4 @@
-"""The figures of a mission, each with the reference value that the scenario gives."""
+"""The summary of a mission: its results, each with the reference value that the scenario gives."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from reporting.words import counted, parameter_title
 from twin_master.mission.earnings import promise_of_return
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
-from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
+from twin_master.scenario.schema import REWARD_NAMES, SUMMARY_TITLES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import (
     MOMENTS,
@@ -31,30 +31,30 @@ TRUTH_IS_OFF = 3.0
 _MEAN = MOMENTS.index("mean")
 _STANDARD_DEVIATION = MOMENTS.index("standard_deviation")
 
-FigureValue = float | int | str | None
+EntryValue = float | int | str | None
 
 
-class FigureGroup(NamedTuple):
-    """Figures of the summary that belong together.
+class SummaryGroup(NamedTuple):
+    """Entries of the summary that belong together.
 
     Attributes
     ----------
     name : str
-        The name of the group in `FIGURES`, which holds keys, titles and units.
+        The name of the group in `SUMMARY_TITLES`, which contains keys, titles and units.
     fields : mapping of str to object
         The values of the fields in braces there.
     values : sequence
-        The values of the figures, in the order of the group.
+        The values of the entries, in the order of the group.
     """
 
     name: str
     fields: Mapping[str, object]
-    values: Sequence[FigureValue]
+    values: Sequence[EntryValue]
 
 
 @dataclass(frozen=True)
-class Figure:
-    """One figure of a mission.
+class SummaryEntry:
+    """One result of a mission.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Figure:
 
     key: str
     title: str
-    value: FigureValue
+    value: EntryValue
     unit: str = ""
     reference: float | str | None = None
     reference_source: str = ""
@@ -235,9 +235,9 @@ def summarise(
     result: MissionResult,
     reward_mean: Float,
     misfit: Float | None = None,
-    first_groups: Iterable[FigureGroup] = (),
-) -> Iterator[Figure]:
-    """Yield the figures of a mission; the same seed gives the same figures.
+    first_groups: Iterable[SummaryGroup] = (),
+) -> Iterator[SummaryEntry]:
+    """Yield the results of a mission; the same seed gives the same results.
 
     Parameters
     ----------
@@ -246,40 +246,40 @@ def summarise(
     misfit : (states, controls, sensors) array, optional
         The difference of the sensor values of the twin's model to those of the asset, relative to
         the latter; NaN if these are zero. It is given if asset and model are known to differ.
-    first_groups : iterable of FigureGroup
-        Figures that come before all others.
+    first_groups : iterable of SummaryGroup
+        Groups that come before all others.
     """
     groups = [*first_groups]
-    groups += _truth_figures(result) if result.flight.simulated else _watched_figures(result)
-    groups += _reward_figures(reward_mean, result.scenario.mission.step_name)
+    groups += _truth_groups(result) if result.flight.simulated else _watched_groups(result)
+    groups += _reward_groups(reward_mean, result.scenario.mission.step_name)
     if result.flight.simulated:
-        groups.append(_earned_figures(result))
-    groups += _parameter_figures(result)
-    groups.append(FigureGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
-    groups += _learnt_figures(result)
-    groups += _observation_figures(result)
+        groups.append(_earned_group(result))
+    groups += _parameter_groups(result)
+    groups.append(SummaryGroup("evidence", {}, [float(result.flight.log_evidence.sum())]))
+    groups += _learnt_groups(result)
+    groups += _observation_groups(result)
     if misfit is not None:
-        groups += _misfit_figures(misfit)
-    groups += _error_bound_figures(result)
-    groups += _suspicion_figures(result)
+        groups += _misfit_groups(misfit)
+    groups += _error_bound_groups(result)
+    groups += _suspicion_groups(result)
     references = {reference.figure: reference for reference in result.scenario.reference}
     if result.flight.simulated:
         promise = promise_of_return(result.knowledge)
         references = {entry.figure: entry for entry in promise} | references
     for group in groups:
-        texts = FIGURES[group.name]
+        texts = SUMMARY_TITLES[group.name]
         for (key_template, (title, unit)), value in zip(texts.items(), group.values, strict=True):
             key = key_template.format(**group.fields)
             title = title.format(**group.fields)
             unit = unit.format(**group.fields)
             reference = references.get(key)
             if reference is None:
-                yield Figure(key, title, value, unit)
+                yield SummaryEntry(key, title, value, unit)
             else:
-                yield Figure(key, title, value, unit, reference.value, reference.source)
+                yield SummaryEntry(key, title, value, unit, reference.value, reference.source)
 
 
-def _reward_figures(reward_mean: Float, step_name: str) -> Iterator[FigureGroup]:
+def _reward_groups(reward_mean: Float, step_name: str) -> Iterator[SummaryGroup]:
     """Yield the mean of each reward over the steps, without those in which it is NaN.
 
     The mean is None if the reward is NaN in all steps.
@@ -287,10 +287,10 @@ def _reward_figures(reward_mean: Float, step_name: str) -> Iterator[FigureGroup]
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         finite = rewards[np.isfinite(rewards)]
         mean = float(finite.mean()) if len(finite) else None
-        yield FigureGroup("reward", {"reward": name, "step": step_name}, [mean])
+        yield SummaryGroup("reward", {"reward": name, "step": step_name}, [mean])
 
 
-def _earned_figures(result: MissionResult) -> FigureGroup:
+def _earned_group(result: MissionResult) -> SummaryGroup:
     """Return the discounted return, and the percentages of steps beyond the limit and needless."""
     earned = result.earned
     values = [
@@ -298,10 +298,10 @@ def _earned_figures(result: MissionResult) -> FigureGroup:
         100.0 * float(np.mean(earned.beyond_limit)),
         100.0 * float(np.mean(earned.needless)),
     ]
-    return FigureGroup("earned", {"step": result.scenario.mission.step_name}, values)
+    return SummaryGroup("earned", {"step": result.scenario.mission.step_name}, values)
 
 
-def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
+def _observation_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield the percentage of lost readings, and the steps without any reading.
 
     Nothing is yielded if no reading was lost.
@@ -310,14 +310,14 @@ def _observation_figures(result: MissionResult) -> Iterator[FigureGroup]:
     is_received = np.isfinite(flight.observed)
     if is_received.all():
         return
-    yield FigureGroup("lost", {}, [100.0 * float(1.0 - is_received.mean())])
+    yield SummaryGroup("lost", {}, [100.0 * float(1.0 - is_received.mean())])
     blind_steps = (flight.first_step + np.flatnonzero(~is_received.any(axis=1))).tolist()
     if blind_steps:
         fields = {"step": result.scenario.mission.step_name}
-        yield FigureGroup("blind", fields, [", ".join(str(step) for step in blind_steps)])
+        yield SummaryGroup("blind", fields, [", ".join(str(step) for step in blind_steps)])
 
 
-def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
+def _misfit_groups(misfit: Float) -> Iterator[SummaryGroup]:
     """Yield the root mean square and the largest value of a misfit, in percent.
 
     Parameters
@@ -332,17 +332,17 @@ def _misfit_figures(misfit: Float) -> Iterator[FigureGroup]:
     sensor = int(np.argmax(largest_of_sensor))
     rms = float(np.sqrt(np.mean(misfit[is_known] ** 2)))
     percent = [100.0 * rms, 100.0 * float(largest_of_sensor[sensor])]
-    yield FigureGroup("misfit", {"sensor": sensor + 1}, percent)
+    yield SummaryGroup("misfit", {"sensor": sensor + 1}, percent)
 
 
-def _error_bound_figures(result: MissionResult) -> Iterator[FigureGroup]:
+def _error_bound_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield the largest certified strain error, if the asset reports it."""
     error_bounds = result.flight.monitors.get("strain_error_bound")
     if error_bounds is not None and {*result.scenario.observation.sensor_units} == {"1"}:
-        yield FigureGroup("bound", {}, [1e6 * float(error_bounds.max())])
+        yield SummaryGroup("bound", {}, [1e6 * float(error_bounds.max())])
 
 
-def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
+def _suspicion_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield the step of the first alarm, and the suspicion after the last step.
 
     Nothing is yielded if the twin does not test its model (`notice` is off).
@@ -358,10 +358,10 @@ def _suspicion_figures(result: MissionResult) -> Iterator[FigureGroup]:
         last_suspicion.gauge_off,
         last_suspicion.decided_by,
     ]
-    yield FigureGroup("notice", {"step": result.scenario.mission.step_name}, values)
+    yield SummaryGroup("notice", {"step": result.scenario.mission.step_name}, values)
 
 
-def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
+def _parameter_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield mean and standard deviation of the calibrated parameter.
 
     If the parameter is learnt in the flight, they are given after and before the flight, and the
@@ -378,22 +378,22 @@ def _parameter_figures(result: MissionResult) -> Iterator[FigureGroup]:
             "whose": "posterior " if is_measured else "",
             "of": f"the {title}" if " " in title else title,
         }
-        yield FigureGroup("parameter", fields, prior)
+        yield SummaryGroup("parameter", fields, prior)
         return
     parameter = learnt_parameters[0]
     fields = {"parameter": draws.name, "label": title}
     last_moments = parameter.posterior[-1]
     moments = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
-    yield FigureGroup("parameter_learnt", fields, [*moments, *prior])
+    yield SummaryGroup("parameter_learnt", fields, [*moments, *prior])
     if parameter.truth is not None:
-        yield FigureGroup("parameter_true", fields, [float(parameter.truth)])
+        yield SummaryGroup("parameter_true", fields, [float(parameter.truth)])
 
 
-def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the figures of all learnt quantities other than the calibrated parameter."""
+def _learnt_groups(result: MissionResult) -> Iterator[SummaryGroup]:
+    """Yield the groups of all learnt quantities other than the calibrated parameter."""
     for quantity in result.learnt:
         if quantity.is_per_sensor:
-            yield _figures_of_sensors(result, quantity)
+            yield _group_of_sensors(result, quantity)
         elif quantity.name != result.scenario.calibration.parameter:
             factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
             fields = {
@@ -403,14 +403,14 @@ def _learnt_figures(result: MissionResult) -> Iterator[FigureGroup]:
             }
             last_moments = factor * quantity.posterior[-1]
             values = [float(last_moments[_MEAN]), float(last_moments[_STANDARD_DEVIATION])]
-            yield FigureGroup("learnt", fields, values)
+            yield SummaryGroup("learnt", fields, values)
 
 
-def _figures_of_sensors(result: MissionResult, quantity: LearntQuantity) -> FigureGroup:
-    """Return the figures of a learnt quantity with a value for each sensor.
+def _group_of_sensors(result: MissionResult, quantity: LearntQuantity) -> SummaryGroup:
+    """Return the group of a learnt quantity that has a value for each sensor.
 
-    They are the mean over the sensors, and the value of the sensor whose posterior mean differs
-    most from its prior mean, in posterior standard deviations.
+    Its entries are the mean over the sensors, and the value of the sensor whose posterior mean
+    differs most from its prior mean, in posterior standard deviations.
     """
     observation = result.scenario.observation
     factor, unit = printed_unit_of_quantity(quantity.name, quantity.unit, result.scenario)
@@ -432,7 +432,7 @@ def _figures_of_sensors(result: MissionResult, quantity: LearntQuantity) -> Figu
         "most": f"{sensor + 1}",
     }
     values = [mean_of_sensors, float(last_mean[sensor]), float(last_deviation[sensor])]
-    return FigureGroup("learnt_of_sensors", fields, values)
+    return SummaryGroup("learnt_of_sensors", fields, values)
 
 
 def notice_record(result: MissionResult) -> JsonObject:
@@ -445,8 +445,8 @@ def notice_record(result: MissionResult) -> JsonObject:
     return {"notices": notices}
 
 
-def _truth_figures(result: MissionResult) -> Iterator[FigureGroup]:
-    """Yield the figures that need the true state: the fallback, and the error of each factor."""
+def _truth_groups(result: MissionResult) -> Iterator[SummaryGroup]:
+    """Yield the groups that need the true state: the fallback, and the error of each factor."""
     scenario = result.scenario
     flight = result.flight
     knowledge = result.knowledge
@@ -457,15 +457,15 @@ def _truth_figures(result: MissionResult) -> Iterator[FigureGroup]:
         flight.control_index,
         flight.state,
     )
-    yield fallback_figures(fallback, scenario)
+    yield fallback_group(fallback, scenario)
     errors = filtered_rms_error(knowledge.model, flight.filtered, flight.state)
     for factor, error in zip(scenario.state, errors.tolist(), strict=True):
         scale, unit = printed_state(factor.unit, "percentage points")
         fields = {"state": factor.name, "title": factor.title or factor.name, "unit": unit}
-        yield FigureGroup("error", fields, [scale * error])
+        yield SummaryGroup("error", fields, [scale * error])
 
 
-def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
+def _watched_groups(result: MissionResult) -> Iterator[SummaryGroup]:
     """Yield the last estimate of a watched asset; its values are None if no state is believed."""
     states = result.knowledge.model.states
     belief = result.flight.filtered[-1]
@@ -474,11 +474,11 @@ def _watched_figures(result: MissionResult) -> Iterator[FigureGroup]:
     deviations = states.standard_deviation(belief)
     for factor, mean, deviation in zip(result.scenario.state, means, deviations, strict=True):
         scale, unit = printed_state(factor.unit)
-        values: list[FigureValue] = [None, None]
+        values: list[EntryValue] = [None, None]
         if is_believed:
             values = [float(scale * mean), float(scale * deviation)]
         fields = {"state": factor.name, "title": factor.title or factor.name, "unit": unit}
-        yield FigureGroup("last", fields, values)
+        yield SummaryGroup("last", fields, values)
 
 
 def control_changes(
@@ -513,15 +513,15 @@ def control_changes(
     return sentence
 
 
-def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
-    """Return the figures of a fallback: level, steps and delay, with their units.
+def fallback_group(fallback: Fallback, scenario: Scenario) -> SummaryGroup:
+    """Return level, steps and delay of a fallback as a group of the summary.
 
-    A single figure says so if the policy depends on no state factor, or on several.
+    A single entry says so if the policy depends on no state factor, or on several.
     """
     level = fallback.switch_level
     first_control = scenario.mission.first_control
     if fallback.switch_factor is None or level is None:
-        return FigureGroup("nowhere", {"first": first_control}, ["no single one"])
+        return SummaryGroup("nowhere", {"first": first_control}, ["no single one"])
     factor = scenario.state[scenario.state_names.index(fallback.switch_factor)]
     scale, unit = printed_state(factor.unit)
     new_control = "another control"
@@ -550,7 +550,7 @@ def fallback_figures(fallback: Fallback, scenario: Scenario) -> FigureGroup:
         delay,
         fallback.early_change_step,
     ]
-    return FigureGroup("fallback", fields, values)
+    return SummaryGroup("fallback", fields, values)
 
 
 def truth_mismatch(

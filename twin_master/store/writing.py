@@ -22,9 +22,9 @@ from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import csv_tables, run_groups
 from twin_master.store.summary import (
-    Figure,
-    FigureGroup,
-    FigureValue,
+    EntryValue,
+    SummaryEntry,
+    SummaryGroup,
     control_changes,
     notice_record,
     summarise,
@@ -95,7 +95,7 @@ def store_flight(
     origin: FlownAndBelieved,
     *,
     steps: int,
-    figures: Sequence[FigureGroup] = (),
+    figures: Sequence[SummaryGroup] = (),
     attributes: Mapping[str, object] | None = None,
     misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
@@ -107,11 +107,11 @@ def store_flight(
     Parameters
     ----------
     origin : FlownAndBelieved
-        What was flown, and what the twin believed, in words.
+        The asset and the believed model, in words.
     steps : int
         The number of steps that were flown or planned.
-    figures : sequence of FigureGroup
-        Figures of the summary that come before those of every mission.
+    figures : sequence of SummaryGroup
+        Groups of the summary that come before those of every mission.
     attributes : mapping of str to object, optional
         Further attributes of the root of `run.nc`.
     misfit : (states, controls, sensors) array, optional
@@ -161,7 +161,7 @@ def _root_attributes(
 
 
 def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int) -> JsonObject:
-    """Return the entries of the summary before its figures.
+    """Return the entries of the summary file before the results.
 
     They are the mission, its control changes, asset and believed model, learnt quantities, and
     notices.
@@ -185,31 +185,26 @@ def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int
     }
 
 
-def printed_figures(figures: Sequence[Figure]) -> list[tuple[str, str]]:
-    """Return value and reference of each figure as texts; the latter is empty without a reference.
+def printed_values(entries: Sequence[SummaryEntry]) -> list[tuple[str, str]]:
+    """Return value and reference of each entry as texts; a missing reference is empty.
 
-    A number has three significant digits. A mean whose standard deviation is a figure, too, has the
+    A number has three significant digits. A mean whose standard deviation is an entry, too, has the
     decimals of that deviation, so that both can be compared.
-
-    Parameters
-    ----------
-    figures : sequence of Figure
-        All figures of the mission.
     """
-    values = {figure.key: figure.value for figure in figures}
-    figures_in_text = []
-    for figure in figures:
+    values = {entry.key: entry.value for entry in entries}
+    texts = []
+    for entry in entries:
         deviation = None
-        if figure.key.endswith(_MEAN):
-            deviation = values.get(figure.key.removesuffix(_MEAN) + _STANDARD_DEVIATION)
+        if entry.key.endswith(_MEAN):
+            deviation = values.get(entry.key.removesuffix(_MEAN) + _STANDARD_DEVIATION)
         reference = ""
-        if figure.reference is not None:
-            reference = _printed_number(figure.reference, deviation)
-        figures_in_text.append((_printed_number(figure.value, deviation), reference))
-    return figures_in_text
+        if entry.reference is not None:
+            reference = _printed_number(entry.reference, deviation)
+        texts.append((_printed_number(entry.value, deviation), reference))
+    return texts
 
 
-def _printed_number(value: FigureValue, deviation: FigureValue) -> str:
+def _printed_number(value: EntryValue, deviation: EntryValue) -> str:
     """Return a value with the decimals of its standard deviation, if that is known."""
     if isinstance(value, float) and isinstance(deviation, float) and deviation > 0.0:
         return rounded(value, deviation)
@@ -226,7 +221,7 @@ class RunOutcome:
         The path of the run folder.
     report : Path or None
         The report in it; None if there is none.
-    figures : tuple of Figure
+    figures : tuple of SummaryEntry
         The summary.
     timing : dict
         The content of `timing.json`.
@@ -242,7 +237,7 @@ class RunOutcome:
 
     folder: Path
     report: Path | None
-    figures: tuple[Figure, ...]
+    figures: tuple[SummaryEntry, ...]
     timing: JsonObject
     origin: FlownAndBelieved
     step_name: str
@@ -258,9 +253,9 @@ class RunOutcome:
         return open_run(self.folder)
 
     def _repr_html_(self) -> str:
-        """Return the figures of the run with their reference values, for a notebook."""
+        """Return the results of the run with their reference values, for a notebook."""
         rows = []
-        texts = printed_figures(self.figures)
+        texts = printed_values(self.figures)
         for figure, (value, reference) in zip(self.figures, texts, strict=True):
             rows.append([figure.title, value, figure.unit, reference])
         headings = ("result", "this run", "unit", "reference")
@@ -285,7 +280,7 @@ def read_outcome(folder: Path) -> RunOutcome:
     return RunOutcome(
         folder,
         report=report if report.is_file() else None,
-        figures=tuple(Figure(**figure) for figure in summary["figures"]),
+        figures=tuple(SummaryEntry(**figure) for figure in summary["figures"]),
         timing=timing,
         origin=FlownAndBelieved(
             str(summary["asset"]),

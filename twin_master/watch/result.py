@@ -13,7 +13,7 @@ from twin_master.mission.journal import last_step, records_backwards
 from twin_master.mission.replay import replay
 from twin_master.network.estimator import Notice
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import FigureGroup
+from twin_master.store.summary import SummaryGroup
 from twin_master.store.writing import store_flight
 from twin_master.watch.folder import WATCHED_ASSET, Watch
 
@@ -125,7 +125,7 @@ def _step_of(line: JournalLine) -> int:
     return max(int(line.get("step", 0)), 0)
 
 
-def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[FigureGroup]:
+def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[SummaryGroup]:
     """Return figures for the summary: the counts of messages, and the residuals of each patch.
 
     Those of a patch are the root mean square residuals without and with it.
@@ -138,9 +138,9 @@ def _summary_figures(watch: Watch, counts: Counts, step_count: int) -> list[Figu
         counts.duplicates,
         counts.rejected,
     ]
-    figures = [FigureGroup("watch", template_fields, message_counts)]
+    figures = [SummaryGroup("watch", template_fields, message_counts)]
     for model in watch.teaching.adopted_models:
         residuals = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
         patch_fields = template_fields | {"first": model["from_step"]}
-        figures.append(FigureGroup("patch", patch_fields, residuals))
+        figures.append(SummaryGroup("patch", patch_fields, residuals))
     return figures

@@ -157,7 +157,7 @@ def figures(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def test_the_summary_has_the_figures_that_the_scenario_names(figures, scenario):
-    assert tuple(figures) == load_scenario(scenario).scenario.figure_names
+    assert tuple(figures) == load_scenario(scenario).scenario.summary_keys
 
 
 def test_the_summary_says_what_was_learnt_of_the_parameter(figures, learnt):

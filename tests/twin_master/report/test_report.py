@@ -23,7 +23,7 @@ from twin_master.errors import RunFolderError
 from twin_master.report import page as report
 from twin_master.report.calibration import true_value
 from twin_master.report.check import predictive_check
-from twin_master.report.mission import default_now, mission_figure
+from twin_master.report.mission import default_present_row, mission_figure
 from twin_master.report.opening_sentences import opening_sentences
 from twin_master.report.page import lost_ranges
 from twin_master.report.reading import Run
@@ -234,10 +234,10 @@ def test_the_page_has_sources_seed_and_figures(text_of_page, words):
 
 
 def test_the_present_is_chosen_before_the_first_change_of_control(run):
-    assert default_now(run) == 28
+    assert default_present_row(run) == 28
     for change, now in ((0, 33), (1, 33), (2, 33), (5, 33), (6, 3)):  # before the first nothing would be seen
         control = np.where(np.arange(50) < change, 1, 0)
-        assert default_now(altered(run, observed__control_index=control)) == now
+        assert default_present_row(altered(run, observed__control_index=control)) == now
 
 
 @pytest.mark.usefixtures("no_drawing")

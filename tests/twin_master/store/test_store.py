@@ -18,7 +18,7 @@ from twin_master.scenario.mission import Reference
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import csv_tables, run_groups
-from twin_master.store.summary import fallback_figures, find_fallback, summarise
+from twin_master.store.summary import fallback_group, find_fallback, summarise
 from twin_master.store.writing import open_run, write_run
 
 
@@ -172,7 +172,7 @@ def controls(*gentle: int) -> np.ndarray:
 def test_a_fallback_has_a_delay_or_is_early(gentle, truth, delay, early):
     """A fallback that came before the damage has no delay among the figures."""
     fallback = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
-    *_, figures = fallback_figures(fallback, SCENARIO)
+    *_, figures = fallback_group(fallback, SCENARIO)
     delay_of_figure = None if early == 29 else delay
     assert (fallback.delay, fallback.early_change_step) == (delay, early)
     assert list(figures)[3:] == [delay_of_figure, early]
@@ -239,7 +239,7 @@ SECONDS = np.zeros((50, 3))
 
 def test_every_figure_is_one_that_a_reference_can_name(monitored):
     figures = summarise(monitored, SECONDS)
-    assert tuple(figure.key for figure in figures) == monitored.scenario.figure_names
+    assert tuple(figure.key for figure in figures) == monitored.scenario.summary_keys
 
 
 def test_the_rms_error_is_that_of_the_filtered_mean(monitored):
