@@ -1,4 +1,4 @@
-"""The declaration of an FMU that we make, and the texts that templates make of it."""
+"""The declaration of an FMU that we build, and the files that templates make from it."""
 
 import math
 import re
@@ -30,13 +30,13 @@ PLACEHOLDER = "0_content_0_"
 
 
 class DeclaredUnit(NamedTuple):
-    """A unit, expressed in SI base units.
+    """A unit in SI base units.
 
     Attributes
     ----------
     base : dict of str to float
-        The non-zero exponents of base units. Factor and offset are included if they are not 1 and
-        0. Empty for a unit that is not understood.
+        The non-zero exponents of base units, and factor and offset if they differ from 1 and 0.
+        Empty for an unknown unit.
     displays : dict of str to float
         The factors of display units.
     """
@@ -47,19 +47,20 @@ class DeclaredUnit(NamedTuple):
 
 @dataclass(frozen=True)
 class Declaration:
-    """The declaration of an FMU, whatever it is made of.
+    """The declarations of an FMU that we build.
 
     Attributes
     ----------
     name : str
         Model name, with which the model identifier begins.
     description : str
-        A sentence that describes the FMU to people.
+        A sentence that describes the FMU.
     table : tuple of FmuVariable
-        The variables, in the order of their value references. Local ones are states, and then as
-        many derivatives.
+        The variables, in the order of their value references. Local variables are states, followed
+        by as many derivatives.
     dependencies : mapping of str to sequence of str
-        Inputs that each output depends on directly; an output that is missing depends on all.
+        Inputs that each output depends on directly; an output without an entry depends on all
+        inputs.
     """
 
     name: str
@@ -90,17 +91,7 @@ class Declaration:
 
 
 def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> None:
-    """Complete the declaration of a unit from its name.
-
-    Parameters
-    ----------
-    unit : DeclaredUnit
-        The declaration; extended in place.
-    name : str
-        The name of the unit.
-    display_unit : str or None
-        The display unit of a variable that has this unit.
-    """
+    """Complete the declaration of a unit from its name and a display unit."""
     meaning = meaning_of(name)
     if meaning is None:
         return
@@ -207,14 +198,14 @@ def _xml_value(value: float | None, kind: str) -> str | None:
 
 @dataclass(frozen=True)
 class ArrayVariable:
-    """Rows that follow one another, as one array; its value reference is that of the first row.
+    """Successive rows as one array, which has the value reference of the first row.
 
     Attributes
     ----------
     name : str
-        Stem of the names of the rows: `strain` for `strain[1]`, ...; `health` for `health.z1`, ...
+        Common stem: `strain` for `strain[1]`, ...; `health` for `health.z1`, ...
     rows : tuple of FmuVariable
-        The elements in order; they differ only in name, description and start value.
+        The elements, which differ only in name, description and start value.
     """
 
     name: str
@@ -239,13 +230,8 @@ class ArrayVariable:
 def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
     """Return the arrays that the variables of a table form in FMI 3.
 
-    These are numbered variables such as `strain[1]`, and inputs and outputs such as `health.z1`, if
-    they follow one another. Rows with different units or ranges stay scalars.
-
-    Parameters
-    ----------
-    table : sequence of FmuVariable
-        The variables in the order of their value references.
+    An array consists of successive numbered variables such as `strain[1]`, or inputs and outputs
+    such as `health.z1`. Rows with different units or ranges stay scalars.
     """
     arrays = []
     for stem, group in groupby(table, _array_stem):
@@ -259,7 +245,7 @@ def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
 
 
 def _array_stem(row: FmuVariable) -> str | None:
-    """Return the name of the array that a row may belong to, or None for a scalar."""
+    """Return the name of the array that a row may belong to; None for a scalar."""
     match = _ELEMENT.fullmatch(row.name)
     if match is None or row.causality == "parameter" or row.kind != "Real":
         return None
@@ -278,19 +264,17 @@ def description_members(
     fmi: int = 2,
     arrays: Sequence[ArrayVariable] = (),
 ) -> dict[str, bytes]:
-    """Return the model description of an FMU, and its documentation page.
+    """Return the files modelDescription.xml and index.html (the documentation) of an FMU.
 
     The FMU is for co-simulation, or, with states, for model exchange. A placeholder stands for what
     the content hash will give. There is no generation date: equal content gives equal bytes.
 
     Parameters
     ----------
-    declared : Declaration
-        The model.
     generation_tool : str
         Attribute of the root element.
     host : str
-        Sentence on what the FMU runs in, for its documentation.
+        Sentence on the host that the FMU needs, for its documentation.
     source_files : sequence of str
         C sources in the folder `sources`; an FMU without any needs Python to run.
     fmi : {2, 3}

@@ -10,7 +10,7 @@ _ESCAPES = {code: f"\\x{code:02x}" for code in _CONTROL_CODES}
 
 
 def visible(text: str) -> str:
-    r"""Return a text with control characters, which a terminal would obey, written as `\x1b`."""
+    r"""Return a text with control characters, which a terminal would execute, written as `\x1b`."""
     return text.translate(_ESCAPES)
 
 
@@ -19,19 +19,15 @@ class FmuError(StandsForOthersError):
 
     Parameters
     ----------
-    sentence : str
-        The message.
     messages : sequence of str
-        Messages that the FMU itself has logged since the last call that succeeded, oldest first.
+        Messages that the FMU itself has logged since the last successful call, oldest first.
     time : float, optional
         Time at which the FMU ended its simulation [s], if it did.
 
     Attributes
     ----------
-    sentence : str
-        The message, without control characters.
     messages : tuple of str
-        The messages of the FMU, without control characters.
+        Messages that the FMU itself has logged since the last successful call, oldest first.
     time : float or None
         As given.
     """
@@ -47,11 +43,11 @@ class FmuError(StandsForOthersError):
 
 
 class FmuBuildError(FmuError, ValueError):
-    """An FMU cannot be made from what was given."""
+    """An FMU cannot be made from this input."""
 
 
 class PatchFileError(FmuBuildError):
-    """A patch file cannot be read, or holds an effect that the FMU cannot carry."""
+    """A patch file cannot be read, or has an effect that the FMU cannot contain."""
 
 
 class FmuFileError(FmuError, ValueError):
@@ -59,7 +55,7 @@ class FmuFileError(FmuError, ValueError):
 
 
 class FmuUnsupportedError(FmuError, ValueError):
-    """An FMU is sound but cannot be run, because of its version, interface or platform."""
+    """An FMU is valid but cannot be run, because of its version, interface or platform."""
 
 
 class BindingError(FmuError, ValueError):
@@ -71,11 +67,11 @@ class CouplingError(FmuError, ValueError):
 
 
 class IterationError(FmuError, RuntimeError):
-    """The values of a loop of FMUs did not settle within the iterations that were allowed."""
+    """The values in a cycle of FMUs did not converge within the allowed iterations."""
 
 
 class SspError(FmuError, ValueError):
-    """An SSP file is missing, damaged, unsafe, not valid, or uses what cannot be read."""
+    """An SSP file is missing, damaged, unsafe or invalid, or uses unsupported features."""
 
 
 class FmuInputError(FmuError, ValueError):
@@ -87,7 +83,7 @@ class FmuCallError(FmuError, RuntimeError):
 
 
 class FmuEndedError(FmuCallError):
-    """The FMU has ended its simulation by itself; its outputs of that moment can still be read."""
+    """The FMU has ended its simulation by itself; its last outputs can still be read."""
 
 
 class FmuOutputError(FmuError, RuntimeError):

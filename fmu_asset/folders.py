@@ -1,6 +1,6 @@
-"""Private folders for extracted FMUs and their workers: how they are made and removed.
+"""Private folders for extracted FMUs and their workers.
 
-Nobody else can write into such a folder: it has a parent of its own that only its user may enter.
+Nobody else can write to such a folder: it has a parent of its own that only its user may enter.
 """
 
 import os
@@ -29,9 +29,8 @@ _cleaned_parents: set[Path] = set()
 def plain_folder() -> Path:
     """Return a new private folder whose path has only ASCII letters, digits and `/_.-`.
 
-    Other characters in the path crash some FMUs (those of pythonfmu decode only `%20`). This
-    function also removes folders that an ended process has left, because it was killed together
-    with its worker.
+    Other characters in the path crash some FMUs (those of pythonfmu decode only `%20`). Folders of
+    ended processes that were killed together with their workers are removed meanwhile.
 
     Raises
     ------
@@ -56,7 +55,7 @@ def plain_folder() -> Path:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Return a context with a folder as `plain_folder` makes it, removed when the context ends."""
+    """Provide a folder as `plain_folder` makes it, which is removed when the context ends."""
     folder = plain_folder()
     try:
         yield folder
@@ -65,9 +64,9 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove the folders of processes that have ended from a parent folder, once for each parent.
+    """Remove the folders of ended processes from a parent folder, once for each parent.
 
-    Nothing is done on a system without /proc, which cannot tell whether a process runs.
+    Without /proc nothing is done, because one cannot tell whether a process still runs.
     """
     can_tell = Path("/proc/self").exists() and hasattr(os, "getuid")
     if parent in _cleaned_parents or not can_tell:
@@ -85,7 +84,7 @@ def _remove_leftovers(parent: Path) -> None:
 
 
 def _prefix() -> str:
-    """Return the beginning of our folders' names, which contains the process namespace.
+    """Return the common beginning of our folders' names, which has the process namespace.
 
     Containers may share a folder for temporary files, but not their process numbers.
     """
@@ -97,10 +96,10 @@ def _prefix() -> str:
 
 
 def end_processes(folder: str | os.PathLike[str]) -> None:
-    """Kill the processes that were started with this folder for temporary files.
+    """Kill the processes that were started with this folder as TMPDIR.
 
-    A process inherits the environment variable TMPDIR from its parent, whatever its group or
-    session, and even if the parent has ended.
+    A process inherits this environment variable from its parent, whatever its group or session, and
+    even if the parent has ended.
 
     Parameters
     ----------
@@ -126,7 +125,7 @@ def end_processes(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def _path_of_opened(folder: str) -> Iterator[str]:
-    """Return a context with a path that leads to this folder even if it is moved or replaced."""
+    """Provide a path that leads to this folder even if it is moved or replaced meanwhile."""
     descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         yield f"/proc/self/fd/{descriptor}"
@@ -135,17 +134,11 @@ def _path_of_opened(folder: str) -> Iterator[str]:
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and its content, however deeply nested, as far as it can be removed.
+    """Remove a folder and its content, however deeply nested, as far as possible.
 
     Inner folders are first moved to the top. `shutil.rmtree` would call itself for each level, and
-    a deep path is longer than the system allows; on systems other than Linux it is used anyway.
-    Links are not followed, not even those by which a process of the FMU replaces a folder
-    meanwhile.
-
-    Parameters
-    ----------
-    folder : path-like
-        The path of the folder.
+    a deep path is longer than the system allows; it is used on systems other than Linux. Links are
+    not followed, not even those with which a process of the FMU replaces a folder meanwhile.
     """
     if not _HAS_OPENED_PATHS:
         shutil.rmtree(folder, ignore_errors=True)

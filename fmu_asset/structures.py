@@ -1,4 +1,4 @@
-"""Files for the FMU of a structure: its binding, and the file by which campaigns use it as a model.
+"""Files for the FMU of a structure: its binding, and its description as a model of campaigns.
 
 With the latter, campaigns are calibrated and missing effects are searched for:
 `docs/how_to/fmu_models.md`.
@@ -16,15 +16,15 @@ from reporting.toml_file import parse_toml
 
 
 def structure_binding_text(design: StructureDesign, frequencies: int = 0) -> str:
-    """Return the binding file of a structure's FMU, with all its variables.
+    """Return the text of the binding file of a structure's FMU, with all its variables.
 
     Parameters
     ----------
     design : StructureDesign
-        The structure; its reduced model has the same names.
+        The structure; its reduced model uses the same names.
     frequencies : int
-        The number of natural frequencies that are observed as well. They take the FMU more time
-        than all the other outputs.
+        The number of natural frequencies that are observed as well. They take the FMU longer than
+        all other outputs together.
     """
     modes = [f"[{mode}]" for mode in range(1, frequencies + 1)]
     text = rendered("structure_binding.toml", design=design, modes=modes).decode()
@@ -39,7 +39,7 @@ def structure_binding(design: StructureDesign, frequencies: int = 0) -> Binding:
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
-    """Return the file that describes a structure's FMU as a model for campaigns.
+    """Return the text of the file that describes a structure's FMU as a model for campaigns.
 
     It has the forces, outputs, ports and parameters of the structure's file. A control in N is a
     force, and one named load_factor is the load factor of flights. A point with a load of 1 N and a
@@ -48,8 +48,6 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
 
     Parameters
     ----------
-    design : MeshDesign or MatrixDesign
-        The design of the structure, as read from its file.
     fmu : str
         Path of its FMU, relative to the folder of the file.
 
@@ -94,5 +92,5 @@ def _is_unit_force_along(load: MeshLoad | MatrixLoad, output: PointOutput | Node
 
 
 def _location(part: MeshLoad | MatrixLoad | PointOutput | NodeOutput) -> object:
-    """Return the point or node of a load or output; None if it has none."""
+    """Return the point or node of a load or output, or None."""
     return getattr(part, "point", getattr(part, "node", None))

@@ -40,23 +40,21 @@ class VariableInfo:
 
     Attributes
     ----------
-    name, description : str
-        The name and the description in the model description.
     reference : int
         The value reference.
     kind : str
         The base type of FMI: Real, Integer, Enumeration, Boolean, String; in FMI 3 Float64, Int32,
         Binary, ...
     causality, variability : str
-        The causality and variability in the words of FMI.
+        As FMI defines them.
     unit, display_unit : str or None
-        The units that the variable declares, or else its declared type.
+        Those of the variable, or else of its declared type.
     minimum, maximum : float or None
         The declared range, in `unit`.
     start : str or None
-        The declared start value; the start values of all elements of an array, with blanks between.
+        The declared start value; for an array those of all elements, separated by blanks.
     shape : tuple of int
-        The lengths of an array of FMI 3, with the start values of its structural parameters; empty
+        The lengths of an array of FMI 3, for the start values of its structural parameters; empty
         for a scalar.
     dimensions : tuple of str or None
         For each length of the shape the name of the structural parameter that sets it; None if it
@@ -94,7 +92,7 @@ class VariableInfo:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """The names of an array's elements, row by row and from 1; of a scalar its own name."""
+        """The names of an array's elements, row by row and from 1; for a scalar its own name."""
         if not self.shape:
             return (self.name,)
         ranges = [range(1, length + 1) for length in self.shape]
@@ -106,7 +104,7 @@ class VariableInfo:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The least and largest value: the declared range, limited to that of the type.
+        """The smallest and largest value: the declared range within that of the type.
 
         In C, an integer beyond the range of its type would wrap around.
         """
@@ -118,7 +116,7 @@ class VariableInfo:
         return low, high
 
     def _bounds_of_type(self) -> tuple[float, float]:
-        """Return the least and largest value that the base type can hold."""
+        """Return the smallest and largest value of the base type."""
         if self.kind == "Boolean":
             return 0.0, 1.0
         if self.base_type not in ("Integer", "Enumeration"):
@@ -133,15 +131,14 @@ class VariableInfo:
         return "" if self.unit in (None, "1") else f" {self.unit}"
 
     def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
-        """Return the variable with its array resized by new values of structural parameters.
+        """Return the variable with array lengths for new values of structural parameters.
 
-        If all elements have the same start value, the new elements have it as well.
+        If all elements have the same start value, new elements have it as well.
 
         Parameters
         ----------
         lengths : mapping of str to int
-            The new values of structural parameters, by name. A parameter without an entry keeps its
-            value.
+            The new values by parameter; the others keep theirs.
 
         Raises
         ------
@@ -164,14 +161,14 @@ class VariableInfo:
 
     @property
     def base_type(self) -> str:
-        """The type in the words of FMI 2 and SSP 1.0, which know reals and integers of one size."""
+        """The type as FMI 2 and SSP 1.0 call it: reals and integers have no size there."""
         if self.kind in FLOAT_KINDS:
             return "Real"
         return "Integer" if self.kind.lstrip("U").startswith("Int") else self.kind
 
     @property
     def single(self) -> bool:
-        """Whether the variable always has one number: it is no text, array or clocked variable."""
+        """Whether the variable is always one number: no text, array or clocked variable."""
         return self.numeric and not self.shape and not self.clocked
 
     @property
@@ -230,15 +227,15 @@ class UnitInfo:
 
 @dataclass(frozen=True)
 class FmuDescription(FmuIdentity):
-    """What an FMU file is and declares, in plain values that a process can be sent.
+    """The declarations of an FMU file, in plain values that can be sent to a process.
 
     Attributes
     ----------
     path : Path
         The FMU file.
     shown_as : str
-        The name of the FMU in messages; empty if that is the path. The FMU of an SSP file needs a
-        name, as it lies in a temporary folder.
+        The name of the FMU in messages, if not its path. The FMU of an SSP file has one, because it
+        lies in a temporary folder.
     sha256 : str
         The hash of the file.
     file_size : int
@@ -258,14 +255,14 @@ class FmuDescription(FmuIdentity):
     needs_tool : bool
         Whether the FMU needs its authoring tool.
     once_per_process : bool
-        Whether a process can make one instance only.
+        Whether a process can make only one instance.
     start_time, stop_time, step_size, tolerance : float or None
         The values of the default experiment; times in s.
     fixed_step : float or None
         The internal step size that FMI 3 declares [s].
     can_interpolate_inputs : bool
-        Whether inputs can change linearly between communication points. This is so in model
-        exchange, and in co-simulation if the FMU declares `canInterpolateInputs` (FMI 1 and 2).
+        Whether inputs can change linearly between communication points: in model exchange always,
+        in co-simulation if the FMU declares `canInterpolateInputs` (FMI 1 and 2).
     """
 
     path: Path
@@ -307,19 +304,17 @@ class FmuDescription(FmuIdentity):
         return {variable.name: variable for variable in self.variables}
 
     def variable(self, name: str) -> VariableInfo | None:
-        """Return the variable of that name, or None."""
+        """Return the variable of a name, or None."""
         return self._variable_by_name.get(name)
 
     def hint(self, name: str) -> str:
-        """Return the end of a message on an unknown name: the most similar name, or a full stop."""
+        """Return the end of a message about an unknown name, with a similar name if any."""
         similar = get_close_matches(name, [variable.name for variable in self.variables], 1)
         return f"; did you mean {similar[0]!r}?" if similar else "."
 
     @cached_property
     def feedthrough(self) -> dict[str, frozenset[str]]:
-        """The inputs on which each variable depends directly, by the name of the variable.
-
-        Only variables that can be the source of a connection have an entry.
+        """For each variable that can feed a connection, the inputs on which it depends directly.
 
         According to FMI, an output without declared dependencies depends on all inputs.
         """
@@ -336,17 +331,7 @@ class FmuDescription(FmuIdentity):
         return direct_inputs
 
     def step_of(self, step_size: float | None) -> float | None:
-        """Return the communication step size: the one asked for, or else the FMU's own.
-
-        Parameters
-        ----------
-        step_size : float or None
-            The step size that a user asks for [s].
-
-        Returns
-        -------
-        float or None
-            The step size [s]; None if neither the user nor the FMU states one.
+        """Return the communication step size [s]: the given one, else the FMU's own, else None.
 
         Raises
         ------
@@ -360,11 +345,11 @@ class FmuDescription(FmuIdentity):
         return step_size or self.fixed_step or self.step_size
 
     def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
-        """Return the unit definitions that apply to a variable: in one FMU, all of them."""
+        """Return the unit definitions for a variable: in one FMU, all of them."""
         return self.units
 
     def exchange_kind(self, variable: VariableInfo) -> str:
-        """Return the base type by which a variable is set and read; enumerations are integers."""
+        """Return the base type in calls that set or read a variable; enumerations are integers."""
         if variable.kind != "Enumeration":
             return variable.kind
         return "Int64" if self.major_version == 3 else "Integer"

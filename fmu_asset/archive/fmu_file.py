@@ -1,6 +1,6 @@
-"""Checking FMU files from outside, reading what they declare, and extracting them.
+"""Checks FMU files from outside, reads what they declare, and extracts them.
 
-An FMU is a ZIP archive of foreign code. Before anything of it is written to disk or run, its
+An FMU is a ZIP archive with foreign code. Before any of it is written to disk or run, its
 structure, names, sizes and checksums are checked, and its model description is read without
 expanding entities.
 """
@@ -54,19 +54,12 @@ _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 
 
 def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -> FmuDescription:
-    """Check an FMU file and return what it declares, without extracting it.
+    """Check an FMU file and return its declarations, without extracting it.
 
     Parameters
     ----------
-    path : path-like
-        The path of the FMU file.
     interface : {"co-simulation", "model-exchange"}, optional
         The interface to be used; by default co-simulation if the FMU offers it.
-
-    Returns
-    -------
-    FmuDescription
-        The declarations of the FMU.
 
     Raises
     ------
@@ -86,21 +79,17 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
 def inspect_fmu(
     path: str | os.PathLike[str], interface: Interface | None = None
 ) -> tuple[FmuDescription, str]:
-    """Check an FMU file of any platform; return what it declares, and why it cannot run here.
+    """Check an FMU file and return its declarations, even if it has no binary for this platform.
 
     Parameters
     ----------
-    path : path-like
-        The path of the FMU file.
     interface : {"co-simulation", "model-exchange"}, optional
         The interface to be used; by default co-simulation if the FMU offers it.
 
     Returns
     -------
-    description : FmuDescription
-        The declarations of the FMU.
     obstacle : str
-        A sentence that says why it has no binary for this platform; empty if it has one.
+        Why it cannot run on this platform; empty if it can.
 
     Raises
     ------
@@ -150,7 +139,7 @@ def inspect_fmu(
 
 
 def _platforms(entry_names: set[str]) -> tuple[str, ...]:
-    """Return the names of the platforms for which an FMU has binaries, such as linux64."""
+    """Return the platforms for which an FMU has binaries, such as linux64."""
     platforms = set()
     for name in entry_names:
         if re.match(r"binaries/[^/]+/.+", name):
@@ -159,7 +148,7 @@ def _platforms(entry_names: set[str]) -> tuple[str, ...]:
 
 
 def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
-    """Return the message that an archive has no modelDescription.xml in its top folder."""
+    """Return the message about an archive without modelDescription.xml in its top folder."""
     lacking = f"{file} is an archive without modelDescription.xml"
     if "./modelDescription.xml" in entry_names:
         return f"{lacking}, but with './modelDescription.xml': {_PACK_WITHOUT_DOT}"
@@ -175,19 +164,7 @@ def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
 def _missing_binary_sentence(
     file: Path, entry_names: set[str], binary: str, platforms: tuple[str, ...]
 ) -> str:
-    """Return the message that an FMU lacks the binary for this platform, or misnames it.
-
-    Parameters
-    ----------
-    file : Path
-        The path of the FMU file.
-    entry_names : set of str
-        The names of the files in it.
-    binary : str
-        The name that the binary should have.
-    platforms : tuple of str
-        The platforms for which the FMU has binaries.
-    """
+    """Return the message about an FMU whose binary for this platform is missing or misnamed."""
     if f"./{binary}" in entry_names:
         return f"{file} has no binary {binary}, but one named './{binary}': {_PACK_WITHOUT_DOT}"
     path = PurePosixPath(binary)
@@ -209,12 +186,12 @@ def _missing_binary_sentence(
 
 
 def extract_fmu(description: FmuDescription) -> Path:
-    """Extract an FMU that `read_fmu` has checked into a new folder with a plain ASCII path.
+    """Extract an FMU that `read_fmu` has checked to a new folder with a plain ASCII path.
 
     Parameters
     ----------
     description : FmuDescription
-        The FMU as `read_fmu` returned it. The file must not have changed since.
+        The file must not have changed since `read_fmu` returned this.
 
     Returns
     -------
@@ -266,18 +243,14 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
 def check_archive(
     file: Path, size: int, archive_kind: str = "FMU", remedy: str = "build"
 ) -> set[str]:
-    """Check an archive (structure, checksums, names and sizes), and return the names of its files.
+    """Check an archive's structure, checksums, names and sizes; return the names of its files.
 
     Parameters
     ----------
-    file : Path
-        The path of the archive.
-    size : int
-        The size of the archive [bytes].
     archive_kind : str
-        The kind of file that the archive should be, for the message.
+        What the archive should be, for the message.
     remedy : str
-        The verb for how a user makes the file again, for the message: "build".
+        A verb for making the file again, for the message, such as "build".
 
     Returns
     -------
@@ -309,7 +282,7 @@ def check_archive(
 
 
 def _check_extracted_size(file: Path, size: int, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse archives that would fill the disk: too many entries, or too large when extracted."""
+    """Raise an error if an archive has too many files, or would fill the disk when extracted."""
     if len(entries) > _MOST_ENTRIES:
         raise FmuFileError(
             f"{file} holds {len(entries)} entries, more than {_MOST_ENTRIES}; no tool exports "
@@ -326,7 +299,7 @@ def _check_extracted_size(file: Path, size: int, entries: list[zipfile.ZipInfo])
 
 
 def _check_duplicate_entries(file: Path, archive: zipfile.ZipFile) -> None:
-    """Refuse two entries of the same name with different content.
+    """Raise an error if two entries of the same name have different content.
 
     Programs that read archives differ in which of the two they take.
     """
@@ -344,7 +317,7 @@ def _check_duplicate_entries(file: Path, archive: zipfile.ZipFile) -> None:
 
 
 def _check_entry_name(file: Path, entry: zipfile.ZipInfo) -> None:
-    """Refuse an entry that would be extracted outside its folder, or has too many folders."""
+    """Raise an error if an entry would leave the folder when extracted, or lies too deep."""
     name = entry.orig_filename
     with_slashes = name.replace("\\", "/")
     parts = PurePosixPath(with_slashes).parts
@@ -370,7 +343,7 @@ def _check_entry_name(file: Path, entry: zipfile.ZipInfo) -> None:
 
 
 class _NoDocumentTypeBuilder(TreeBuilder):
-    """A builder of XML trees that stops at a document type, before its entities are defined."""
+    """Builds an XML tree, but raises an error at a document type, before entities are defined."""
 
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
         raise FmuFileError(
@@ -380,7 +353,7 @@ class _NoDocumentTypeBuilder(TreeBuilder):
 
 
 def _parsed_model_description(file: Path) -> Element:
-    """Return the XML of the model description; refuse entities.
+    """Return the XML of the model description; raise an error if it defines entities.
 
     Entities can be nested until they fill the memory, or include files of this machine.
     """
@@ -405,12 +378,12 @@ def _parsed_model_description(file: Path) -> Element:
 
 
 def design_record(design_hash: str) -> bytes:
-    """Return the content of the file `DESIGN_RECORD`, which records the design of an FMU."""
+    """Return the content of `DESIGN_RECORD`, the file with the design hash of an FMU."""
     return (json.dumps({"design_hash": design_hash}) + "\n").encode()
 
 
 def packed_design_hash(path: str | os.PathLike[str]) -> str:
-    """Return the hash of the design from which an FMU was built; empty if the FMU records none."""
+    """Return the hash of the design of which an FMU was built; empty if it has none."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"resources/{DESIGN_RECORD}") as file:
             design_hash = json.loads(file.read(_LARGEST_DESIGN_RECORD_BYTES))["design_hash"]

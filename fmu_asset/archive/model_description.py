@@ -1,4 +1,4 @@
-"""Reading the records of `declared` from a model description that fmpy has read."""
+"""Converts a model description that fmpy has read to the records of `declared`."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -24,10 +24,7 @@ _XML_TRUE = ("true", "1")
 
 
 class FmuFileFacts(NamedTuple):
-    """The facts about an FMU file that its model description does not declare.
-
-    The attributes are those of `FmuDescription`.
-    """
+    """What is known of an FMU file without its model description; see `FmuDescription`."""
 
     path: Path
     sha256: str
@@ -38,24 +35,17 @@ class FmuFileFacts(NamedTuple):
 def read_declared(
     declared: ModelDescription, root: Element, file: FmuFileFacts, interface: Interface | None
 ) -> FmuDescription:
-    """Return the declarations of an FMU as the records of this package.
+    """Return the declarations of an FMU, converted from those that fmpy has read.
 
     Parameters
     ----------
     declared : fmpy.model_description.ModelDescription
-        The model description as fmpy has read it. It is changed: missing ranges are added and
-        inverse display units removed.
+        What fmpy has read. It is changed: missing ranges are added and inverse display units
+        removed.
     root : Element
-        The XML of the model description, for the declarations that fmpy does not read.
-    file : FmuFileFacts
-        Path, hash, size and platforms of the file.
+        The XML, for declarations that fmpy does not read.
     interface : {"co-simulation", "model-exchange"} or None
-        The interface to be used; if it is None, co-simulation if the FMU offers it.
-
-    Returns
-    -------
-    FmuDescription
-        The declarations.
+        The interface to be used; None for co-simulation if the FMU offers it.
 
     Raises
     ------
@@ -112,7 +102,7 @@ def _offered_interfaces(
 ) -> dict[Interface, CoSimulation | ModelExchange]:
     """Return fmpy's record of each interface that an FMU offers, co-simulation first.
 
-    An FMU without interfaces, or without the wanted one, is refused.
+    An error is raised if there is none, or not the requested one.
     """
     offered: dict[Interface, CoSimulation | ModelExchange] = {}
     if declared.coSimulation is not None:
@@ -146,7 +136,7 @@ def _capabilities(
     root: Element,
     interface: Interface,
 ) -> _Capabilities:
-    """Return the capabilities of an interface, which fmpy does not read for FMI 1."""
+    """Return the capabilities of an interface; those of FMI 1 are read here, not by fmpy."""
     can_vary_step = getattr(declared_interface, "canHandleVariableCommunicationStepSize", True)
     declares_interpolation = getattr(declared_interface, "canInterpolateInputs", False)
     can_interpolate = interface == "model-exchange" or declares_interpolation
@@ -162,7 +152,7 @@ def _capabilities(
 
 
 def _read_missing_ranges(declared: ModelDescription, root: Element) -> None:
-    """Add the ranges of unsigned integers to fmpy's records, as fmpy 0.3.32 does not read them."""
+    """Add the ranges of unsigned integers, which fmpy 0.3.32 does not read, to its records."""
     elements = {}
     for element in root.iterfind("ModelVariables/*"):
         if element.tag.startswith("UInt"):
@@ -188,7 +178,7 @@ def _remove_inverse_display_units(declared: ModelDescription, root: Element) -> 
 
 
 def _declared_dependencies(declared: ModelDescription) -> dict[str, tuple[str, ...]]:
-    """Return the declared names of the variables that each output depends on."""
+    """Return the variables that each output depends on, as far as they are declared."""
     dependencies: dict[str, tuple[str, ...]] = {}
     for output in declared.outputs:
         if output.variable is not None and output.dependencies is not None:
@@ -198,13 +188,13 @@ def _declared_dependencies(declared: ModelDescription) -> dict[str, tuple[str, .
 
 
 def _optional_number(record: object, attribute: str) -> float | None:
-    """Return an attribute of one of fmpy's records as a number; None if it is not declared."""
+    """Return an attribute of a record of fmpy as a number; None if it is not declared."""
     value = getattr(record, attribute, None)
     return None if value is None else float(value)
 
 
 def _variable_info(declared: ScalarVariable, dependencies: tuple[str, ...] | None) -> VariableInfo:
-    """Return the record of a variable; units and limits that it lacks are those of its type."""
+    """Return the record of a variable; units and limits that it lacks come from its type."""
     declared_type = declared.declaredType
     unit_owner = declared_type if declared.unit is None else declared
     display_owner = declared_type if declared.displayUnit is None else declared

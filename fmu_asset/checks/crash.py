@@ -1,4 +1,4 @@
-"""The step at which an FMU crashes, and what the sandbox refused it until then."""
+"""Finds the step at which an FMU crashes, and what the sandbox refused it until then."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -14,10 +14,10 @@ def located_crash(
     run: Callable[[FmiAsset], object],
     crash: FmuWorkerError,
 ) -> FmuWorkerError:
-    """Return the error of a crash that names the step itself, and what the sandbox refused.
+    """Return an error that names the exact step of a crash, and what the sandbox refused.
 
-    Many steps are made in one call, so that the error of a crash may name an earlier step. The
-    simulation is therefore run once more, with a report of each step and of the refused calls.
+    Many steps are made in one call, so the error of a crash may name an earlier step. The
+    simulation is therefore run once more, with a report of each step and of refused calls.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def located_crash(
     run : callable
         Simulates an asset.
     crash : FmuWorkerError
-        The error of the first run; it is returned with a note if the second run does not crash.
+        The error of the first run, which is returned with a note if the second run does not crash.
     """
     with watch_for_refusals() as report:
         has_sandbox = 0

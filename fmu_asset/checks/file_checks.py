@@ -1,4 +1,4 @@
-"""Checks of an FMU's file, which do not run it."""
+"""Checks of an FMU's file that do not run it."""
 
 import zipfile
 from collections.abc import Callable, Iterator
@@ -19,13 +19,7 @@ _COMPILED_MEMBERS = {"resources/reduced_model.bin", "sources/structure_variables
 
 
 def check_file(description: FmuDescription) -> Iterator[Finding]:
-    """Yield the findings of the checks that read an FMU's file without running the FMU.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The declarations of the FMU, whose path names the file.
-    """
+    """Yield the findings of all checks that read an FMU's file without running it."""
     checks: dict[str, Callable[[FmuDescription], list[CheckResult]]] = {
         "archive": _check_archive,
         "fmpy validate": _check_schema,
@@ -44,7 +38,7 @@ def _listed(names: list[str]) -> str:
 
 
 def _check_archive(description: FmuDescription) -> list[CheckResult]:
-    """Report version, interfaces, variables and platforms; `read_fmu` has checked the archive."""
+    """Report version, interfaces, variables and platforms; `read_fmu` has checked the rest."""
     interfaces = " and ".join(description.interfaces)
     platforms = ", ".join(description.platforms)
     text = (
@@ -67,9 +61,9 @@ def _check_schema(description: FmuDescription) -> list[CheckResult]:
 
 
 def _check_content(description: FmuDescription) -> list[CheckResult]:
-    """Check that a wing or structure FMU from this package is unchanged since its build.
+    """Check that a wing or structure FMU of this package is unchanged since its build.
 
-    Its GUID is the hash of its content. Other FMUs give no result.
+    Its GUID is the hash of its content. There is no result for other FMUs.
     """
     with zipfile.ZipFile(description.path) as archive:
         members = set(archive.namelist())
@@ -93,10 +87,7 @@ def _check_content(description: FmuDescription) -> list[CheckResult]:
 
 
 def _check_units(description: FmuDescription) -> list[CheckResult]:
-    """Check that real variables have units that can be converted and have their usual meaning.
-
-    Time, the independent variable, is left out.
-    """
+    """Check that real variables other than time have convertible units with their usual meaning."""
     reals = [
         variable
         for variable in description.variables

@@ -15,12 +15,10 @@ class Finding:
 
     Attributes
     ----------
-    check : str
-        Name of the check, a few words.
     verdict : {"ok", "warning", "problem", "skipped"}
         A warning is allowed but makes an FMU harder to use.
     text : str
-        The finding as one sentence.
+        One sentence.
     """
 
     check: str
@@ -35,12 +33,12 @@ class CheckResult(NamedTuple):
     text: str
 
     def named(self, check: str) -> Finding:
-        """Return the finding of a check of this name."""
+        """Return the finding of the check with this name."""
         return Finding(check, self.verdict, self.text)
 
 
 def one_line(error: FmuError) -> str:
-    """Return in one line the message of an error, and the last message that the FMU logged."""
+    """Return the message of an error, and the last message of the FMU, in one line."""
     text = error.sentence
     if error.messages:
         text += f" The FMU says: {error.messages[-1]}"

@@ -1,4 +1,4 @@
-"""The check of an FMU: rules of the FMI standard, rules of this package, and its behaviour."""
+"""The check of an FMU: rules of the FMI standard and of this package, and its behaviour."""
 
 import os
 from dataclasses import dataclass
@@ -23,10 +23,8 @@ class FmuCheck:
 
     Attributes
     ----------
-    path : Path
-        The path of the FMU file.
     findings : tuple of Finding
-        Findings in the order in which they were made.
+        In the order in which they were made.
     """
 
     path: Path
@@ -57,24 +55,20 @@ def check_fmu(
 
     Parameters
     ----------
-    path : path-like
-        The path of any FMU file.
     binding : Binding or path-like, optional
         The binding with which the FMU is run; by default it is drafted from the model description.
     cycles : int
-        Number of instances that are made and freed one after the other in one process; 0 skips
-        that check.
+        Number of instances that are made and freed one after the other in one process; 0 skips this
+        check.
     step_size : float, optional
         Communication step size of a drafted binding [s].
     step_timeout, memory_limit : float, optional
         Limits of the workers, as in `FmiAsset`.
-    progress : Progress, optional
-        The display of the progress.
 
     Returns
     -------
     FmuCheck
-        The findings. A binding that does not fit the FMU is a finding, not an error.
+        A binding that does not fit the FMU is a finding, not an error.
 
     Raises
     ------
@@ -112,15 +106,13 @@ def check_fmu(
 
 
 def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
-    """Return the binding with which an FMU is checked, drafted from its model description.
+    """Return a binding for the checks of an FMU, drafted from its model description.
 
-    The binding has all inputs and outputs, and the stop time of the FMU's default experiment. The
-    stop time is left out if the steps of the checks would run beyond it.
+    It has all inputs and outputs, and the stop time of the default experiment, unless the checks
+    would step beyond that.
 
     Parameters
     ----------
-    description : FmuDescription
-        The declarations of the FMU.
     step_size : float or None
         Communication step size [s]; the FMU's own if None.
 

@@ -1,4 +1,4 @@
-"""Checks that run an FMU: repetition, resuming, step size, limits of inputs, reset and memory."""
+"""Checks that run an FMU: repetition, resuming, step size, limits of inputs, reset, memory."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
@@ -50,14 +50,10 @@ RunInputs = dict[str, dict[str, Value]]
 
 
 class RunChecks:
-    """Checks that run an FMU with a binding, each time in a new worker.
+    """Checks that run an FMU with a binding, each in a new worker.
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
-    binding : Binding
-        The binding of the FMU.
     step_timeout, memory_limit : float or None
         Limits of the workers, as in `FmiAsset`.
 
@@ -91,8 +87,6 @@ class RunChecks:
         ----------
         cycles : int
             Number of instances that are made one after the other; 0 skips that check.
-        progress : Progress
-            The display of the progress.
         """
         checks: dict[str, Callable[[], CheckResult]] = {
             "determinism": self._check_determinism,
@@ -125,7 +119,7 @@ class RunChecks:
     # ------------------------------------------------------------------ runs
 
     def _asset(self, binding: Binding | None = None) -> FmiAsset:
-        """Return a new asset of the FMU; with the binding of the checks if none is given."""
+        """Return a new asset of the FMU, by default with the binding of the checks."""
         return FmiAsset(
             self._path,
             self._binding if binding is None else binding,
@@ -134,10 +128,10 @@ class RunChecks:
         )
 
     def _inputs_without_start_values(self) -> RunInputs:
-        """Return zeros for the input arrays whose start values do not fit their length, by role.
+        """Return zeros, by role, for input arrays whose start values do not fit their length.
 
-        Structural parameters that the binding sets change the length of an array, but not the
-        number of its declared start values.
+        Structural parameters in the binding change the length of an array, but not the number of
+        its declared start values.
         """
         zeros: RunInputs = {role: {} for role in INPUT_ROLES}
         # Without structural parameters all start values fit.
@@ -160,12 +154,12 @@ class RunChecks:
         return fmu.find(variable, f"{role}.{name}", "parameter" if is_start_health else "input")
 
     def _run(self) -> Float:
-        """Return the n outputs in each of N steps of a run, (N, n), in a new worker."""
+        """Return the outputs (N, n) of N steps in a new worker."""
         with closing(self._asset()) as asset:
             return self._run_from_start(asset)
 
     def _run_from_start(self, asset: FmiAsset) -> Float:
-        """Reset an asset to its start values; return its n outputs in each of N steps, (N, n)."""
+        """Reset an asset, and return its outputs (N, n) in N steps."""
         asset.reset(**self._base_inputs)
         return _outputs_of_steps(asset, RUN_STEPS)
 
@@ -174,7 +168,7 @@ class RunChecks:
     def _check_sandbox(self) -> CheckResult:
         """Run once more, and report the system calls that the sandbox refuses.
 
-        If the run fails, the calls before the failure are reported.
+        If the run fails, this covers the calls before the failure.
         """
         if not (self._binding.limits.sandbox and landlock_version()):
             text = "There is no sandbox: the binding turns it off, or the kernel has none."
@@ -185,7 +179,7 @@ class RunChecks:
             return CheckResult(report.verdict(), report.sentence())
 
     def _check_determinism(self) -> CheckResult:
-        """Check that two runs in two processes give equal outputs, bit by bit."""
+        """Check that runs in two processes give bitwise equal outputs."""
         outputs = self._run()
         if outputs.tobytes() == self._first_outputs.tobytes():
             return CheckResult("ok", "Two flights in two processes are equal to the bit.")
@@ -197,7 +191,7 @@ class RunChecks:
         return CheckResult("problem", text)
 
     def _check_state(self) -> CheckResult:
-        """Check that a run equals one that is resumed from a saved state in a new process."""
+        """Check that a run equals one that resumes from a saved state in a new process."""
         steps_after = RUN_STEPS - _STEPS_BEFORE_SAVING
         with closing(self._asset()) as asset:
             asset.reset(**self._base_inputs)
@@ -228,7 +222,7 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_step_size(self) -> CheckResult:
-        """Check how much the outputs change with half the step size, at the same times."""
+        """Check how much the outputs at the same times change with half the step size."""
         header = self._binding.binding
         half_step = header.step_size / 2.0
         # The decimation is the number of steps between two outputs: doubled, it keeps their times.
@@ -255,15 +249,7 @@ class RunChecks:
         return CheckResult("warning" if advice else "ok", text)
 
     def _refused_step(self, step: float, error: FmuCallError) -> CheckResult:
-        """Return the result for an FMU that refuses half the step size.
-
-        Parameters
-        ----------
-        step : float
-            The step size that it refuses [s].
-        error : FmuCallError
-            The error of the step.
-        """
+        """Return the result for an FMU that refuses half the step size [s]."""
         if self._description.can_vary_step:
             text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
             return CheckResult("problem", text)
@@ -274,7 +260,7 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_range_edges(self) -> CheckResult:
-        """Make one step at each limit of the range of each scalar input, and report failures."""
+        """Make one step at each limit of each scalar input's range, and report failures."""
         limit_count = 0
         failures = []
         with closing(self._asset()) as asset:
@@ -304,13 +290,13 @@ class RunChecks:
         return CheckResult("skipped", "No input has a range.")
 
     def _step_with(self, asset: FmiAsset, role: str, name: str, value: float) -> None:
-        """Reset an asset, and make one step with the given value of one input."""
+        """Reset an asset, and make one step with another value of one input."""
         inputs = self._base_inputs | {role: self._base_inputs[role] | {name: value}}
         asset.reset(**self._base_inputs)
         asset.step(**inputs)
 
     def _check_reset(self) -> CheckResult:
-        """Check that a run after a second reset equals the first, and that the FMU can be reset."""
+        """Check that a run after a second reset equals the first run, and that the reset works."""
         with closing(self._asset()) as asset:
             outputs = self._run_from_start(asset)
             outputs_again = self._run_from_start(asset)
@@ -323,19 +309,11 @@ class RunChecks:
                 f"instance ({difference}).",
             )
         if trial.works is False:
-            return CheckResult("problem" if trial.lies else "warning", trial.fault)
+            return CheckResult("problem" if trial.reports_false_success else "warning", trial.fault)
         return CheckResult("ok", "After a reset its outputs are those of a new instance.")
 
     def _check_instances(self, cycles: int, progress: Progress) -> CheckResult:
-        """Make, step and free many instances in one process, and check the growth of its memory.
-
-        Parameters
-        ----------
-        cycles : int
-            The number of instances.
-        progress : Progress
-            The display of the progress.
-        """
+        """Make, step and free instances in one process, and check the growth of its memory."""
         half_of_cycles = cycles // 2
         number = 0
         memory_half_way = 0
@@ -369,7 +347,7 @@ class RunChecks:
 
 
 def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
-    """Make N further steps with unchanged inputs, and return the n outputs of each, (N, n)."""
+    """Make N further steps with unchanged inputs, and return the outputs (N, n)."""
     rows = []
     for _ in range(steps):
         observation = asset.step()

@@ -1,4 +1,4 @@
-"""Sentences about what a binding and its FMU leave open: inputs that nobody sets, missing units."""
+"""Warnings about what a binding and its FMU leave open: unset inputs, missing units."""
 
 from collections.abc import Collection, Iterator, Mapping
 
@@ -21,17 +21,13 @@ def unset_inputs_sentence(
 
     Parameters
     ----------
-    description : FmuDescription
-        The FMU.
-    binding : Binding
-        The binding.
     given_names : mapping of str to collection of str, optional
-        The names of the binding that get values, by role; by default all of the binding.
+        The binding's names of the inputs that get values, by role; by default all of the binding.
 
     Returns
     -------
     str
-        The sentence; empty if all inputs get values.
+        Empty if all inputs get values.
     """
     set_variables = set(_set_variables(binding, given_names))
     unset = []
@@ -54,7 +50,7 @@ def unset_inputs_sentence(
 def _set_variables(
     binding: Binding, given_names: Mapping[str, Collection[str]] | None
 ) -> Iterator[str]:
-    """Yield the variables of the FMU that get values: inputs of roles, and of ports."""
+    """Yield the FMU's variables that get values, through roles and ports."""
     for role in INPUT_ROLES:
         for name, entry in binding.inputs(role).items():
             if given_names is None or name in given_names.get(role, ()):
@@ -73,20 +69,13 @@ def _with_start_value(variable: VariableInfo) -> str:
 def undeclared_units_sentence(description: FmuDescription, binding: Binding) -> str:
     """Return the warning about variables whose unit only the binding states.
 
-    The numbers of such a variable are taken as they are, in the unit of the binding. If this is the
-    unit of SI, it is most likely meant; degC, mm or % may be wrong by an offset or a factor.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU.
-    binding : Binding
-        The binding.
+    Their numbers are taken to be in the binding's unit. In an SI unit that is most likely right; in
+    degC, mm or % they may be wrong by an offset or a factor.
 
     Returns
     -------
     str
-        The sentence; empty if there is no such variable.
+        Empty if there is no such variable.
     """
     without_unit = set()
     for variable in description.variables:
@@ -110,7 +99,7 @@ def undeclared_units_sentence(description: FmuDescription, binding: Binding) -> 
 
 
 def _bound_units(binding: Binding) -> Iterator[tuple[str, str]]:
-    """Yield the variables of the FMU that a binding names, each with its unit in the binding."""
+    """Yield each variable that a binding names, with its unit in the binding."""
     for role in INPUT_ROLES:
         for entry in binding.inputs(role).values():
             yield entry.variable, entry.unit
@@ -123,6 +112,6 @@ def _bound_units(binding: Binding) -> Iterator[tuple[str, str]]:
 
 
 def _is_unit_of_si(unit: str) -> bool:
-    """Return whether a unit is one of SI without prefix, or is not understood."""
+    """Return whether a unit is an SI unit without prefix, or unknown."""
     meaning = meaning_of(unit)
     return meaning is None or (meaning.factor, meaning.offset) == (1.0, 0.0)

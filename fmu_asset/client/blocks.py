@@ -42,21 +42,21 @@ _LARGEST = sys.float_info.max
 
 
 class NumberBlock(Protocol):
-    """A block of numbers that can be set by position: a list, or a view of a C array."""
+    """Numbers that can be set by position: a list, or a view of a C array."""
 
     def __setitem__(self, position: int, number: float, /) -> None:
         """Set a number."""
 
 
 class _SelectedInput(NamedTuple):
-    """An input of the binding, before its positions in the request are known.
+    """An input of the binding before it has positions in the request.
 
     Attributes
     ----------
     role, name : str
         Role and name in the binding.
     selections : list of VariableElements
-        Its variables in the FMU: one, or as many as the vector of a port has.
+        The FMU's variables that it sets: one, or as many as the vector of a port has.
     bound_input : BoundInput
         Its unit and range.
     """
@@ -70,7 +70,7 @@ class _SelectedInput(NamedTuple):
 def _selected_inputs(
     fmu: BoundFmu, ports: Sequence[PortQuantity], misfits: Misfits
 ) -> list[_SelectedInput]:
-    """Return the inputs of all roles and ports, without health that is set only at the start."""
+    """Return all inputs and port inputs that are sent at every step."""
     inputs = []
     for role in INPUT_ROLES:
         for name, entry in fmu.binding.inputs(role).items():
@@ -89,7 +89,7 @@ def _selected_inputs(
 
 
 def _selected_port_input(fmu: BoundFmu, quantity: PortQuantity) -> _SelectedInput:
-    """Return a quantity of a port that is an input of the FMU."""
+    """Return the input for a port's quantity; raise an error if its variables are unlike."""
     names = quantity.vector.variables
     selections = [fmu.find(name, quantity.label, "input") for name in names]
     variables = [selection.variable for selection in selections]
@@ -104,9 +104,9 @@ def _selected_port_input(fmu: BoundFmu, quantity: PortQuantity) -> _SelectedInpu
 
 
 class _PlainInput(NamedTuple):
-    """An input that needs no conversion: one real number, in the FMU's own unit.
+    """An input of one real number in the FMU's own unit, which needs no conversion.
 
-    A value is sent without further checks if it is a float within the limits.
+    A float within the limits is sent as it is.
     """
 
     position: int
@@ -119,14 +119,7 @@ _NOT_PLAIN = _PlainInput(position=0, low=1.0, high=0.0)
 
 
 class Request:
-    """The inputs of a step: their order in the request, and how they are written to it.
-
-    Parameters
-    ----------
-    fmu : BoundFmu
-        The FMU and its binding.
-    inputs : sequence of _SelectedInput
-        The inputs that the binding names.
+    """The layout of the inputs in the request, which also checks, converts and writes them.
 
     Attributes
     ----------
@@ -166,7 +159,7 @@ class Request:
         positions: Sequence[int],
         label_of_position: dict[int, str],
     ) -> None:
-        """Refuse an input that sets a value which another one sets; note its positions."""
+        """Raise an error if another input sets the same value; record the positions."""
         for position in positions:
             if position in label_of_position:
                 raise BindingError(
@@ -177,7 +170,7 @@ class Request:
             label_of_position[position] = bound_input.label
 
     def _check_linear_interpolation(self) -> None:
-        """Refuse linear interpolation if the FMU, or all of its inputs, cannot follow it."""
+        """Raise an error if the FMU, or all of its inputs, do not support linear interpolation."""
         description = self._fmu.description
         wish = f"The binding {self._fmu.binding.title} asks for linear interpolation of inputs, but"
         if not description.can_interpolate_inputs:
@@ -209,13 +202,13 @@ class Request:
         return inputs_of_role[name]
 
     def start_values(self, inputs: InputsByRole) -> list[float]:
-        """Return a request that holds the FMU's own start values of the inputs.
+        """Return a request with the start values that the FMU declares for its inputs.
 
         Parameters
         ----------
         inputs : mapping of str to mapping or None
-            Inputs by role that will be written over these. If they set a whole array, it is zero
-            here: the start values of a resized array may not fit.
+            Inputs by role that will be written over these. An array that they set as a whole is
+            zero here, because the start values of a resized array may not fit.
 
         Raises
         ------
@@ -237,14 +230,12 @@ class Request:
         return block + block[REQUEST_HEAD : REQUEST_HEAD + linear_count]
 
     def write(self, block: NumberBlock, inputs: InputsByRole) -> bool:
-        """Write inputs to a request; return whether there were any.
+        """Write inputs, in the binding's units, to a request; return whether there were any.
 
         Parameters
         ----------
         block : list of float or memoryview
-            The request; changed in place.
-        inputs : mapping of str to mapping or None
-            Inputs by role and by the binding's names, in its units.
+            The request, which is changed in place.
 
         Raises
         ------
@@ -272,21 +263,19 @@ class Request:
         return has_inputs
 
     def of_steps(self, previous: Float, histories: InputsByRole, steps: int | None) -> Float:
-        """Return the requests of many steps, without time and step size.
+        """Return the requests of many steps; time and step size are not filled in.
 
         Parameters
         ----------
         previous : (2 + n_inputs,) ndarray
-            The last request. An input without a history keeps its value.
+            The last request, from which an input without a history keeps its value.
         histories : mapping of str to mapping
-            Inputs by role and name.
-        steps : int, optional
-            The number of steps N; by default that of the histories.
+            Inputs by role and name, in the binding's units.
 
         Returns
         -------
         (N, 2 + n_inputs) ndarray
-            Values in the FMU's units.
+            Values in the FMU's units, for the N steps of the histories or of `steps`.
 
         Raises
         ------
@@ -323,14 +312,12 @@ def _plain_inputs(bound_inputs: Mapping[str, BoundInput]) -> dict[str, _PlainInp
 
 
 def step_count(histories: Sequence[tuple[BoundInput, Float]], steps: int | None) -> int:
-    """Return the number of steps that histories and the caller ask for.
+    """Return the number of steps; check that all histories and the caller agree on it.
 
     Parameters
     ----------
     histories : sequence of (BoundInput, (n,) or (N, n) ndarray)
-        Each input with its values; an (n,) array is for all steps.
-    steps : int, optional
-        The number that the caller asks for.
+        Each input with its values; an (n,) array holds for all steps.
 
     Raises
     ------
@@ -362,7 +349,7 @@ def step_count(histories: Sequence[tuple[BoundInput, Float]], steps: int | None)
 
 
 class _BoundOutput(NamedTuple):
-    """An output that the binding names: what the caller calls it, and in which unit it is."""
+    """An output that the binding names, with the name and unit that the caller uses."""
 
     name: str
     selection: VariableElements
@@ -371,21 +358,14 @@ class _BoundOutput(NamedTuple):
 
 
 class Reply:
-    """The outputs that a binding observes, monitors or records: their order, and their values.
-
-    Parameters
-    ----------
-    fmu : BoundFmu
-        The FMU and its binding.
-    observed, extras : list of _BoundOutput
-        The observations in the order of the binding, and what is read in addition.
+    """The layout of the outputs in the reply, and their conversion to the binding's units.
 
     Attributes
     ----------
     layout : BlockLayout
         Order of the outputs.
     extra_units : dict of str to str
-        Units of the outputs that are read in addition to the observations, by name.
+        Units of the monitors, recorded variables and port outputs, by name.
     names : list of str
         Names of all values in the FMU, in the order of the reply.
     """
@@ -418,7 +398,7 @@ class Reply:
         return converted
 
     def observation(self, block: Float, time: float) -> Observation:
-        """Return the observation in a reply (n_outputs,) at a time [s]."""
+        """Return the observation in a reply (n_outputs,) that was read at a time [s]."""
         values = self._converted(block[self._index])
         extra_values = values[self._observation_count :].tolist()
         # The lengths are equal by construction; checking them would double the time of this line.
@@ -426,16 +406,9 @@ class Reply:
         return Observation(values[: self._observation_count], time, extra_outputs)
 
     def history(self, time: Float, blocks: Float, ended: str = "") -> ObservationHistory:
-        """Return the history in replies.
+        """Return the history in the replies (N, n_outputs) at N times [s].
 
-        Parameters
-        ----------
-        time : (N,) ndarray
-            Time of each reply [s].
-        blocks : (N, n_outputs) ndarray
-            The replies.
-        ended : str
-            How the FMU ended the simulation by itself, if it did.
+        `ended` says how the FMU ended the simulation by itself, if it did.
         """
         values = self._converted(blocks[:, self._index])
         observed_values = np.ascontiguousarray(values[:, : self._observation_count])
@@ -457,14 +430,14 @@ def _slice_or_index(
 
 
 def _bound_output(fmu: BoundFmu, name: str, variable: str, unit: str, label: str) -> _BoundOutput:
-    """Return an output of the FMU; without a unit of the caller it keeps its own."""
+    """Return an output in the given unit; without one, in the FMU's own unit."""
     selection = fmu.find(variable, label, "output")
     unit = unit or selection.variable.unit or "1"
     return _BoundOutput(name, selection, unit, fmu.unit_conversion(selection.variable, unit, label))
 
 
 def _observed_outputs(fmu: BoundFmu, misfits: Misfits) -> list[_BoundOutput]:
-    """Return the outputs that are observed, in the order of the binding."""
+    """Return the outputs of all observations, in the order of the binding."""
     outputs = []
     for key, vector in fmu.binding.observation.items():
         label = f"observation.{key}"
@@ -477,7 +450,7 @@ def _observed_outputs(fmu: BoundFmu, misfits: Misfits) -> list[_BoundOutput]:
 def _extra_outputs(
     fmu: BoundFmu, ports: Sequence[PortQuantity], misfits: Misfits
 ) -> list[_BoundOutput]:
-    """Return the outputs that are read in addition: monitors, recorded variables and ports."""
+    """Return the further outputs: monitors, recorded variables and outputs of ports."""
     outputs = []
     for name, scalar in fmu.binding.monitor.items():
         label = f"monitor.{name}"
@@ -499,31 +472,22 @@ def _extra_outputs(
 
 
 class Blocks:
-    """The request and the reply of an FMU with a binding, and the values set before its start.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
-    binding : Binding
-        The binding of the FMU.
+    """A binding resolved against an FMU: request, reply, and values set before the start.
 
     Attributes
     ----------
     description : FmuDescription
         The FMU, with the array sizes of the binding.
-    binding : Binding
-        The binding, with arrays that are observed or recorded as their elements.
     request : Request
         Inputs of a step.
     reply : Reply
-        Outputs after it.
+        Outputs after a step.
     initial_values : InitialValueTable
         Values that are set before the initialisation.
     health_at_start : dict of str to BoundInput
         Health that is set before the initialisation only, by the binding's names.
     plan : Plan
-        Plan of the instance; its folder is still empty.
+        What each call exchanges with the instance; its folder is filled in later.
 
     Raises
     ------
@@ -556,9 +520,9 @@ class Blocks:
         self.plan = self._plan(configuration)
 
     def _plan(self, configuration: list[InitialValue]) -> Plan:
-        """Return the plan of the instance, without its folder.
+        """Return the plan of the instance, whose folder is not known yet.
 
-        If the binding states no tolerance, our solver uses the declared one, but none above its
+        If the binding states no tolerance, our solver uses the smaller of the declared one and its
         default.
         """
         description = self.description
@@ -578,7 +542,7 @@ class Blocks:
         )
 
     def bound_input(self, role: str, name: str) -> BoundInput:
-        """Return an input, also one that is set before the initialisation only.
+        """Return an input of the binding, including health that is set at the start only.
 
         Raises
         ------
@@ -594,12 +558,12 @@ class Blocks:
         parameters: Mapping[str, npt.ArrayLike],
         health: Mapping[str, npt.ArrayLike] | None = None,
     ) -> InitialValues:
-        """Return the values that are set before the initialisation, see `InitialValueTable`."""
+        """Return the values that are set before the start; see `InitialValueTable`."""
         return self.initial_values.initial_values(parameters, health)
 
 
 def _check_version(description: FmuDescription, binding: Binding) -> None:
-    """Refuse an FMU whose version of FMI is not the one that the binding states."""
+    """Raise an error if the FMU does not have the version of FMI that the binding states."""
     version = binding.binding.fmi_version
     if version is not None and version[0] != description.fmi_version[0]:
         raise BindingError(

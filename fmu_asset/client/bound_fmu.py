@@ -40,19 +40,17 @@ class VariableElements(NamedTuple):
 def find_variable(
     description: FmuDescription, name: str, label: str, causality: str
 ) -> VariableElements:
-    """Return the variable of an FMU, or the element of an array, that a binding names.
+    """Return the FMU's variable, or the element of an array, that a binding names.
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
     name : str
         A variable, or an element of an array such as `p[3]`.
     label : str
-        Place in the binding, for messages.
+        Where the name stands in the binding, for messages.
     causality : {"input", "parameter", "structuralParameter", "output"}
-        Role of the variable. Everything that is neither input nor parameter can be read as an
-        output; a tunable parameter can be sent at every step like an input (co-simulation); and a
+        How the variable is used. Everything that is neither input nor parameter can be read as an
+        output; in co-simulation a tunable parameter can be sent at every step like an input; and a
         start value can be set like a parameter.
 
     Raises
@@ -75,12 +73,9 @@ def find_variable(
 
 
 def _find_element(description: FmuDescription, name: str, label: str) -> VariableElements | None:
-    """Return the element of an array that a name like `p[3]` means.
+    """Return the array element that a name like `p[3]` means.
 
-    Returns
-    -------
-    VariableElements or None
-        None if the name has another form, or the FMU has no such array.
+    None if the name has another form, or the FMU has no such array.
     """
     match = _ELEMENT.fullmatch(name)
     if match is None:
@@ -102,7 +97,7 @@ def _find_element(description: FmuDescription, name: str, label: str) -> Variabl
 def _check_use(
     description: FmuDescription, variable: VariableInfo, causality: str, name: str, label: str
 ) -> None:
-    """Refuse a variable that cannot be used in the role of a causality; see `find_variable`."""
+    """Raise an error if a variable cannot be used as its causality asks; see `find_variable`."""
     is_tunable_input = (
         causality == "input"
         and variable.causality == "parameter"
@@ -140,10 +135,6 @@ class BlockLayout:
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
-    variables : sequence of VariableInfo
-        Variables that are exchanged. A variable that is named twice is in the block once.
     begin : int
         Position of the first value.
     linear : bool
@@ -151,10 +142,8 @@ class BlockLayout:
 
     Attributes
     ----------
-    variables : tuple of VariableInfo
-        The variables in the order of the block.
     groups : tuple of VariableGroup
-        The groups that are set or read in one call.
+        Variables of one type, which are set or read in one call.
     """
 
     def __init__(
@@ -197,7 +186,7 @@ class BlockLayout:
 
 
 class Misfits:
-    """The entries of a binding that do not fit an FMU; one message names them all.
+    """Collects the entries of a binding that do not fit an FMU, for one message.
 
     Parameters
     ----------
@@ -214,14 +203,14 @@ class Misfits:
 
     @contextmanager
     def at(self, label: str) -> Iterator[None]:
-        """Note the first `BindingError` at a place of the binding, and go on after it."""
+        """Record the first `BindingError` at an entry of the binding, and go on."""
         try:
             yield
         except BindingError as error:
             self._messages.setdefault(label, str(error))
 
     def refuse(self) -> None:
-        """Raise a `BindingError` if an entry did not fit."""
+        """Raise a `BindingError` that names all recorded entries, if there are any."""
         messages = [*self._messages.values()]
         if not messages:
             return
@@ -234,7 +223,7 @@ class Misfits:
 
 
 class PortQuantity(NamedTuple):
-    """A quantity of a mechanical port, resolved against an FMU.
+    """A quantity of a mechanical port, with its variables in the FMU.
 
     Attributes
     ----------
@@ -243,7 +232,7 @@ class PortQuantity(NamedTuple):
     vector : VectorBinding
         Its variables.
     is_read : bool
-        Whether it is an output of the FMU: of force and motion one is, and the other is not.
+        Whether it is an output of the FMU: either the force is, or the motion.
     """
 
     name: str
@@ -257,14 +246,12 @@ class PortQuantity(NamedTuple):
 
 
 class BoundFmu:
-    """An FMU and its binding, which names variables of the FMU.
+    """An FMU and its binding; it finds the variables that the binding names.
 
     Parameters
     ----------
     description : FmuDescription
         The FMU, with the array sizes of the binding.
-    binding : Binding
-        The binding of the FMU.
     """
 
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
@@ -276,16 +263,7 @@ class BoundFmu:
         return f"{label} of the binding {self.binding.title}"
 
     def find(self, name: str, label: str, causality: str) -> VariableElements:
-        """Return the variable, or element of an array, that the binding names at a place.
-
-        Parameters
-        ----------
-        name : str
-            Name in the FMU.
-        label : str
-            Place in the binding.
-        causality : str
-            Role of the variable, see `find_variable`.
+        """Return the variable, or element of an array, that the binding names; see `find_variable`.
 
         Raises
         ------
@@ -295,7 +273,7 @@ class BoundFmu:
         return find_variable(self.description, name, self.place_in_binding(label), causality)
 
     def variable_or_array(self, name: str) -> VariableInfo | None:
-        """Return the variable of a name, or the array to whose element the name belongs."""
+        """Return the variable of a name such as `p`, or the array `p` for `p[3]`."""
         array_name = name.rpartition("[")[0]
         return self.description.variable(name) or self.description.variable(array_name)
 
@@ -316,18 +294,14 @@ class BoundFmu:
         variable: VariableInfo,
         positions: Sequence[int] = (),
     ) -> BoundInput:
-        """Return an input of the binding, which checks and converts its values for the FMU.
+        """Return an input of the binding, which checks and converts values for the FMU.
 
         Parameters
         ----------
         label : str
-            The place in the binding.
-        input_binding : InputBinding
-            The unit and the range of the input.
-        variable : VariableInfo
-            The FMU's variable.
+            Where the input stands in the binding, for messages.
         positions : sequence of int
-            The positions of the input's values in a block of values; empty before it is laid out.
+            Positions of its values in the request; empty as long as the request has no layout.
 
         Raises
         ------
@@ -369,7 +343,7 @@ class BoundFmu:
         return self.bound_input(label, input_binding, selection.variable, selection.elements)
 
     def unit_conversion(self, variable: VariableInfo, unit: str, label: str) -> Conversion:
-        """Return the conversion of a value from the caller's unit to the unit of a variable.
+        """Return the conversion from the caller's unit to the unit of a variable.
 
         Raises
         ------
@@ -382,7 +356,7 @@ class BoundFmu:
     # ------------------------------------------------------------------ ports
 
     def port_quantities(self, misfits: Misfits) -> list[PortQuantity]:
-        """Return the quantities of all ports of the binding, and note those that do not fit.
+        """Return the quantities of all ports of the binding, and record what does not fit.
 
         A port does not fit if a variable is not in the FMU, if it mixes inputs and outputs, or if
         force and motion are both inputs or both outputs. The quantities of a port are compared with
@@ -401,14 +375,14 @@ class BoundFmu:
         return quantities
 
     def _check_port_variables(self, label: str, vector: VectorBinding) -> None:
-        """Refuse variables of a port that the FMU does not have, or has in another unit."""
+        """Raise an error if the FMU lacks a variable of a port, or has it in another dimension."""
         for name, unit in zip(vector.variables, vector.units, strict=True):
             causality = "input" if self._is_input(name) else "output"
             variable = self.find(name, label, causality).variable
             self.unit_conversion(variable, unit, label)
 
     def _quantities_of_port(self, port_name: str, port: PortBinding) -> list[PortQuantity]:
-        """Return the quantities of a port; for errors see `port_quantities`."""
+        """Return the quantities of a port; raise an error unless force and motion are opposite."""
         quantities = []
         force_count = len(port.force.variables)
         is_output_of_quantity: dict[str, bool] = {}
@@ -430,14 +404,7 @@ class BoundFmu:
     def _is_output_vector(self, label: str, vector: VectorBinding, force_count: int) -> bool:
         """Return whether the variables of a port's quantity are outputs of the FMU.
 
-        Parameters
-        ----------
-        label : str
-            The place of the quantity in the binding.
-        vector : VectorBinding
-            The variables of the quantity.
-        force_count : int
-            The number of components of the force, which the quantity must have, too.
+        Raise an error if their number differs from that of the force, or if they are mixed.
         """
         location = self.place_in_binding(label)
         count = len(vector.variables)
@@ -466,12 +433,8 @@ def start_values(
 
     Parameters
     ----------
-    description : FmuDescription
-        The FMU, for messages.
-    variable : VariableInfo
-        The variable, with its present shape.
     placeholders : bool
-        Whether to return zeros, because the caller sets all values. The start values of a resized
+        Whether to return zeros, because the caller sets all values: the start values of a resized
         array may not fit.
 
     Raises
@@ -504,19 +467,12 @@ def start_values(
 def with_structural_parameters(
     description: FmuDescription, binding: Binding
 ) -> tuple[FmuDescription, list[InitialValue]]:
-    """Return an FMU with the array sizes that a binding chooses, and the values that set them.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The FMU as its file declares it.
-    binding : Binding
-        The binding; its structural parameters are sizes of arrays (FMI 3).
+    """Return the FMU with the array sizes that a binding chooses, and the values to set for them.
 
     Raises
     ------
     BindingError
-        If the FMU has no such structural parameter, or is run by model exchange.
+        If the FMU has no such structural parameter (FMI 3), or is run by model exchange.
     FmuInputError
         If a value is not a whole number or out of range, or makes an array too large.
     """

@@ -1,4 +1,4 @@
-"""An input or parameter that a binding names: its values are checked and converted for the FMU."""
+"""An input or parameter of a binding, which checks and converts its values for the FMU."""
 
 import math
 from collections.abc import Sequence
@@ -15,20 +15,18 @@ from .units import IDENTITY, Conversion
 
 
 class BoundInput(NamedTuple):
-    """An input or parameter of a binding: its range, unit and positions in the FMU.
+    """An input or parameter of a binding: range, unit, and positions of its n values.
 
     Attributes
     ----------
     label : str
         Role and name in the binding, for messages.
     positions : sequence of int
-        Positions of its n values in the request block, or among the values of a parameter.
+        Positions in the request, or among the elements of a parameter.
     low, high : float
         Range in the FMU's unit.
     conversion : Conversion
         Conversion from the binding's unit to the FMU's.
-    variable : VariableInfo
-        The FMU's variable.
     """
 
     label: str
@@ -44,13 +42,13 @@ class BoundInput(NamedTuple):
         return self.variable.kind not in FLOAT_KINDS
 
     def numbers(self, values: npt.ArrayLike, *, history: bool = False) -> Float:
-        """Check the values of an input, and return them in the unit of the FMU.
+        """Check the values of an input, and return them in the FMU's unit.
 
         Parameters
         ----------
         values : float, str or array_like
-            The n values of the input in the binding's unit. A history has N n values, n for each of
-            N steps, or n values that hold for all steps.
+            The n values in the binding's unit. A history has (N, n) values for N steps, or n values
+            that hold for all steps.
         history : bool
             Whether the values may differ from step to step.
 
@@ -93,7 +91,7 @@ class BoundInput(NamedTuple):
     # ------------------------------------------------------------------ reading
 
     def _with_item_numbers(self, values: npt.ArrayLike) -> npt.ArrayLike:
-        """Return values with the names of an enumeration's items replaced by their numbers."""
+        """Return values with names of an enumeration's items replaced by their numbers."""
         if not self.variable.items:
             return values
         if isinstance(values, str):
@@ -107,7 +105,7 @@ class BoundInput(NamedTuple):
         return values
 
     def _number_of_item(self, name: str) -> float:
-        """Return the number of an enumeration's item; refuse an unknown name."""
+        """Return the number of an enumeration's item; raise an error for an unknown name."""
         if name not in self.variable.items:
             raise FmuInputError(
                 f"{self.label} must be an item of the enumeration {self.variable.name!r} "
@@ -116,7 +114,7 @@ class BoundInput(NamedTuple):
         return float(self.variable.items[name])
 
     def _float_array(self, values: npt.ArrayLike, *, history: bool) -> Float:
-        """Return values as an array of floats; refuse what is not a number."""
+        """Return values as an array of floats; raise an error for anything but numbers."""
         try:
             return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -128,7 +126,7 @@ class BoundInput(NamedTuple):
     def _varies(self, history: Float) -> bool:
         """Return whether a history (N, n), or (N,) for one value, has values for each step.
 
-        A history of another shape is refused.
+        A history of another shape raises an error.
         """
         count = len(self.positions)
         shape_of_one_step = () if count == 1 else (count,)
@@ -143,7 +141,7 @@ class BoundInput(NamedTuple):
         return True
 
     def _check_count(self, array: Float, values: npt.ArrayLike) -> None:
-        """Refuse an array whose number of values is not that of the input."""
+        """Raise an error if an array does not have as many values as the input."""
         count = len(self.positions)
         if array.size == count:
             return
@@ -163,15 +161,10 @@ class BoundInput(NamedTuple):
         return self.conversion.factor * rows + self.conversion.offset
 
     def _acceptable(self, values: Float, clipped: Float) -> npt.NDArray[np.bool_]:
-        """Return which values (N, n) may be sent to the FMU.
+        """Return which of the values (N, n) may be sent to the FMU.
 
-        Parameters
-        ----------
-        values : (N, n) ndarray
-            The values in the FMU's unit.
-        clipped : (N, n) ndarray
-            The same values, limited to the range. A value that differs from these by no more than
-            the rounding error of a conversion of units is accepted.
+        A value that differs from `clipped`, the same values limited to the range, by no more than
+        the rounding error of a unit conversion is accepted.
         """
         rounding_error = 1e-12 * np.maximum(np.abs(clipped), 1.0)
         is_near_range = np.abs(clipped - values) <= rounding_error
@@ -183,15 +176,7 @@ class BoundInput(NamedTuple):
         return acceptable
 
     def _refusal(self, value: float, number: float) -> str:
-        """Return the sentence that refuses a value.
-
-        Parameters
-        ----------
-        value : float
-            The value as the caller gave it.
-        number : float
-            The value in the FMU's unit.
-        """
+        """Return the sentence that refuses a value, given also as a number in the FMU's unit."""
         if not math.isfinite(number):
             return f"{self.label} must be finite, but is {value!r}; nothing was sent to the FMU."
         if self.takes_whole_numbers and not float(number).is_integer():

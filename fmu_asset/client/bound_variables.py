@@ -26,14 +26,9 @@ _Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
 
 
 def _with_expanded_patterns(names: object) -> object:
-    """Return names with their patterns expanded, see `expand`.
+    """Return a name or a list of names with all patterns expanded, see `expand`.
 
-    What is neither a text nor a list is returned unchanged, so that pydantic refuses it.
-
-    Parameters
-    ----------
-    names : object
-        A text or a list of texts, as read from a file.
+    Anything else is returned unchanged, so that pydantic refuses it.
     """
     if isinstance(names, str):
         return expand(names)
@@ -49,7 +44,7 @@ def _with_expanded_patterns(names: object) -> object:
 
 
 def expand(pattern: str) -> tuple[str, ...]:
-    """Return the names that a pattern stands for: `a[{1..3}]` is a[1], a[2], a[3].
+    """Return the names that a pattern stands for: a[1], a[2], a[3] for `a[{1..3}]`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A first binding for an FMU without one: roles guessed from causality, names and units."""
+"""Drafts a binding for an FMU: roles are guessed from causality, names and units."""
 
 import re
 import tomllib
@@ -46,8 +46,6 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
     step_size : float, optional
         Communication step size [s]; that of the FMU's default experiment, or 1.
 
@@ -101,22 +99,15 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
 def bindable(variable: VariableInfo) -> bool:
     """Return whether a binding can name a variable.
 
-    It must be a number without a clock, and its name must not look like a pattern of ours, which
-    would be expanded.
+    It must be a number without a clock, and its name must not look like a pattern such as `{1..3}`,
+    which would be expanded.
     """
     is_number = variable.numeric and not variable.clocked and variable.size > 0
     return is_number and not _PATTERN.search(variable.name)
 
 
 def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> list[VariableInfo]:
-    """Return the outputs of an FMU; if it has none, one local variable.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
-    usable : sequence of VariableInfo
-        Variables that a binding can name.
+    """Return the outputs among usable variables; if there are none, the first local number.
 
     Raises
     ------
@@ -133,10 +124,9 @@ def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> l
 def _variables_to_observe(
     description: FmuDescription, usable: Sequence[VariableInfo]
 ) -> list[VariableInfo]:
-    """Return the outputs to observe.
+    """Return the real outputs whose names do not look auxiliary.
 
-    They are the real outputs whose names do not look auxiliary; if there are none, all real ones;
-    if there are none of these, all outputs.
+    If there are none, return all real outputs; without these, all outputs.
     """
     candidates = observable(description, usable)
     real_outputs = [v for v in candidates if v.kind in FLOAT_KINDS]
@@ -145,15 +135,15 @@ def _variables_to_observe(
 
 
 class _TableKeys:
-    """Makes keys for the tables of a binding that are unique within their role."""
+    """Makes keys for the tables of a binding, which are unique within their role."""
 
     def __init__(self) -> None:
         self._uses: Counter[tuple[str, str]] = Counter()
 
     def key(self, role: str, name: str) -> str:
-        """Return a key made from a name; a number is appended if that key is used already.
+        """Return a key made from a name, with a number appended if it is used already.
 
-        A name that begins with its role, such as `health.z1`, gives the rest of it: `z1`.
+        A name that begins with its role loses it: `health.z1` gives `z1`.
         """
         words = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower()
         plain_key = words.removeprefix(f"{role}_") or "x"
@@ -211,9 +201,7 @@ class _NumberedName(NamedTuple):
     Attributes
     ----------
     stem, number, tail : str
-        Parts of the name: before the last number, the number, and after it.
-    unit : str or None
-        Unit of the variable.
+        The name before the last number, the number, and the rest.
     """
 
     stem: str
@@ -240,7 +228,7 @@ def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
-    """Return variables in groups; a group has successive numbers and equal units."""
+    """Return variables in groups of successive numbers and equal units."""
     groups: list[list[VariableInfo]] = []
     expected_name: _NumberedName | None = None
     for variable in variables:

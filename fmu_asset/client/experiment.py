@@ -31,13 +31,13 @@ class FmuExperiment(NamedTuple):
     Attributes
     ----------
     binding : Binding
-        A binding of all outputs of the FMU or system, in its units.
+        Binding of all outputs of the FMU or system, in its units.
     steps : int
         Number of communication steps.
     parameters : dict of str to float or list
         Parameters by the binding's names.
     inputs : dict of str to dict of str to float or list
-        Inputs by role and name, held from start to end.
+        Inputs by role and name, constant throughout.
     """
 
     binding: Binding
@@ -53,19 +53,17 @@ def default_experiment(
     step_size: float | None = None,
     values: Mapping[str, PlainValue] | None = None,
 ) -> FmuExperiment:
-    """Return the default experiment of an FMU, with the changes that the caller asks for.
+    """Return the default experiment of an FMU with the caller's changes.
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
     stop_time : float, optional
         The end [s]. By default it is the FMU's own, or one second after the start.
     step_size : float, optional
         The communication step size [s]. By default it is the FMU's own, or a 500th of the duration.
     values : mapping of str to float, str or list, optional
         Parameters (also structural ones) and inputs by the names of the FMU's variables, in its
-        units. A text is read as `value_of_text` does.
+        units. A text is converted by `value_of_text`.
 
     Raises
     ------
@@ -105,24 +103,7 @@ def default_experiment(
 def _values_of_variables(
     description: FmuDescription, values: Mapping[str, PlainValue], settable: Sequence[str]
 ) -> dict[str, PlainValue]:
-    """Return the values by variable name, with texts converted.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
-    values : mapping of str to float, str or list
-        The values or their texts, by variable name.
-    settable : sequence of str
-        The names of the variables that can be set.
-
-    Raises
-    ------
-    BindingError
-        If a variable cannot be set.
-    FmuInputError
-        If a text is not a value of its variable.
-    """
+    """Return the values by variable name, with texts converted; refuse an unknown variable."""
     plain_values: dict[str, PlainValue] = {}
     for name, value in values.items():
         variable = description.variable(name)
@@ -136,20 +117,18 @@ def _values_of_variables(
 
 
 def _selected(values: Mapping[str, PlainValue], names: Collection[str]) -> dict[str, PlainValue]:
-    """Return the values of some names."""
+    """Return the values whose names are among some names."""
     return {name: value for name, value in values.items() if name in names}
 
 
 def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
-    """Convert a text, such as a user's input, to a value of a variable.
+    """Convert a text, such as a user's input, to a value of a parameter or input.
 
     Parameters
     ----------
-    variable : VariableInfo
-        The parameter or input. If it is a text parameter, the text itself is its value.
     text : str
-        A number, true or false, or the name of an enumeration's item; for an array several of them,
-        separated by commas.
+        A number, true or false, or the name of an enumeration's item. For an array, several of
+        these separated by commas. For a text parameter, the text itself.
 
     Raises
     ------
@@ -177,8 +156,6 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
 
     Parameters
     ----------
-    description : FmuDescription
-        The FMU, or a system of several.
     step_size : float, optional
         The communication step size [s]. By default it is that of the FMU's default experiment, or
         1.
@@ -220,19 +197,9 @@ def _bound_variables(
 
 
 def _steps_until(start: float, end: float, size: float | None) -> tuple[int, float]:
-    """Return the number and the size of the steps from a start to an end.
+    """Return the number and the size of the steps from a start to an end [s].
 
-    Parameters
-    ----------
-    start, end : float
-        The start and the end [s].
-    size : float or None
-        The communication step size [s]; None for 500 steps.
-
-    Raises
-    ------
-    FmuInputError
-        If the end does not come after the start, or the steps are too many.
+    If no size is given, there are `_DEFAULT_STEPS` steps.
     """
     if not (math.isfinite(end) and end > start):
         raise FmuInputError(
@@ -252,16 +219,9 @@ def _steps_until(start: float, end: float, size: float | None) -> tuple[int, flo
 
 
 def ending_with_histories(binding: Binding, steps: int) -> Binding:
-    """Return a binding whose simulation ends with the input histories of a file.
+    """Return the binding with the stop time at which input histories of so many rows end.
 
-    A binding that states its own end is returned as it is.
-
-    Parameters
-    ----------
-    binding : Binding
-        The binding of the FMU.
-    steps : int
-        The number of rows of the file.
+    A binding that states its own stop time is returned as it is.
     """
     header = binding.binding
     # A row is constant over a step; under linear interpolation a step leads from one row to the
@@ -273,7 +233,7 @@ def ending_with_histories(binding: Binding, steps: int) -> Binding:
 
 
 def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> ObservationHistory:
-    """Return the outputs of an asset under the input histories of a file.
+    """Simulate an asset under the input histories of a file, and return its outputs.
 
     Without interpolation, a row is constant over the step that begins at its time. Under linear
     interpolation, the inputs change linearly from row to row: the asset is initialised with the
@@ -281,8 +241,6 @@ def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> Obs
 
     Parameters
     ----------
-    asset : FmiAsset
-        The asset, which steps the FMU.
     steps : int
         The number of rows, N.
     histories : dict of str to dict of str to (N,) or (N, n) ndarray
@@ -311,21 +269,17 @@ def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> Obs
 
 
 def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) -> ObservationHistory:
-    """Return the present outputs of an asset, and those after each of the following steps.
+    """Return the present outputs of an asset, and those after each further step.
 
     Parameters
     ----------
-    asset : FmiAsset
-        The asset, which has been started.
-    steps : int
-        Number of steps, N.
     histories : dict of str to dict of str to (N,) or (N, n) ndarray
         Inputs of the steps by role and name.
 
     Returns
     -------
     ObservationHistory
-        N + 1 moments; fewer if the FMU ends the simulation by itself.
+        N + 1 times; fewer if the FMU ends the simulation by itself.
 
     Raises
     ------
@@ -346,19 +300,17 @@ def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) ->
 
 
 def run_experiment(asset: FmiAsset, experiment: FmuExperiment) -> ObservationHistory:
-    """Return the outputs of an asset at the start of an experiment, and after each step.
+    """Run an experiment, and return the outputs at its start and after each step.
 
     Parameters
     ----------
-    asset : FmiAsset or CoupledAsset
-        The asset, which steps the FMU.
     experiment : FmuExperiment
-        Steps, parameters and inputs; the inputs hold already during the initialisation.
+        Steps, parameters, and inputs, which hold already during the initialisation.
 
     Returns
     -------
     ObservationHistory
-        N + 1 moments; fewer if the FMU ends the simulation by itself.
+        N + 1 times; fewer if the FMU ends the simulation by itself.
 
     Raises
     ------

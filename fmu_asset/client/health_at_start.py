@@ -1,7 +1,7 @@
-"""Simulation with health that an FMU takes at its start only.
+"""Simulation with health that an FMU accepts at its start only.
 
-Where damage is a parameter of the FMU, it cannot change during a run. A history in which it changes
-is cut into runs of constant health, each with a start of its own.
+If damage is a parameter of the FMU, it cannot change during a simulation. A history in which it
+changes is therefore cut into runs of constant health, each with a start of its own.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from .values import InputsByRole
 
 
 class ConstantHealthRun(NamedTuple):
-    """Successive steps with constant health, so that they can be made without a new start.
+    """Successive steps with constant health, which need only one start.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class ConstantHealthRun(NamedTuple):
 
 
 class _CheckedHistory(NamedTuple):
-    """The checked history of one input.
+    """The history of one input, with checked values.
 
     Attributes
     ----------
@@ -45,10 +45,8 @@ class _CheckedHistory(NamedTuple):
         The role and the name in the binding.
     values : array_like
         The values as the caller gave them.
-    bound_input : BoundInput
-        The input, with its positions in the request.
     numbers : (n,) or (N, n) ndarray
-        The checked values in the FMU's unit.
+        The values in the FMU's unit.
     is_at_start : bool
         Whether the FMU accepts the input only before its initialisation.
     """
@@ -66,7 +64,7 @@ class _CheckedHistory(NamedTuple):
         return self.numbers.ndim == 2
 
     def part(self, begin: int, end: int) -> npt.ArrayLike:
-        """Return the values of some steps, as the caller gave them."""
+        """Return the values from one step to before another, as the caller gave them."""
         return np.asarray(self.values)[begin:end] if self.varies else self.values
 
     def first_value(self, begin: int) -> npt.ArrayLike:
@@ -80,15 +78,13 @@ class _CheckedHistory(NamedTuple):
 def split_where_health_changes(
     blocks: Blocks, inputs: InputsByRole, steps: int | None
 ) -> list[ConstantHealthRun]:
-    """Split histories of inputs into runs of constant health.
+    """Split histories of inputs into runs of constant health, each with its own start.
 
     Health that is a parameter of the FMU can only be set before its initialisation, so each run
     needs a new start.
 
     Parameters
     ----------
-    blocks : Blocks
-        What is exchanged with the FMU.
     inputs : mapping of str to mapping
         Inputs by role and name: one value for all steps, or one for each.
     steps : int, optional
@@ -117,7 +113,7 @@ def split_where_health_changes(
 
 
 def _checked_histories(blocks: Blocks, inputs: InputsByRole) -> list[_CheckedHistory]:
-    """Return the histories of all inputs, with their values checked and converted."""
+    """Return the histories of all inputs, checked and converted."""
     histories = []
     for role, by_name in inputs.items():
         table: Mapping[str, npt.ArrayLike] = by_name or {}
@@ -130,15 +126,7 @@ def _checked_histories(blocks: Blocks, inputs: InputsByRole) -> list[_CheckedHis
 
 
 def _first_steps(histories: list[_CheckedHistory], count: int) -> list[int]:
-    """Return the numbers of the first step, and of each step at which the health changes.
-
-    Parameters
-    ----------
-    histories : list of _CheckedHistory
-        The histories of all inputs.
-    count : int
-        The number of steps.
-    """
+    """Return the first step of each run of constant health among `count` steps."""
     health_columns = []
     for history in histories:
         if history.is_at_start:

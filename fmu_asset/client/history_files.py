@@ -42,19 +42,12 @@ class _InputName(NamedTuple):
 
 
 def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
-    """Return the number of steps in a CSV file, and the inputs of each step.
+    """Read the number of steps, and the inputs of each step, from a CSV file.
 
     The first line names the columns: `time` [s], which begins at the binding's start time and goes
     on by its interval, and inputs as `control.load_factor`, or `load_factor` where no other role
     has that name; the elements of an array are `u[1]`, `u[2]`, .... The values of a line hold over
     the step that begins at its time.
-
-    Parameters
-    ----------
-    path : Path
-        The path of the file.
-    binding : Binding
-        The binding, with the names and units of the inputs.
 
     Raises
     ------
@@ -92,7 +85,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
 
 
 def _check_times(time: Float, path: Path, binding: Binding) -> None:
-    """Refuse times (N,) [s] that are not those at which the steps of a binding begin."""
+    """Raise an error if times (N,) [s] are not those at which the binding's steps begin."""
     expected_times = binding.binding.start_time + binding.interval * np.arange(len(time))
     wrong_steps = np.flatnonzero(np.abs(time - expected_times) > _TIME_TOLERANCE * binding.interval)
     if len(wrong_steps):
@@ -106,7 +99,7 @@ def _check_times(time: Float, path: Path, binding: Binding) -> None:
 
 
 def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
-    """Return the inputs of a binding by all names that their columns may have.
+    """Return the inputs of a binding by the names that their columns may have.
 
     A name without a role is accepted if only one role has an input of this name.
     """
@@ -126,21 +119,10 @@ def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
 def _column_meaning(
     column: str, known_names: dict[str, _InputName]
 ) -> tuple[_InputName | None, int]:
-    """Return the input and the number of its element that the name of a column means.
+    """Return the input that a column belongs to, and the number of its element.
 
-    Parameters
-    ----------
-    column : str
-        The name of the column.
-    known_names : dict of str to _InputName
-        The inputs by the names of columns.
-
-    Returns
-    -------
-    input_name : _InputName or None
-        None if there is no such input.
-    number : int
-        The number of the element, or `_WHOLE` if the column is not that of an element.
+    The input is None if there is none of that name; the number is `_WHOLE` for a column of a whole
+    input.
     """
     if column in known_names:
         return known_names[column], _WHOLE
@@ -151,13 +133,7 @@ def _column_meaning(
 
 
 def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: Path) -> Float:
-    """Return the history of an input from its own column, or from the columns of its elements.
-
-    Returns
-    -------
-    (N,) or (N, n) array
-        The latter if the input is given by its n elements.
-    """
+    """Return the history (N,) of an input's own column, or (N, n) of its n elements' columns."""
     if _WHOLE in elements:
         return elements[_WHOLE]
     missing_numbers = {*range(1, len(elements) + 1)} - elements.keys()
@@ -171,20 +147,14 @@ def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: P
 def write_history(
     path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory
 ) -> None:
-    """Write the outputs of a simulation: NetCDF if the name ends with .nc, else CSV.
+    """Write the outputs of a simulation, as NetCDF if the name ends with .nc, else as CSV.
 
     The file is written whole or not at all.
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
-    asset : FmiAsset
-        The asset that was simulated.
     source : (str, str)
         Name and SHA-256 of its FMU file.
-    history : ObservationHistory
-        The outputs of the FMU in each step.
 
     Raises
     ------

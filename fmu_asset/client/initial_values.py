@@ -1,4 +1,4 @@
-"""Values that are set before the initialisation: parameters, and health that needs a new start."""
+"""Values that are set before the initialisation: parameters, and health that is one."""
 
 from collections.abc import Mapping
 
@@ -16,14 +16,12 @@ from .values import InputsByRole
 
 
 class InitialValueTable:
-    """Parameters and start values of an FMU that a binding names.
+    """The parameters and start values that a binding names, checked and converted.
 
     Parameters
     ----------
-    fmu : BoundFmu
-        The FMU and its binding.
     misfits : Misfits
-        Collects the parameters that do not fit.
+        Collects the entries that do not fit.
 
     Attributes
     ----------
@@ -53,20 +51,7 @@ class InitialValueTable:
     def split_inputs(
         self, inputs: InputsByRole
     ) -> tuple[InputsByRole, Mapping[str, npt.ArrayLike]]:
-        """Return the inputs that are sent at every step, and the health that is set at a start.
-
-        Parameters
-        ----------
-        inputs : mapping of str to mapping or None
-            Inputs by role and name.
-
-        Returns
-        -------
-        sent_inputs : dict of str to mapping or None
-            The same without health that is set at a start.
-        health : mapping of str to float
-            That health.
-        """
+        """Split inputs by role into those sent at every step, and health set at a start."""
         health = inputs.get("health") or {}
         at_start = {name: value for name, value in health.items() if name in self.health}
         sent_health = {name: value for name, value in health.items() if name not in self.health}
@@ -77,13 +62,13 @@ class InitialValueTable:
         parameters: Mapping[str, npt.ArrayLike],
         health: Mapping[str, npt.ArrayLike] | None = None,
     ) -> InitialValues:
-        """Return the values to set before the initialisation: the binding's, then the caller's.
+        """Return the values to set before the initialisation; the caller's override the binding's.
 
         Parameters
         ----------
         parameters : mapping of str to float or sequence of float
-            Parameters by the binding's names and in its units; one that the binding does not name
-            goes by its name in the FMU, in the FMU's unit.
+            Parameters by the binding's names and in its units. One that the binding does not name
+            has its name and unit in the FMU.
         health : mapping of str to float, optional
             Health that is set at a start only, by the binding's names and in its units.
 
@@ -116,7 +101,7 @@ class InitialValueTable:
     def _numbers(
         self, inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]]
     ) -> list[InitialValue]:
-        """Return the values of numeric variables; several inputs may be elements of one array."""
+        """Return the values of numeric variables, with the elements of each array joined."""
         numbers_by_variable: dict[str, list[float]] = {}
         variables: dict[str, VariableInfo] = {}
         description = self._fmu.description
@@ -142,7 +127,7 @@ class InitialValueTable:
     # ------------------------------------------------------------------ names
 
     def _parameter(self, name: str) -> BoundInput:
-        """Return a numeric parameter, named as in the binding or as in the FMU."""
+        """Return a numeric parameter by its name in the binding, or else in the FMU."""
         if name in self._parameters:
             return self._parameters[name]
         fmu = self._fmu
@@ -157,7 +142,7 @@ class InitialValueTable:
         return fmu.start_input(f"parameter.{name}", input_binding)
 
     def _text_parameter(self, name: str) -> VariableInfo | None:
-        """Return the text parameter that the binding or the FMU has by a name; None without one."""
+        """Return a text parameter by its name in the binding or the FMU; None without one."""
         if name in self._text_parameters or name in self._parameters:
             return self._text_parameters.get(name)
         variable = self._fmu.description.variable(name)

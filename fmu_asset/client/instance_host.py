@@ -36,12 +36,12 @@ _BLOCK_BYTES = 2**20
 
 
 class Host(Protocol):
-    """What runs for an asset: one FMU whose instance may be replaced, or several that are coupled.
+    """What runs the FMU of an asset: one replaceable instance, or several coupled ones.
 
     Attributes
     ----------
     reset_trial : ResetTrial
-        The knowledge about restarts of the FMU.
+        What is known about restarts of the FMU.
     """
 
     reset_trial: ResetTrial
@@ -67,10 +67,10 @@ class Host(Protocol):
         """The worker process, if there is one."""
 
     def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
-        """Bring it to a start; `renewed` says that `renew` was called just before."""
+        """Start the simulation; `renewed` says that `renew` was called just before."""
 
     def renew(self) -> None:
-        """Replace what runs by something new in the same process, before a start."""
+        """Replace the instance by a new one in the same process; `start` must follow."""
 
     def sibling(self) -> Self:
         """Return an independent host of the same extracted FMU."""
@@ -98,17 +98,10 @@ class Host(Protocol):
 
 
 class ExtractedFmu:
-    """The folder of an extracted FMU, which is removed when this object is no longer used.
-
-    Parameters
-    ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
+    """The folder of an extracted FMU, removed when this object is garbage-collected.
 
     Attributes
     ----------
-    folder : Path
-        The path of the folder.
     users : int
         The number of instances that run from it.
 
@@ -125,33 +118,29 @@ class ExtractedFmu:
 
 
 class InstanceHost:
-    """The owner of an asset's only instance, which makes, restarts, steps and frees it.
+    """Makes, restarts, steps and frees the instance of one FMU.
 
     If the first step after a restart shows that the restart did not work, the instance is replaced
-    and the step repeated. So the instance may change in each method.
+    and the step repeated. So any method may change the attribute `instance`.
 
     Parameters
     ----------
-    description : FmuDescription
-        The variables and abilities that the FMU declares.
     plan : Plan
-        The variables that each call exchanges with the FMU; the folder is still empty.
-    limits : WorkerLimits
-        Limits of the worker.
+        What each call exchanges with the FMU; the folder is filled in here.
     isolated : bool
-        Whether the instance runs in a worker process. It does so on Linux only; elsewhere it runs
-        in this process.
+        Whether the instance runs in a worker process. This works on Linux only; elsewhere the
+        instance runs in this process.
 
     Attributes
     ----------
     instance : FmuInstance, WorkerInstance or None
-        The instance, if there is one.
+        None before the start and after `close`.
     request : memoryview of float
         The request of this instance: time, step size, inputs.
     reply : (n_outputs,) ndarray
         Its reply.
     reset_trial : ResetTrial
-        The knowledge about restarts of the FMU.
+        What is known about restarts of the FMU.
     """
 
     request: "memoryview[float]"
@@ -176,7 +165,7 @@ class InstanceHost:
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
     def sibling(self) -> Self:
-        """Return a host of another instance of the same extracted FMU.
+        """Return a host for another instance of the same extracted FMU.
 
         The folder of the FMU is kept until all siblings are closed or garbage-collected.
         """
@@ -214,14 +203,12 @@ class InstanceHost:
     # ------------------------------------------------------------------ starts
 
     def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
-        """Bring the instance to a start; a lost one is replaced.
+        """Start the simulation from the initial state; a lost instance is replaced.
 
         Parameters
         ----------
-        start : InstanceStart
-            The start.
         renewed : bool
-            Whether the instance has just been made by `renew`.
+            Whether the instance has just been made by `renew`, so that it needs no reset.
 
         Raises
         ------
@@ -269,17 +256,17 @@ class InstanceHost:
     # ------------------------------------------------------------------ steps
 
     def step(self) -> None:
-        """Make the step that the request describes, again if the last restart did not work."""
+        """Make the step in the request; repeat it if the last restart did not work."""
         assert self.instance is not None
         self.instance.step()
         if self._is_at_start:
             self._is_at_start = False
             request = self.request.tobytes()
-            while self._replaced_if_contradicted(request, self.reply):
+            while self._replace_if_restart_failed(request, self.reply):
                 self.instance.step()
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make many steps, in blocks that limit the memory of a call to the worker.
+        """Make many steps, in blocks that limit the size of a message to the worker.
 
         It stops after a step whose outputs are not all finite. See `Instance.run`.
         """
@@ -293,7 +280,7 @@ class InstanceHost:
     def _run_block(
         self, requests: Float, replies: Float, report: Callable[[int], object], first: int
     ) -> int:
-        """Make a block of steps, of which the first one has a given number; return how many."""
+        """Make a block of steps that begins at step `first`; return how many were made."""
         assert self.instance is not None
         is_at_start = self._is_at_start
         self._is_at_start = False
@@ -311,7 +298,7 @@ class InstanceHost:
             except FmuError as error:
                 failure = error
             can_be_compared = is_at_start and steps_made > 0
-            if can_be_compared and self._replaced_if_contradicted(
+            if can_be_compared and self._replace_if_restart_failed(
                 requests[0].tobytes(), replies[0]
             ):
                 count_and_report(0)
@@ -331,34 +318,17 @@ class InstanceHost:
         return self.instance.save()
 
     def restore(self, content: bytes) -> None:
-        """Bring the instance to a serialised state."""
+        """Restore a serialised state."""
         assert self.instance is not None
         self._is_at_start = False
         self.instance.restore(content)
 
-    def _replaced_if_contradicted(self, request: bytes, reply: Float) -> bool:
+    def _replace_if_restart_failed(self, request: bytes, reply: Float) -> bool:
         """Replace the instance if its first step proves that its restart did not work.
 
-        A restart has worked if the same start and the same first step give the same outputs as in
-        the first instance, whose first step is recorded here. The new instance stands before the
-        step, which is in its request.
-
-        Parameters
-        ----------
-        request : bytes
-            The request of the first step after a start.
-        reply : (n_outputs,) ndarray
-            The outputs after it.
-
-        Returns
-        -------
-        bool
-            Whether there is a new instance, so that the step must be repeated.
-
-        Raises
-        ------
-        FmuError
-            If the new instance cannot be started.
+        A restart has worked if the same start and the same first step give the same outputs
+        (n_outputs,) as in the first instance, whose first step is recorded here. If the instance
+        was replaced, return True: the step is then in the new request and must be made again.
         """
         trial = self.reset_trial
         start = self._start
@@ -380,7 +350,7 @@ class InstanceHost:
     # ------------------------------------------------------------------ restarts
 
     def _restarted_instance(self) -> Instance:
-        """Return an instance in its state after instantiation, by the fastest method that works.
+        """Return the instance in its state after instantiation, by the fastest method that works.
 
         The methods are tried in this order: the FMU's own reset, a new instance in the same
         process, and a new process. A method with a known fault is not tried again.
@@ -405,7 +375,7 @@ class InstanceHost:
     def _is_worth_trying(self, method: RestartMethod) -> bool:
         """Return whether a restart method has no known fault and its result can be verified.
 
-        The FMU's reset is verified by comparison with the first step of the first instance.
+        The FMU's reset is verified against the first step of the first instance.
         """
         trial = self.reset_trial
         cannot_be_verified = (
@@ -414,13 +384,7 @@ class InstanceHost:
         return method >= trial.method and not cannot_be_verified
 
     def _instance_restarted_by(self, restart: Callable[[], Instance]) -> Instance | None:
-        """Return the instance after a restart, or None if the first step shows a failed restart.
-
-        Parameters
-        ----------
-        restart : callable
-            Restarts the instance by one method, and returns it.
-        """
+        """Restart the instance; return None if its first step differs from the recorded one."""
         instance = restart()
         first_step = self.reset_trial.first_step
         if first_step is None:
@@ -433,7 +397,7 @@ class InstanceHost:
         return None
 
     def _reset_instance(self) -> Instance:
-        """Reset the instance by the FMU's own function; record the refusal if the FMU refuses."""
+        """Reset the instance by the FMU's own function, and record it if the FMU refuses."""
         assert self.instance is not None
         try:
             self.instance.reset()
@@ -445,7 +409,7 @@ class InstanceHost:
     # ------------------------------------------------------------------ making an instance
 
     def _make_instance(self) -> Instance:
-        """Return an instance that is loaded anew, in a new worker if this host uses workers."""
+        """Load the FMU anew and return its instance, in a new worker if this host is isolated."""
         extracted = self._extracted
         # after a crash the files of the FMU may be damaged, so they are extracted again
         has_crashed = self.instance is not None and self.instance.lost
@@ -465,7 +429,7 @@ class InstanceHost:
         return instance
 
     def _open(self, plan: Plan) -> Instance:
-        """Return an instance of a plan, in a worker if this host has workers."""
+        """Return a new instance, in a worker process if this host is isolated."""
         if not self._isolated:
             return open_instance(plan)
         grants = self._limits.grants
@@ -490,7 +454,7 @@ def _release(instance: Instance, extracted: ExtractedFmu) -> None:
 
 
 def _check_grants(grants: Grants, folder: str) -> None:
-    """Refuse grants of the sandbox that name a missing file or folder."""
+    """Raise an error if the sandbox grants access to a file or folder that does not exist."""
     missing_file = missing_path(grants, folder)
     if missing_file:
         raise FmuInputError(
@@ -500,14 +464,14 @@ def _check_grants(grants: Grants, folder: str) -> None:
 
 
 def warn_without_sandbox(label: str, grants: Grants | None) -> None:
-    """Warn once if FMUs, or one of them, can reach all files of the user.
+    """Warn once if an FMU can reach all files of the user.
 
     Parameters
     ----------
     label : str
         Name of the FMU.
     grants : Grants or None
-        Grants of its sandbox; None if its binding turns the sandbox off.
+        What its sandbox allows; None if its binding turns the sandbox off.
     """
     if grants is None:
         warning = (
@@ -531,19 +495,17 @@ def worker_limits(
     load_timeout: float | None,
     memory_limit: float | None,
 ) -> WorkerLimits:
-    """Return the limits of time and memory of a worker, the process in which an FMU runs.
+    """Return the limits of time and memory for the worker process of an FMU.
 
-    A limit that the caller gives takes precedence over the limit in the binding. If neither gives
-    a limit, the default holds.
+    A limit of the caller takes precedence over that of the table `[limits]` in the binding, and
+    that over the default.
 
     Parameters
     ----------
-    binding : Binding
-        The binding, whose table `[limits]` may give limits.
     step_timeout, load_timeout : float or None
-        The wall-clock limits of the caller for a step and for loading the FMU [s].
+        Wall-clock limits of the caller for a step and for loading the FMU [s].
     memory_limit : float or None
-        The memory limit of the caller [MiB].
+        Memory limit of the caller [MiB].
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Whether an FMU can be brought back to its start, found out by comparison with its first start.
+"""Tests whether an FMU returns to its start, by comparison with its first start.
 
-Some FMUs return OK from their reset and go on from where they were, or keep a clock that shows
-later only. The first step of the first instance is therefore kept. At every later start that step
-is made again and its outputs are compared: after a difference a slower method is used for good,
-first another instance in the same process and then another process.
+Some FMUs return OK from their reset but continue from where they were, or keep a clock whose effect
+appears only later. Therefore the first step of the first instance is recorded. At every later start
+that step is made again and its outputs are compared. After a difference a slower method is used
+from then on: first another instance in the same process, then another process.
 """
 
 from array import array
@@ -34,7 +34,7 @@ class InstanceStart:
     request : list of float
         The request block: time, step size, inputs.
     with_inputs : bool
-        Whether the inputs of the block are set before the initialisation.
+        Whether the inputs of the request are sent during the initialisation.
     """
 
     time: float
@@ -44,11 +44,6 @@ class InstanceStart:
 
     def initialise(self, instance: Instance) -> None:
         """Initialise an instance that has just been instantiated or reset.
-
-        Parameters
-        ----------
-        instance : Instance
-            The instance.
 
         Raises
         ------
@@ -78,7 +73,6 @@ class FirstStep:
     Attributes
     ----------
     start : InstanceStart
-        How the instance was started.
     request : bytes
         Request block of the step.
     reply : (n,) ndarray
@@ -92,10 +86,7 @@ class FirstStep:
     def repeat(self, instance: Instance) -> Float:
         """Return the outputs (n,) of another instance after the same start and the same step.
 
-        Parameters
-        ----------
-        instance : Instance
-            An instance that has just been instantiated or reset.
+        The instance must have just been instantiated or reset.
         """
         self.start.initialise(instance)
         memoryview(instance.request).cast("B")[:] = self.request
@@ -110,35 +101,35 @@ _FAULTS = {
     ),
 }
 """The fault of a restart method, if the first step after it differs from that of a new instance."""
-_NEXT_PLACES = {RestartMethod.RESET: "instance", RestartMethod.RENEWAL: "process"}
+_RENEWED_AT_START = {RestartMethod.RESET: "instance", RestartMethod.RENEWAL: "process"}
 """What is made anew at every start, once a restart method has failed."""
 
 
 @dataclass
 class ResetTrial:
-    """What is known about restarts of an FMU; shared by all assets that use one extracted FMU.
+    """What is known about restarts of an FMU; shared by all assets of one extracted FMU.
 
     Attributes
     ----------
     comparable : bool
-        Whether restarts can be verified by comparison: there can be several instances, and new ones
+        Whether restarts can be verified by comparison: several instances are possible, and new ones
         give equal outputs.
     works : bool or None
         Whether the FMU's own reset works; None if this is not known yet.
     fault : str
         A sentence on the fault of its restart; empty if none is known.
-    lies : bool
-        Whether it reports success although its restart does not work.
+    reports_false_success : bool
+        Whether a restart reported success although it did not work.
     method : RestartMethod
         The fastest method without a known fault.
     first_step : FirstStep or None
-        The first step of the first instance, once it has been made.
+        None until the first instance has made a step.
     """
 
     comparable: bool = True
     works: bool | None = None
     fault: str = ""
-    lies: bool = False
+    reports_false_success: bool = False
     method: RestartMethod = RestartMethod.RESET
     first_step: FirstStep | None = field(default=None, repr=False)
 
@@ -151,9 +142,10 @@ class ResetTrial:
     def accepts(
         self, label: str, method: RestartMethod, first_step: FirstStep, reply: Float
     ) -> bool:
-        """Return whether the first step after a restart agrees with that of a new instance.
+        """Return whether the first step after a restart agrees with the recorded one.
 
-        If it does not, a warning is logged once, and a slower method is used from now on.
+        If it does not, a warning is logged once, and a slower method is used from now on. If even a
+        new process gives other outputs, the restart is accepted and no more comparisons are made.
 
         Parameters
         ----------
@@ -162,7 +154,7 @@ class ResetTrial:
         method : RestartMethod
             The method by which the instance was restarted.
         first_step : FirstStep
-            The step with which it is compared.
+            The recorded step.
         reply : (n,) ndarray
             The outputs after the same step.
         """
@@ -184,11 +176,11 @@ class ResetTrial:
             doubt = " Flights that began by a reset before may be wrong."
         self.fault = (
             f"{_FAULTS[method]} (an output is {reply[output]:.9g} where that of a new instance is "
-            f"{expected_reply[output]:.9g}); every start takes a new {_NEXT_PLACES[method]} "
+            f"{expected_reply[output]:.9g}); every start takes a new {_RENEWED_AT_START[method]} "
             f"instead.{doubt}"
         )
         self.works = False
-        self.lies = True
+        self.reports_false_success = True
         self.method = RestartMethod(method + 1)
         if (label, method) not in _logged:
             _logger.warning("%s: %s", label, self.fault)

@@ -1,4 +1,4 @@
-"""An FMU in operation: it is started, counts its steps, and saves and restores its state."""
+"""An FMU in operation: it is started and stepped, and its state is saved and restored."""
 
 import math
 from typing import Literal, NoReturn
@@ -23,14 +23,7 @@ _REPLAY_INSTEAD = (
 
 
 class RunningFmu:
-    """An FMU in operation, at the level of requests and replies.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        What is exchanged with the FMU.
-    host : Host
-        What runs the FMU.
+    """An FMU in operation, driven by requests and replies.
 
     Attributes
     ----------
@@ -61,7 +54,7 @@ class RunningFmu:
         self._record: list[bytes] = []
 
     def _chosen_state_method(self) -> StateMethod:
-        """Return how states are saved: as the binding says, or as the FMU supports it best."""
+        """Return how states are saved: as the binding says, else serialised if the FMU can."""
         state_method = self._blocks.binding.binding.state
         if state_method != "auto":
             return state_method
@@ -82,8 +75,8 @@ class RunningFmu:
         self.phase = "closed"
         self.host.close()
 
-    def refuse_closed(self) -> None:
-        """Refuse to use an asset that is closed, or whose state could not be restored."""
+    def check_open(self) -> None:
+        """Raise an error if the asset is closed, or if its state could not be restored."""
         if self.phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self.phase == "closed":
@@ -102,9 +95,9 @@ class RunningFmu:
         Parameters
         ----------
         start : AssetStart
-            The start; its inputs are empty if the start values of the FMU hold.
+            The step, and the inputs; these are empty if the start values of the FMU hold.
         settings : list of InitialValue
-            Parameters and health of the start, as the FMU gets them.
+            Parameters and health, in the FMU's units.
         request : list of float
             The request with the inputs of the start.
         renewed : bool
@@ -125,7 +118,7 @@ class RunningFmu:
     # ------------------------------------------------------------------ steps
 
     def step(self, inputs: InputsByRole) -> None:
-        """Make one step; if the FMU refuses it, the request and the time are as before."""
+        """Make one step; if the FMU refuses it, request and time are as before."""
         request = self.host.request
         previous_request = request.tobytes()
         begin = self.time
@@ -147,7 +140,7 @@ class RunningFmu:
             self._record.append(self.host.request.tobytes()[HEAD_BYTES:])
 
     def hold(self, inputs: InputsByRole) -> None:
-        """Set inputs without a step; if one does not fit, none is set."""
+        """Set inputs without a step; if one of them is refused, none is set."""
         request = self.host.request
         previous_request = request.tobytes()
         try:
@@ -162,7 +155,7 @@ class RunningFmu:
         return np.asarray(self._start_time + index * self._interval, dtype=np.float64)
 
     def requests_of_steps(self, histories: InputsByRole, steps: int | None) -> Float:
-        """Return the requests (N, 2 + n_inputs) of N steps from now on; see `Request.of_steps`."""
+        """Return the requests (N, 2 + n_inputs) of the next N steps; see `Request.of_steps`."""
         previous_request = np.array(self.host.request)
         requests = self._blocks.request.of_steps(previous_request, histories, steps)
         requests[:, 0] = self.times(len(requests))[:-1]
@@ -175,7 +168,7 @@ class RunningFmu:
         return requests
 
     def run(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
-        """Make steps until all are made, one gives values that are not finite, or the FMU ends.
+        """Make steps until all are made, an output is not finite, or the FMU ends.
 
         If a step fails, the asset is left in the state after the last complete step.
 
@@ -185,8 +178,6 @@ class RunningFmu:
             The request of each step.
         replies : (N, n_outputs) ndarray
             Filled with the reply of each step.
-        stage : Stage
-            Shows the progress.
 
         Returns
         -------
@@ -219,19 +210,19 @@ class RunningFmu:
     # ------------------------------------------------------------------ outputs
 
     def read(self) -> None:
-        """Read the outputs of this moment into the reply."""
+        """Read the present outputs into the reply."""
         try:
             self.host.read()
         except FmuError as error:
             self.raise_located(error, f"reading at t = {self.time:g} s")
 
     def present_outputs(self) -> bytes:
-        """Return the present outputs of the FMU as the bytes of doubles."""
+        """Return the present outputs as the bytes of doubles."""
         self.host.read()
         return self.host.reply.tobytes()
 
     def finite_reply(self, remark: str = "") -> Float:
-        """Return the outputs (n_outputs,); refuse values that are not finite, with a remark."""
+        """Return the outputs (n_outputs,); raise an error with a remark if one is not finite."""
         reply = self.host.reply
         # a fast test first: the sum of squares can be infinite for large values, too
         if math.isfinite(reply.dot(reply)):
@@ -281,12 +272,12 @@ class RunningFmu:
         ).to_bytes()
 
     def was_started_as(self, saved_state: SavedState) -> bool:
-        """Return whether the FMU runs, and was started as that of a saved state."""
+        """Return whether the FMU runs, and was started in the same way as a saved state."""
         is_running = self.phase == "ready" and not self.host.lost
         return is_running and saved_state.start == self.last_start
 
     def restore(self, saved_state: SavedState) -> None:
-        """Go from the start of a saved state to the state; see `FmiAsset.restore_state`."""
+        """Restore a saved state after its start was repeated; see `FmiAsset.restore_state`."""
         replays = saved_state.method == "replay"
         try:
             if replays:
@@ -304,7 +295,7 @@ class RunningFmu:
             self.raise_located(error, "restoring the state")
 
     def _replay(self, saved_state: SavedState) -> None:
-        """Repeat the steps of a saved state from its start."""
+        """Repeat all steps from the start of a saved state to the state."""
         bytes_per_step = self.bytes_of_inputs
         for index in range(saved_state.steps_since_start):
             inputs = saved_state.body[index * bytes_per_step : (index + 1) * bytes_per_step]
@@ -321,8 +312,8 @@ class RunningFmu:
         """Size of the inputs of one step in a request [bytes]."""
         return 8 * self._blocks.plan.input_count
 
-    def refuse_foreign(self, saved_state: SavedState) -> None:
-        """Refuse a saved state that another FMU or binding has made, or that is damaged."""
+    def check_saved_state(self, saved_state: SavedState) -> None:
+        """Raise an error if a state was saved with another FMU or binding, or is damaged."""
         description = self._blocks.description
         if saved_state.fmu != description.sha256:
             raise FmuStateError(
@@ -341,14 +332,12 @@ class RunningFmu:
     # ------------------------------------------------------------------ errors
 
     def raise_located(self, error: FmuError, action: str) -> NoReturn:
-        """Raise an error of the FMU again, with the name of the FMU and what was done.
+        """Raise an error again, with the name of the FMU and the failed action in its message.
 
-        The messages of the error are added to the log.
+        The messages of the FMU are added to the log.
 
         Parameters
         ----------
-        error : FmuError
-            The error that the FMU or its worker raised.
         action : str
             The action that failed, such as "the start".
         """
@@ -364,5 +353,5 @@ class RunningFmu:
 
 
 def _with_advice_to_replay(error: FmuError) -> FmuError:
-    """Return an error with the advice to keep states as inputs."""
+    """Return the error with the advice to save states as inputs."""
     return type(error)(f"{error.sentence} {_REPLAY_INSTEAD}", error.messages, error.time)

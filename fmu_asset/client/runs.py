@@ -1,7 +1,7 @@
-"""Repeated runs of an FMU from stated starts.
+"""Repeated runs of an FMU from given starts.
 
-A model of campaigns asks its FMU for thousands of short motions and equilibria. One instance for
-each step size stays open and is reset, and results are cached.
+A model of a campaign needs thousands of short simulations and equilibria of its FMU. One instance
+for each step size stays open and is reset, and results are cached.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -37,7 +37,7 @@ def _close_asset(asset: object) -> None:
 
 
 class OperatingPoint(NamedTuple):
-    """Parameters and constant inputs of a run, as sorted pairs of a binding's name and a value."""
+    """Parameters and constant inputs of a run, as sorted pairs of name and value."""
 
     parameters: tuple[tuple[str, float], ...] = ()
     inputs: tuple[tuple[str, float], ...] = ()
@@ -49,19 +49,15 @@ class OperatingPoint(NamedTuple):
 
 
 class FmuRun(NamedTuple):
-    """A simulation that is wanted from an FMU.
+    """A simulation of an FMU that starts at rest.
 
     Attributes
     ----------
-    operating_point : OperatingPoint
-        The parameters and the constant inputs.
     step : float
-        The communication step [s].
-    steps : int
-        The number of steps.
+        Communication step size [s].
     initial_offsets : mapping of str to float
-        Values that are added to the constant inputs before the run. The run starts from the state
-        of rest under these inputs.
+        Values that are added to the constant inputs before the run, which starts from rest under
+        these inputs.
     offsets : mapping of str to (steps,) array
         Values that are added to the constant inputs in each step of the run.
     """
@@ -74,21 +70,18 @@ class FmuRun(NamedTuple):
 
 
 class FmuRuns:
-    """An FMU that is simulated many times; its instances and results are kept.
+    """Simulates an FMU many times; instances stay open, and results are cached.
 
     Parameters
     ----------
-    path : Path
-        The FMU file.
     binding : Binding
-        Its variables. The inputs of a run are the loads of the binding; they are zero unless the
-        run gives a value.
-    isolated : bool
-        Whether instances run in processes of their own.
+        Binding of the FMU. The inputs of a run are its loads; they are zero unless the run gives a
+        value.
     limit : float
-        The longest motion until rest [s].
+        Longest simulation until rest [s].
     tolerance : float
-        The largest change of an output that counts as rest, as a fraction of its largest value.
+        Largest variation of an output that counts as rest, as a fraction of its largest absolute
+        value.
     """
 
     def __init__(
@@ -103,15 +96,12 @@ class FmuRuns:
         self._results = ResultCache(CACHE_BYTES, attrgetter("nbytes"))
 
     def refusal_context(self) -> AbstractContextManager[None]:
-        """Return a context for calls of the FMU.
-
-        A subclass can add an explanation to the FMU's errors in it.
-        """
+        """Return a context for calls of the FMU; a subclass can add a remark to errors there."""
         return nullcontext()
 
     @cached_property
     def asset(self) -> FmiAsset:
-        """The FMU with its binding; it is not run, but asked what it declares.
+        """The FMU with its binding, which is not run but shows what the FMU declares.
 
         Raises
         ------
@@ -127,13 +117,7 @@ class FmuRuns:
     def cached(self, key: Hashable, compute: Callable[[], FloatArray]) -> FloatArray:
         """Return the result for a key, computed at the first call.
 
-        Parameters
-        ----------
-        key : hashable
-            The key of the result.
-        compute : callable
-            Computes the result. If the results need too much memory, old ones are dropped, and are
-            then computed again.
+        If the results need too much memory, old ones are dropped and then computed again.
         """
         result = self._results.get(key, compute)
         result.setflags(write=False)
@@ -144,10 +128,9 @@ class FmuRuns:
         self._assets.clear()
 
     def probing_amplitude(self, name: str) -> float:
-        """Return an amplitude by which a test of linearity can vary a load in both directions.
+        """Return the amplitude by which a test of linearity varies a load in both directions.
 
-        The amplitude is 1 in the binding's unit, or a tenth of the smaller limit of the load's
-        range if that is less.
+        It is 1 in the binding's unit, or a tenth of the smaller limit of the load if that is less.
         """
         low, high = self.asset.input_range("load", name)
         return min(1.0, 0.1 * abs(low), 0.1 * abs(high))
@@ -155,24 +138,19 @@ class FmuRuns:
     def start_run(self, run: FmuRun) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the start of a run, with its outputs and the inputs of all steps.
 
-        Parameters
-        ----------
-        run : FmuRun
-            The run.
-
         Returns
         -------
         asset : FmiAsset
-            The instance at its start; if there are initial offsets, at rest under them.
+            The instance; if there are initial offsets, at rest under them.
         outputs : (C,) ndarray
-            The outputs of the instance at the start.
+            Its outputs at the start.
         inputs : dict of str to (steps,) ndarray
-            The value of every input in each step.
+            Each input in each step.
 
         Raises
         ------
         FmuError
-            If the FMU refuses, or does not come to rest.
+            If the FMU fails, or does not come to rest.
         """
         constant_inputs = self._constant_inputs(run.operating_point, NO_OFFSETS)
         inputs = {name: value + np.zeros(run.steps) for name, value in constant_inputs.items()}
@@ -192,7 +170,7 @@ class FmuRuns:
         Raises
         ------
         FmuError
-            If the FMU refuses, or does not come to rest.
+            If the FMU fails, or does not come to rest.
         """
         asset, initial_outputs, inputs = self.start_run(run)
         with self.refusal_context():
@@ -207,19 +185,19 @@ class FmuRuns:
         *,
         settle: bool,
     ) -> FloatArray:
-        """Return the outputs (L, C) of the FMU at rest at several operating points.
+        """Return the outputs (L, C) of the FMU at rest at L operating points.
 
         Parameters
         ----------
         points : sequence of OperatingPoint
-            L operating points, which differ in inputs only.
+            Operating points, which differ in inputs only.
         offsets : mapping of str to (L,) ndarray
-            Additions to inputs at each point.
+            Values that are added to inputs at each point.
         step : float
             Communication step [s].
         settle : bool
-            Whether the motion at each point is followed until it rests; otherwise the FMU is
-            quasi-static, and a step gives the equilibrium.
+            Whether each point is simulated until it is at rest. Otherwise the FMU is quasi-static,
+            and one step gives the equilibrium.
 
         Raises
         ------
@@ -253,7 +231,7 @@ class FmuRuns:
     def _constant_inputs(
         self, point: OperatingPoint, offsets: Mapping[str, float]
     ) -> dict[str, float]:
-        """Return the value of every input at an operating point, with offsets added."""
+        """Return all inputs at an operating point, with offsets added."""
         inputs = {**dict.fromkeys(self._binding.load, 0.0), **dict(point.inputs)}
         for name, offset in offsets.items():
             inputs[name] = inputs[name] + offset
@@ -274,13 +252,8 @@ class FmuRuns:
     def _outputs_after_settling(self, asset: FmiAsset) -> FloatArray:
         """Return the outputs (C,) of an instance at rest under its present inputs.
 
-        The instance is simulated until every output stays within the tolerance over `SETTLE_CHUNK`
-        steps.
-
-        Raises
-        ------
-        FmuOutputError
-            If this takes longer than the limit.
+        It is simulated until every output stays within the tolerance over `SETTLE_CHUNK` steps; an
+        `FmuOutputError` is raised if that takes longer than the limit.
         """
         duration = 0.0
         largest: FloatArray | float = 0.0

@@ -1,4 +1,4 @@
-"""The state of an asset as bytes, which the checkpoint of a mission keeps."""
+"""The state of an asset as bytes, for the checkpoints of a mission."""
 
 import struct
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ _HEADER = struct.Struct("<8sI")
 
 
 class PackedState(BaseModel):
-    """A state of an asset: a head, kept as JSON, and a body of bytes.
+    """A state of an asset: a header, written as JSON, and a body of bytes.
 
     Attributes
     ----------
@@ -113,9 +113,9 @@ class SavedState(PackedState):
     start_inputs : bytes
         Inputs during the initialisation, as doubles; empty if there were none.
     inputs : bytes
-        Inputs that hold at the moment of the state, as doubles.
+        Inputs at the time of the state, as doubles.
     outputs : bytes
-        Outputs at that moment, as doubles; the restored FMU must give them again.
+        Outputs at that time, as doubles; the restored FMU must give the same.
     """
 
     magic = b"UAVASSET"
@@ -144,7 +144,7 @@ class SavedState(PackedState):
         return self.index - self.first_index
 
     def is_sound(self, method: StateMethod, bytes_of_inputs: int) -> bool:
-        """Return whether the lengths fit each other and an asset of so many bytes of inputs."""
+        """Return whether the parts have the lengths that a method and a size of inputs require."""
         return (
             self.method == method
             and len(self.inputs) == bytes_of_inputs
@@ -156,7 +156,7 @@ class SavedState(PackedState):
         )
 
     def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
-        """Refuse a restored FMU whose outputs differ from those at the time of saving.
+        """Raise an error if a restored FMU gives other outputs than at the time of saving.
 
         Parameters
         ----------
@@ -168,7 +168,8 @@ class SavedState(PackedState):
         Raises
         ------
         FmuStateError
-            If a bit differs: the FMU declares a capability that it does not have.
+            If a bit differs: the FMU cannot restore its state, though it declares so, or cannot
+            repeat it.
         """
         if outputs == self.outputs:
             return
@@ -190,12 +191,12 @@ class SavedState(PackedState):
 
 
 def partial_state_sentence(fault: str) -> str:
-    """Return the end of a sentence about an FMU that saves or restores only part of its state.
+    """Return the end of a sentence about an FMU that saves or restores its state in part.
 
     Parameters
     ----------
     fault : str
-        The fault of the FMU, such as "does not restore all of its state".
+        What the FMU does, such as "does not restore all of its state".
     """
     return (
         f'it declares canGetAndSetFMUstate but {fault}; write `state = "replay"` into the table '

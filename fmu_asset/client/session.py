@@ -44,8 +44,6 @@ class FmiAsset:
     fmu_path : path-like or FmuDescription
         An FMU of FMI 1, 2 or 3, for co-simulation or model exchange, or what `read_fmu` returned
         for it.
-    binding : Binding or path-like
-        The binding, or its file.
     isolated : bool
         Whether the FMU runs in a worker process.
     step_timeout, load_timeout : float, optional
@@ -61,14 +59,12 @@ class FmiAsset:
     ----------
     description : FmuDescription
         Declarations of the FMU.
-    binding : Binding
-        The binding, with arrays that are observed or recorded as their elements.
     state_method : {"serialised", "replay"}
         How `save_state` keeps the state: serialised by the FMU, or as the inputs of all steps.
     reset_trial : ResetTrial
-        Whether the FMU's own reset works, as the first reset after a simulation shows.
+        What is known about the FMU's own reset; it is tested at the first reset after a simulation.
     recorded_units : dict of str to str
-        Units of `Observation.extra` by name.
+        Units of `Observation.extra`, by name.
 
     Raises
     ------
@@ -104,7 +100,7 @@ class FmiAsset:
         self._compose(blocks, host, parameters or {})
 
     def _compose(self, blocks: Blocks, host: Host, parameters: Values) -> None:
-        """Make an asset, not yet started, of its blocks and of what runs the FMU."""
+        """Set up the asset from its blocks and its host; the FMU is not started yet."""
         self._blocks = blocks
         self._running = RunningFmu(blocks, host)
         self.description = blocks.description
@@ -144,17 +140,16 @@ class FmiAsset:
         return None if worker is None else worker.memory
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
-        """Return the least and the largest value of an input, in the unit of the binding.
+        """Return the smallest and largest allowed value of an input, in the binding's unit.
 
-        The binding, a file, connects names and units of the twin with variables of the FMU. If both
-        binding and FMU limit the input, both limits are observed.
+        If both the binding and the FMU limit the input, the narrower range holds.
 
         Parameters
         ----------
         role : str
-            The role of the input in the binding, such as "control" or "load".
+            Its role in the binding, such as "control" or "load".
         name : str
-            The name of the input in the binding.
+            Its name in the binding.
 
         Raises
         ------
@@ -168,7 +163,7 @@ class FmiAsset:
         return low, high
 
     def check_parameters(self, parameters: Values) -> None:
-        """Check that parameters could be set, without setting them.
+        """Check values of parameters without setting them.
 
         Parameters
         ----------
@@ -199,13 +194,13 @@ class FmiAsset:
         self._running.close()
 
     def reset(self, parameters: Values | None = None, **inputs: Unpack[Inputs]) -> None:
-        """Go back to the start.
+        """Start the FMU again from its initial state.
 
         Parameters
         ----------
         parameters : mapping of str to float, optional
-            Parameters in the binding's units; those of the constructor if absent. They stay for
-            later resets.
+            Parameters in the binding's units; they also hold for later resets. By default those of
+            the last reset, or of the constructor.
         **inputs : mapping of str to float, optional
             `control`, `health`, `load` and `port`: inputs that hold already during the
             initialisation. If none is given, the FMU's start values hold.
@@ -227,8 +222,7 @@ class FmiAsset:
     def renew(self, **inputs: Unpack[Inputs]) -> None:
         """Replace the FMU's instance by a new one in the same process, and start it.
 
-        The method `reset` also starts the FMU again, but by the FMU's own function for this. Call
-        `renew` where that function is not trusted.
+        Unlike `reset`, this does not rely on the reset function of the FMU.
 
         Parameters
         ----------
@@ -250,9 +244,9 @@ class FmiAsset:
         self._restart(by_role, renewed=True)
 
     def sibling(self, parameters: Values | None = None) -> Self:
-        """Return an independent asset of the same FMU, binding and limits.
+        """Return an independent asset of the same FMU, binding and limits, not yet started.
 
-        The FMU is not extracted again, and the new asset has not been started.
+        The extracted files of the FMU are shared.
 
         Parameters
         ----------
@@ -280,14 +274,9 @@ class FmiAsset:
         self._parameters = plain_values(parameters)
 
     def _restart(self, inputs: InputsByRole, *, renewed: bool = False) -> None:
-        """Start the FMU again with inputs that hold during the initialisation.
+        """Start the FMU again with inputs that hold already during its initialisation.
 
-        Parameters
-        ----------
-        inputs : mapping of str to mapping
-            Inputs by role and name.
-        renewed : bool
-            Whether the instance is new, so that it needs no reset.
+        With `renewed`, the instance is new and needs no reset.
         """
         health = self._running.last_start.health
         if self._blocks.health_at_start:
@@ -299,11 +288,10 @@ class FmiAsset:
         self._start(request, health, with_inputs=with_inputs, renewed=renewed)
 
     def _restart_if_health_changes(self, inputs: InputsByRole) -> InputsByRole:
-        """Start the FMU again if inputs change its health; return the inputs without that health.
+        """Start the FMU again if the health changes, and return the other inputs.
 
-        It concerns health that the FMU accepts only before its initialisation. The new start is
-        made at the present time with the present inputs. States before it can no longer be
-        replayed.
+        Only health that the FMU accepts before its initialisation alone is meant. The new start is
+        made at the present time with the present inputs; earlier states can no longer be replayed.
         """
         running = self._running
         inputs, changed_health = self._blocks.initial_values.split_inputs(inputs)
@@ -316,7 +304,7 @@ class FmiAsset:
             self._blocks.request.write(request, inputs)
             with_inputs = True
         else:
-            running.refuse_closed()
+            running.check_open()
             request = self._blocks.request.start_values(inputs)
             with_inputs = self._blocks.request.write(request, inputs)
         self._settings = settings
@@ -332,39 +320,23 @@ class FmiAsset:
         renewed: bool = False,
         index: int = 0,
     ) -> None:
-        """Start the FMU with the present parameters.
+        """Start the FMU with the present settings, which already contain the health.
 
-        Parameters
-        ----------
-        request : list of float
-            The request with the inputs of the start.
-        health : dict of str to float or list
-            Health that is set before the initialisation; the settings contain it already.
-        with_inputs : bool
-            Whether the inputs are set before the initialisation.
-        renewed : bool
-            Whether the instance is new, so that it needs no reset.
-        index : int
-            The number of steps that the asset has made before this start.
+        `request` holds the inputs of the start, which are sent during the initialisation only if
+        `with_inputs` is set. `index` counts the steps made before this start.
         """
         inputs = array("d", request).tobytes()[HEAD_BYTES:] if with_inputs else b""
         start = AssetStart(self._parameters, health, index, inputs)
         self._running.start(start, self._settings, request, renewed=renewed)
 
     def _open(self, inputs: InputsByRole) -> None:
-        """Start the FMU at its first use.
+        """Start the FMU at its first use, before a step with the given inputs.
 
-        An FMU that was closed or broken is not started again: the user must reset the asset.
-
-        Parameters
-        ----------
-        inputs : mapping of str to mapping
-            Inputs of the next step. If it sets the whole of an array that was resized, the FMU's
-            start values of this array need not fit.
+        An FMU that was closed or broken is not started: the caller must reset the asset first.
         """
         if self._running.phase == "ready":
             return
-        self._running.refuse_closed()
+        self._running.check_open()
         # under linear interpolation the first step begins at the start values, so they must fit
         if not self.binding.binding.structural_parameters or self._running.linear_count:
             inputs = {}
@@ -380,7 +352,7 @@ class FmiAsset:
         load: Values | None = None,
         port: Values | None = None,
     ) -> Observation:
-        """Make one communication step.
+        """Make one communication step and return the outputs after it.
 
         Inputs are given by the binding's names and in its units; one that is not given keeps its
         last value. If the FMU refuses the step, the asset is where it was before it.
@@ -388,7 +360,7 @@ class FmiAsset:
         Parameters
         ----------
         control, health, load, port : mapping of str to float, or to a sequence for an array
-            Inputs of this step; those of a port are called `<port>.<quantity>`.
+            Inputs of this step. An input of a port is called `<port>.<quantity>`.
 
         Raises
         ------
@@ -419,10 +391,10 @@ class FmiAsset:
         load: Values | None = None,
         port: Values | None = None,
     ) -> None:
-        """Set inputs now, without a step.
+        """Set inputs without making a step.
 
-        Later steps keep them unless they give other values. Under linear interpolation the next
-        step begins at these values, so this is how an input can jump.
+        They keep these values until they are set again. Under linear interpolation the next step
+        begins at these values, so an input can jump.
 
         Parameters
         ----------
@@ -441,7 +413,7 @@ class FmiAsset:
         self._running.hold(inputs)
 
     def observe(self) -> Observation:
-        """Return the observation of this moment without a step, such as the initial one.
+        """Return the present outputs without making a step, such as the initial ones.
 
         Raises
         ------
@@ -453,7 +425,7 @@ class FmiAsset:
         return self._observation()
 
     def _observation(self) -> Observation:
-        """Return the observation in the reply; refuse values that are not finite."""
+        """Return the outputs in the reply; raise an error if one is not finite."""
         return self._blocks.reply.observation(self._running.finite_reply(), self._running.time)
 
     # ------------------------------------------------------------------ many steps
@@ -468,11 +440,11 @@ class FmiAsset:
         steps: int | None = None,
         progress: Progress | None = None,
     ) -> ObservationHistory:
-        """Make many communication steps under prescribed inputs, from the present state on.
+        """Make many steps from the present state with prescribed inputs, and return all outputs.
 
-        The result equals, bit by bit, that of as many calls of `step`. All inputs are checked
-        before the first step. If a step fails, the asset stays in the state after the step before.
-        If the FMU ends its simulation, the result ends there, and its attribute `ended` says so.
+        The result is bitwise equal to that of single calls of `step`. All inputs are checked before
+        the first step. If a step fails, the asset stays in the state before that step. If the FMU
+        ends its simulation, the result ends there, and its attribute `ended` says so.
 
         Parameters
         ----------
@@ -481,7 +453,7 @@ class FmiAsset:
             steps. An array of n values is (N, n) or (n,). An input that is not given keeps its last
             value.
         steps : int, optional
-            The number of steps N; if left out, the length of the histories.
+            The number of steps N; by default the length of the histories.
         progress : Progress, optional
             The display of the progress.
 
@@ -492,7 +464,7 @@ class FmiAsset:
             was sent.
         BindingError, FmuCallError, FmuOutputError, FmuWorkerError, FmuTimeoutError
             As `step`; the message says at which step. A worker that dies or takes too long reports
-            every 20 ms: the step named may be a little early.
+            every 20 ms, so the step in the message may be a little early.
         """
         histories: InputsByRole = {
             "control": control,
@@ -515,7 +487,7 @@ class FmiAsset:
     def _simulate(
         self, histories: InputsByRole, steps: int | None, progress: Progress | None
     ) -> ObservationHistory:
-        """Make many steps after one start; see `simulate`."""
+        """Make the steps of `simulate` that need no new start."""
         self._open(histories)
         running = self._running
         first_index = running.step_index
@@ -542,10 +514,11 @@ class FmiAsset:
     # ------------------------------------------------------------------ states
 
     def save_state(self) -> bytes:
-        """Return the state of the asset, for `restore_state` in this or another process.
+        """Return the state of the asset as bytes, for `restore_state` in this or another process.
 
-        If the FMU can serialise its state, that is kept; if not, the inputs of all steps since the
-        last reset are, and restoring replays them (see `state_method`).
+        If the FMU can serialise its state, the bytes hold that state. Otherwise they hold the
+        inputs of all steps since the last reset, which `restore_state` replays (see
+        `state_method`).
 
         Raises
         ------
@@ -557,12 +530,7 @@ class FmiAsset:
         return self._running.save_state()
 
     def restore_state(self, content: bytes) -> None:
-        """Bring the asset to a state that `save_state` returned, in this or an earlier process.
-
-        Parameters
-        ----------
-        content : bytes
-            The state that `save_state` returned.
+        """Restore a state that `save_state` returned, in this or an earlier process.
 
         Raises
         ------
@@ -573,7 +541,7 @@ class FmiAsset:
             If the FMU fails.
         """
         saved_state = SavedState.from_bytes(content)
-        self._running.refuse_foreign(saved_state)
+        self._running.check_saved_state(saved_state)
         # An instance that was started in the same way takes a serialised state as it is, which
         # makes ensembles fast.
         if saved_state.method == "replay" or not self._running.was_started_as(saved_state):
@@ -581,7 +549,7 @@ class FmiAsset:
         self._running.restore(saved_state)
 
     def _start_as_saved(self, start: AssetStart) -> None:
-        """Start the FMU as it was started before a state was saved."""
+        """Repeat the start that preceded a saved state."""
         self._parameters = start.parameters
         self._settings = self._blocks.settings(start.parameters, start.health)
         inputs = start.inputs
@@ -596,7 +564,7 @@ class FmiAsset:
         self._running.start(start, self._settings, request)
 
     def fork(self) -> Self:
-        """Return an independent asset of the same FMU in the same state, with its own worker.
+        """Return a copy of this asset in the same state, with a worker of its own.
 
         The FMU is not extracted again.
 

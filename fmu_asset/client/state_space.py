@@ -108,11 +108,6 @@ class FmuStateSpace:
         FMU with different parameters cannot be compared. Their outputs and rates of outputs can:
         the new coordinates T are those in which the rows [C; C A] of both systems agree best (least
         squares).
-
-        Parameters
-        ----------
-        reference : FmuStateSpace
-            The system that has the wanted coordinates.
         """
         own_rows = _outputs_and_rates(self)
         reference_rows = _outputs_and_rates(reference)
@@ -137,16 +132,16 @@ class FmuStateSpace:
         Parameters
         ----------
         columns : (K,) sequence of int
-            The numbers of the outputs.
+            Indices of the outputs.
         orders : int or (K,) sequence of int
-            The order of the derivative in time of each output: 0, 1 or 2.
+            Order of the time derivative of each output: 0, 1 or 2.
 
         Returns
         -------
         on_state : (K, n) ndarray
-            The rows that multiply the state.
+            Matrix that multiplies the state.
         on_forces : (K, E) ndarray
-            The rows that multiply the forces.
+            Matrix that multiplies the forces.
         """
         on_state = self.output_matrix[columns]
         on_forces = self.feedthrough[columns]
@@ -182,12 +177,7 @@ class FmuStateSpace:
         return np.asarray((self.output_matrix[output] @ shapes) * participation)
 
     def most_flexible_mode(self, output: int, force: int) -> VibratingMode | None:
-        """Return the mode that contributes most to the static displacement of an output by a force.
-
-        Parameters
-        ----------
-        output, force : int
-            The numbers of the output and of the force.
+        """Return the mode with the largest part in an output's static displacement under a force.
 
         Returns
         -------
@@ -212,13 +202,7 @@ class FmuStateSpace:
         )
 
     def stiffness(self, output: int, force: int) -> PortStiffnesses:
-        """Return the stiffness between an output and a force: of the main mode, and at rest.
-
-        Parameters
-        ----------
-        output, force : int
-            The numbers of the output and of the force.
-        """
+        """Return the static stiffness between a force and an output, and that of the main mode."""
         static = 1.0 / float(self.gain[output, force])
         mode = self.most_flexible_mode(output, force)
         # A mode without a noticeable part in the static flexibility is rounding.
@@ -227,7 +211,7 @@ class FmuStateSpace:
         return PortStiffnesses(modal=1.0 / mode.flexibility, static=static)
 
     def has_jumping_speed(self, outputs: IntArray, forces: IntArray) -> bool:
-        """Return whether a force at any of some ports makes the speed there jump.
+        """Return whether the speed at any of some ports jumps when the force there jumps.
 
         At such a port no mass resists the force. A missing effect there that depends on the speed
         could not be integrated in time.
@@ -235,7 +219,7 @@ class FmuStateSpace:
         Parameters
         ----------
         outputs, forces : (P,) array of int
-            The numbers of the displacement output and of the force of each port.
+            Indices of the displacement and of the force of each port.
         """
         for output, force in zip(outputs, forces, strict=True):
             residues = self._residues(output, force)
@@ -253,7 +237,7 @@ def _outputs_and_rates(system: FmuStateSpace) -> FloatArray:
 
 
 def _nonzero(scales: FloatArray) -> FloatArray:
-    """Return scales with 1 instead of 0, so that they can be divided by."""
+    """Return scales in which 1 replaces 0, to divide by."""
     return np.where(scales == 0.0, 1.0, scales)
 
 
@@ -288,19 +272,19 @@ class SingularTriplets(NamedTuple):
 
 
 class DiscreteSystem(NamedTuple):
-    """A system in discrete time: s(k+1) = transition s(k), y(k) = output_rows s(k) for k >= 1.
+    """A linear system in discrete time: s(k+1) = F s(k), y(k) = H s(k) for k >= 1.
 
-    Sample k is taken k + 1 steps after the start. The equation of y does not hold for k = 0, at the
-    end of the first step: the unit force still acts there, and has a feedthrough.
+    Sample k is taken k + 1 steps after the start. Sample 0 lies at the end of the first step, where
+    the unit force still acts and contributes by the feedthrough, so y(0) differs from H s(0).
 
     Attributes
     ----------
     transition : (n, n) ndarray
-        The matrix that advances the state by one step.
+        F.
     first_states : (n, E + R) ndarray
-        The states s(0) at the end of the first step, for each unit force and each release.
+        s(0) for each unit force and each release.
     output_rows : (C, n) ndarray
-        The matrix that gives the outputs from the state.
+        H.
     """
 
     transition: FloatArray
@@ -320,7 +304,7 @@ def realise_state_space(records: FloatArray, forces: int, step: float) -> FmuSta
         Outputs at the ends of K steps. The first E responses are those to a unit of each force,
         which acts during the first step only; the last R are those to a unit of each release.
     forces : int
-        The number of forces, E.
+        The number of forces E.
     step : float
         The length of a step [s].
 
@@ -385,18 +369,11 @@ def _sufficient_triplets(matrix: FloatArray) -> SingularTriplets:
 
 
 def _largest_triplets(matrix: FloatArray, count: int) -> SingularTriplets:
-    """Return the largest singular triplets of a matrix, by randomised SVD.
+    """Return the largest `count` singular triplets of a matrix (r, c), by randomised SVD.
 
-    The method is that of Halko, Martinsson and Tropp (2011): the matrix is projected on the range
-    of its product with random vectors. It is accurate for singular values far above the last one,
-    and the caller uses no others.
-
-    Parameters
-    ----------
-    matrix : (r, c) ndarray
-        The matrix.
-    count : int
-        The number of triplets; if the matrix has no more, all are computed exactly.
+    The matrix is projected on the range of its product with random vectors (Halko, Martinsson and
+    Tropp 2011). This is accurate for singular values far above the last one; the caller uses no
+    others.
     """
     if min(matrix.shape) <= count:
         left, values, right = np.linalg.svd(matrix, full_matrices=False)
@@ -410,23 +387,10 @@ def _largest_triplets(matrix: FloatArray, count: int) -> SingularTriplets:
 def _system_of_order(
     order: int, matrices: HankelMatrices, triplets: SingularTriplets, records: FloatArray
 ) -> DiscreteSystem | None:
-    """Return the discrete-time system of n states that reproduces records.
+    """Return the discrete-time system of a given order that reproduces scaled records.
 
-    Parameters
-    ----------
-    order : int
-        The number n of states.
-    matrices : HankelMatrices
-        The Hankel matrices of the records.
-    triplets : SingularTriplets
-        The singular value decomposition of `matrices.hankel`.
-    records : (K, C, E + R) ndarray
-        The scaled outputs, see `realise_state_space`.
-
-    Returns
-    -------
-    DiscreteSystem or None
-        None if the system is unstable, or does not reproduce the records within `FIT`.
+    None if the order is out of range, or the system is unstable or misses the records by more than
+    `FIT`.
     """
     if not 0 < order <= MOST_STATES:
         return None
@@ -461,21 +425,7 @@ def _system_of_order(
 
 
 def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> FloatArray:
-    """Return the states that follow first states when there are no forces.
-
-    Parameters
-    ----------
-    transition : (n, n) ndarray
-        The matrix that advances a state by one step.
-    first : (n, k) ndarray
-        The first states of k responses.
-    samples : int
-        The number of samples K.
-
-    Returns
-    -------
-    (K, n, k) ndarray
-    """
+    """Return the free response (K, n, k) that starts at k first states (n, k)."""
     states = first[None]
     power_of_transition = transition
     # Each pass appends as many states as there are: those, advanced by that many steps.
@@ -490,16 +440,8 @@ def _in_continuous_time(
 ) -> FmuStateSpace:
     """Return the continuous-time system that has the samples of a discrete-time system.
 
-    Forces are constant during a step (zero-order hold).
-
-    Parameters
-    ----------
-    system : DiscreteSystem
-        The discrete-time system, in the units of the FMU.
-    first_outputs : (C, E) ndarray
-        The outputs at the end of the first step, during which each unit force acts.
-    step : float
-        The length of a step [s].
+    Forces are constant during a step [s] (zero-order hold). `first_outputs` (C, E) are the outputs
+    at the end of the first step, during which each unit force acts.
     """
     order = len(system.transition)
     forces = first_outputs.shape[1]
@@ -522,10 +464,7 @@ def _in_continuous_time(
 
 
 def _logarithm(matrix: FloatArray) -> FloatArray:
-    """Return the real logarithm of a matrix.
-
-    Eigenvectors give it fast. If they are nearly dependent, scipy's `logm` computes it.
-    """
+    """Return the real logarithm of a matrix, by eigenvectors if they are well conditioned."""
     values, vectors = np.linalg.eig(matrix)
     if np.linalg.cond(vectors) < LARGEST_CONDITION:
         scaled_vectors = vectors * np.log(values.astype(complex))

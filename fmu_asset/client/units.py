@@ -55,14 +55,8 @@ def conversion(
 
     Parameters
     ----------
-    unit : str
-        Unit that the binding states.
-    variable : VariableInfo
-        The FMU's variable.
-    definitions : sequence of UnitInfo
-        The FMU's unit definitions.
     where : str
-        Place in the binding, for the message.
+        The entry of the binding, for the message.
 
     Raises
     ------
@@ -87,7 +81,7 @@ def conversion(
 def _conversion_from_display_unit(
     display_unit: str, unit: str, definitions: Sequence[UnitInfo]
 ) -> Conversion | None:
-    """Return the conversion from a display unit to its unit; None if the unit does not have it."""
+    """Return the conversion from a display unit to its unit, or None if it is not one."""
     definition = next(
         (unit_definition for unit_definition in definitions if unit_definition.name == unit), None
     )
@@ -101,7 +95,7 @@ def _conversion_from_display_unit(
 
 
 def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
-    """Return a sentence for every unit that an FMU defines otherwise than is common."""
+    """Return a sentence for every unit that an FMU defines otherwise than usual."""
     sentences = []
     for definition in definitions:
         common_meaning = meaning_of(definition.name)
@@ -134,14 +128,8 @@ def between(
 ) -> Conversion | None:
     """Return the conversion of a value from one unit to another; None if there is none.
 
-    A value without a declared unit is taken to be in the other's unit.
-
-    Parameters
-    ----------
-    source, target : str or None
-        The units.
-    source_definitions, target_definitions : sequence of UnitInfo
-        Definitions of the units of each side; common units need no definition.
+    A value without a declared unit is taken to be in the other unit. Each side has its own
+    definitions of units; common units need none.
     """
     if source is None or target is None:
         return IDENTITY
@@ -158,7 +146,7 @@ def between(
 
 
 def meaning(unit: str, definitions: Sequence[UnitInfo]) -> Meaning | None:
-    """Return the meaning of a unit in SI: that of the FMU's definition, or else the common one.
+    """Return the meaning of a unit in SI, as the FMU or else common use defines it.
 
     None if the unit is unknown.
     """

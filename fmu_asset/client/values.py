@@ -32,9 +32,7 @@ class Inputs(TypedDict, total=False):
 
 
 def inputs_by_role(inputs: Inputs) -> InputsByRole:
-    """Return the keyword arguments of a call, after a check that each one is a role of inputs.
-
-    Without the check, a misspelt keyword would be ignored.
+    """Return keyword arguments as inputs by role; a misspelt role raises an error.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Packing the companions of the wing as FMUs; equal input gives equal bytes.
+"""Packs the companions of the wing as FMUs; equal input gives equal bytes.
 
-A companion is two files of this folder: its variables in TOML, and its behaviour in Python. The FMU
-is packed like that of a wing, with the same slave.
+A companion consists of two files of this folder: its variables in TOML, and its behaviour in
+Python. The FMU is packed like that of a wing, with the same slave.
 """
 
 import json
@@ -30,7 +30,7 @@ def load_contents(resources):
 
 
 def companion_bytes(name: str) -> bytes:
-    """Pack a companion of the wing as an FMU, and return the bytes of the FMU file.
+    """Return the bytes of a companion's FMU file.
 
     Parameters
     ----------
@@ -57,18 +57,16 @@ def companion_bytes(name: str) -> bytes:
 
 
 def companion_declaration(name: str, description: TomlTable) -> Declaration:
-    """Return the model name, variables and dependencies of a companion from its TOML file.
+    """Return the declarations of a companion FMU, made from its TOML file.
 
     Parameters
     ----------
-    name : str
-        The model name.
     description : mapping
         The content of the TOML file: a text `description`, and a list of tables `group`. The
         variables of a group are declared `repeat` times (by default once), with the number of the
-        repetition in the place of `{n}` in their texts. A variable has the keys of
-        `VariableTable.add`, with `low` and `high` for its range. An output may name the input on
-        which it depends directly by the key `of`.
+        repetition instead of `{n}` in their texts. A variable has the keys of `VariableTable.add`,
+        with `low` and `high` for its range. An output may name by the key `of` the input on which
+        it depends directly.
     """
     table = VariableTable({})
     dependencies: dict[str, list[str]] = {"status": []}
@@ -83,19 +81,9 @@ def companion_declaration(name: str, description: TomlTable) -> Declaration:
 def _add_variable(
     table: VariableTable, dependencies: dict[str, list[str]], row: TomlTable, number: int
 ) -> None:
-    """Add a variable to the table, and if it is an output, its direct dependency.
+    """Add a variable to the table, and the direct dependency of an output.
 
-    Parameters
-    ----------
-    table : VariableTable
-        The variables so far; the variable is added.
-    dependencies : dict of str to list of str
-        The inputs on which each output depends directly, by the name of the output; an entry is
-        added for an output.
-    row : mapping
-        The keys of the variable in the TOML file.
-    number : int
-        The number that replaces `{n}` in the texts of the variable.
+    `number` replaces `{n}` in the texts of the variable.
     """
     attributes: TomlTable = {}
     for key, value in row.items():

@@ -1,19 +1,18 @@
-"""Damage that grows: the stiffness losses of two regions, by script, by load and by chance.
+"""Growing damage: the stiffness losses of two regions, by script, by load and by chance.
 
 This file is copied into the FMU: standard library only.
 
-The loss of a region is the sum of three parts, kept below a ceiling:
+The loss of a region is the sum of three parts, limited to a ceiling:
 
 - a script: at each mark of time between `first` and `last` of an entry, the entry's gain;
 - growth with the load, as in crack growth (Paris and Erdogan 1963):
   dz/dt = rate (|n| / n_ref)^exponent;
-- chance: at each mark but the first, one level more with probability
-  min(1, p (|n| / n_ref)^exponent), where n is the load factor that was held before the mark.
+- chance: at each mark but the first, one more level with probability
+  min(1, p (|n| / n_ref)^exponent), where n is the load factor before the mark.
 
 A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that
-begins at it, so that the damage that a step does is felt from the next step on. The numbers of a
-mark follow from the seed, the region and the mark alone: they do not depend on the step size, on
-the other region or on earlier marks.
+begins at it, so that damage from one step acts from the next step on. The random number of a mark
+depends only on seed, region and mark: not on the step size, the other region or earlier marks.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class ScriptEntry(NamedTuple):
     first, last : float
         The times after the start between which its marks lie [s].
     gains : tuple of float
-        The loss that each region gains at each of these marks.
+        The loss that is added to each region at each of these marks.
     """
 
     first: float
@@ -49,7 +48,7 @@ class ScriptEntry(NamedTuple):
 
 
 class DamageGrowthBehaviour:
-    """The behaviour of the FMU of growing damage, called by its slave; see the module."""
+    """The behaviour of the FMU of growing damage; see the module."""
 
     def __init__(self) -> None:
         self._losses = [0.0, 0.0]
@@ -78,7 +77,7 @@ class DamageGrowthBehaviour:
     def start(
         self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
     ) -> list[float]:
-        """Begin with the initial losses, and return the outputs."""
+        """Set the initial losses, and return the outputs."""
         self._set_parameters(parameters)
         self._losses = [parameters[f"initial.{region}"] for region in REGIONS]
         self._start_time = time
@@ -92,9 +91,9 @@ class DamageGrowthBehaviour:
         Parameters
         ----------
         time, duration : float
-            Begin and length of the step [s].
+            Beginning and length of the step [s].
         inputs : sequence of float
-            The load factor that is held over the step.
+            The constant load factor of the step.
         """
         load_factor = inputs[0]
         period = self._period
@@ -121,12 +120,7 @@ class DamageGrowthBehaviour:
     def _pass_mark(self, elapsed: float, load_factor: float) -> None:
         """Add the damage of the next mark.
 
-        Parameters
-        ----------
-        elapsed : float
-            Time of the mark after the start [s].
-        load_factor : float
-            The load factor that was held before the mark.
+        `elapsed` is its time after the start [s], `load_factor` that before the mark.
         """
         tolerance = _RELATIVE_TIME_TOLERANCE * self._period
         for region, name in enumerate(REGIONS):
@@ -149,7 +143,7 @@ class DamageGrowthBehaviour:
         return [round(loss, _DECIMALS) for loss in self._losses]
 
     def state(self) -> list[float]:
-        """Return losses, start time, number of the next mark, and last load factor."""
+        """Return losses, start time, index of the next mark, and last load factor."""
         return [
             *self._losses,
             self._start_time,
@@ -158,7 +152,7 @@ class DamageGrowthBehaviour:
         ]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Return to a state that the method `state` returned."""
+        """Restore a state that `state` returned."""
         self._set_parameters(parameters)
         *losses, start_time, next_mark, load_factor = state
         self._losses = losses

@@ -1,12 +1,12 @@
-"""Strain gauges: true strains in; gain, offset, drift, noise and dropout; readings out.
+"""Strain gauges: true strains in, readings with gain, offset, drift, noise and dropout out.
 
 This file is copied into the FMU: standard library only.
 
 At time t, a gauge reads gain * strain + offset + drift_rate * max(0, t - drift_start) + noise. It
 is lost where dropout_start < t <= dropout_end, where blackout.start < t <= blackout.end (all
-gauges), and by chance with `dropout_probability`: then it reads 0 and `received` is false. A step
-that begins at `dropout_start` is therefore the first one that is lost. The random numbers of a
-reading follow from the seed and the number of the reading alone.
+gauges), and by chance with `dropout_probability`: then it reads 0 and `received` is false. So the
+step that begins at `dropout_start` is the first one that is lost. The random numbers of a reading
+depend only on the seed and the number of the reading.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class LossWindow(NamedTuple):
 
 
 class StrainGaugesBehaviour:
-    """The behaviour of the FMU of strain gauges, called by its slave; see the module."""
+    """The behaviour of the FMU of strain gauges; see the module."""
 
     _reading_number = 0
 
@@ -77,7 +77,7 @@ class StrainGaugesBehaviour:
         Parameters
         ----------
         time, duration : float
-            Begin and length of the step [s].
+            Beginning and length of the step [s].
         inputs : sequence of float
             The true strains.
         """
@@ -86,7 +86,7 @@ class StrainGaugesBehaviour:
         return outputs
 
     def _outputs(self, time: float, strains: Sequence[float], reading_number: int) -> list[float]:
-        """Return the readings, followed by one number for each gauge: 1 if received, 0 if lost."""
+        """Return the readings, then a flag for each gauge: 1 if received, 0 if lost."""
         # systematic errors
         readings = []
         for gain, strain, offset in zip(self._gains, strains, self._offsets, strict=True):
@@ -118,7 +118,7 @@ class StrainGaugesBehaviour:
         return [float(self._reading_number)]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Return to a state that the method `state` returned."""
+        """Restore a state that `state` returned."""
         self._set_parameters(parameters)
         self._reading_number = int(state[0])
 
@@ -126,7 +126,7 @@ class StrainGaugesBehaviour:
 def normal(generator: random.Random) -> float:
     """Return a standard normal number, by the formula of Box and Muller (1958).
 
-    The library's own is not promised to stay the same from one version of Python to the next.
+    Python's own generator may change from one version to the next.
     """
     radius = math.sqrt(-2.0 * math.log(1.0 - generator.random()))
     return radius * math.cos(2.0 * math.pi * generator.random())

@@ -1,4 +1,4 @@
-"""Compiling the C sources of an FMU to a shared library, the same bytes every time."""
+"""Compiles the C sources of an FMU to a shared library, with the same bytes every time."""
 
 import os
 import shlex
@@ -38,7 +38,7 @@ _SHOWN_ERROR_LINES = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Compiler:
-    """A C compiler with its flags, which makes shared libraries.
+    """A C compiler for shared libraries, with its flags.
 
     Attributes
     ----------
@@ -47,9 +47,9 @@ class Compiler:
     command : sequence of str
         The command, with the flags that it is called with.
     advice : str
-        What to do if it fails, for messages, such as "set CC to another one".
+        What to do if it fails, such as "set CC to another one".
     environment : mapping of str to str, optional
-        The environment variables that it is called with; by default those of this process.
+        Its environment variables; by default those of this process.
     longest_seconds : float
         The time after which it is stopped.
     """
@@ -61,12 +61,12 @@ class Compiler:
     longest_seconds: float = 300.0
 
     def library(self, sources: Mapping[str, bytes], file_name: str) -> bytes:
-        """Return the shared library of C sources.
+        """Compile C sources to a shared library, and return its bytes.
 
         Parameters
         ----------
         sources : mapping of str to bytes
-            The content of the sources and headers by file name, all in one folder.
+            The content of sources and headers by file name, all in one folder.
         file_name : str
             The name of the file that the compiler writes.
 
@@ -106,17 +106,12 @@ class Compiler:
 
 
 def find_compiler() -> list[str]:
-    """Return the command of this host's C compiler: `$CC` if it is set, else one of `COMPILERS`.
-
-    Returns
-    -------
-    list of str
-        The command, such as ["/usr/bin/cc"]; `$CC` may hold arguments.
+    """Return the command of this host's C compiler: `$CC`, which may have arguments, or one found.
 
     Raises
     ------
     FmuBuildError
-        If there is no compiler.
+        If there is none.
     """
     command_from_environment = shlex.split(os.environ.get("CC", ""))
     if command_from_environment:
@@ -137,19 +132,12 @@ def find_compiler() -> list[str]:
 
 
 def compile_library(sources: Mapping[str, bytes]) -> bytes:
-    """Return the shared library of C sources for this host.
-
-    The same sources and compiler give the same bytes.
+    """Compile C sources to a shared library for this host; equal sources give equal bytes.
 
     Parameters
     ----------
     sources : mapping of str to bytes
-        The content of the sources and headers by file name, all in one folder.
-
-    Returns
-    -------
-    bytes
-        The library.
+        The content of sources and headers by file name, all in one folder.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Compiling the C sources of an FMU for other platforms, by the compiler zig from PyPI."""
+"""Compiles the C sources of an FMU for other platforms, by the compiler zig from PyPI."""
 
 import importlib.util
 import os
@@ -51,17 +51,17 @@ def find_cross_compiler() -> list[str]:
 
 
 def cross_compile_library(sources: Mapping[str, bytes], targets: Sequence[Target]) -> bytes:
-    """Return the shared library of C sources for a platform other than this host.
+    """Compile C sources to a shared library for other platforms than this host.
 
     The same sources and version of ziglang give the same bytes.
 
     Parameters
     ----------
     sources : mapping of str to bytes
-        The content of the sources and headers by file name, all in one folder.
+        The content of sources and headers by file name, all in one folder.
     targets : sequence of str
-        The processor and system that the library runs on, such as ["x86_64-windows"]. Several
-        processors are possible on macOS, whose file then holds the library of each.
+        Processor and system, such as ["x86_64-windows"]. Several processors are possible on macOS,
+        whose file then contains the library of each.
 
     Raises
     ------
@@ -93,11 +93,11 @@ def cross_compile_library(sources: Mapping[str, bytes], targets: Sequence[Target
 
 @contextmanager
 def zig_environment() -> Iterator[dict[str, str]]:
-    """Return a context with the environment variables of a run of zig.
+    """Provide the environment variables for a run of zig.
 
-    zig keeps what it compiles of its own C libraries in the folder `zig` of the cache of uav-twin,
+    zig stores what it compiles of its own C libraries in the folder `zig` of the cache of uav-twin,
     or in a temporary folder if that one cannot be written. The objects of the FMU are always in a
-    temporary folder, so the cache grows with new targets and versions of zig alone.
+    temporary folder, so the cache grows only with new targets and versions of zig.
     """
     cache = cache_folder() / "zig"
     with tempfile.TemporaryDirectory(prefix="uav-twin-zig-") as scratch:
@@ -130,10 +130,10 @@ _THIN_HEADER = struct.Struct("<Iii")  # magic, processor, its subtype
 
 
 def fat_library(libraries: Sequence[bytes]) -> bytes:
-    """Return one Mach-O file that holds the libraries of several processors.
+    """Return one Mach-O file that contains the libraries of several processors.
 
-    The system loads the library for its own processor. The file is laid out as in `fat.h` of
-    macOS: header, an entry for each library, and the libraries at multiples of 2^14 bytes.
+    The system loads the library for its own processor. The file is laid out as in `fat.h` of macOS:
+    header, an entry for each library, and the libraries at multiples of 2^14 bytes.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """The files of a compiled FMU: description, sources, headers of FMI, data file, and library.
 
-The C sources in `sources` evaluate the reduced model; what differs from one model to the next is a
-data file and two generated sources with the variables.
+The C sources in `sources` evaluate the reduced model. Models differ only in a data file and two
+generated sources with the variables.
 """
 
 import struct
@@ -38,20 +38,11 @@ _NOT_IN_DATA_FILE = ("nominal", "damping", "validity_box", "followed_shapes")
 
 
 def data_file_bytes(model: ReducedArrays) -> bytes:
-    """Return the content of the file from which a compiled FMU reads its reduced model.
+    """Return the data file from which a compiled FMU reads its reduced model.
 
-    Equal models give equal bytes.
-
-    Parameters
-    ----------
-    model : ReducedArrays
-        The reduced structure. Its arrays are written under their names, scalars as arrays without
-        dimension, and names as their counts; arrays without values are left out.
-
-    Returns
-    -------
-    bytes
-        Magic, version, arrays, CRC-32.
+    It consists of magic, version, arrays and CRC-32. The arrays of the model are written under
+    their names, scalars as arrays without dimension, and names as their counts; empty arrays are
+    left out. Equal models give equal bytes.
     """
     values: dict[str, object] = {}
     for field in fields(ReducedArrays):
@@ -70,17 +61,12 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
 
 
 def pack_arrays(arrays: Mapping[str, FloatArray]) -> bytes:
-    """Return arrays as the bytes of a data file, which the sources of a compiled FMU read.
+    """Return arrays by name as a data file, which the sources of a compiled FMU read.
 
     Parameters
     ----------
     arrays : mapping of str to ndarray
-        The arrays of float64 by name, which has at most 31 ASCII letters.
-
-    Returns
-    -------
-    bytes
-        The content of the file.
+        Arrays of float64; a name has at most 31 ASCII letters.
     """
     parts = [MAGIC, _COUNT.pack(VERSION, len(arrays))]
     for name in sorted(arrays):
@@ -100,7 +86,7 @@ STATES = {"modal_displacement": "Coordinate", "modal_velocity": "Rate of the coo
 def exchange_table(
     table: Sequence[FmuVariable], mode_count: int, *, arrays: bool = False
 ) -> tuple[FmuVariable, ...]:
-    """Return the variables of an FMU for model exchange, where the modes are states.
+    """Return the variables of an FMU for model exchange, in which the modes are states.
 
     Parameters
     ----------
@@ -109,13 +95,14 @@ def exchange_table(
     mode_count : int
         Number M of modes.
     arrays : bool
-        Whether the rows will become arrays, whose derivative is an array too.
+        Whether the rows become arrays, with derivatives that are arrays, too.
 
     Returns
     -------
     tuple of FmuVariable
-        The same variables with discrete health and the transient response, then 2 M states
-        (coordinates of the modes and their rates, mass-normalised), then their 2 M derivatives.
+        The same variables with discrete health and transient response, then 2 M states
+        (mass-normalised coordinates of the modes and their rates), then the 2 M derivatives of the
+        states.
     """
     rows = []
     for row in table:
@@ -157,19 +144,15 @@ def compiled_members(
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
 ) -> dict[str, bytes]:
-    """Return the files of a compiled FMU without binary; a placeholder stands for the content hash.
+    """Return the files of a compiled FMU without its binary, with the placeholder for the hash.
 
     Parameters
     ----------
-    model : ReducedArrays
-        The reduced model of the structure.
     declaration : Declaration
-        The declarations of the FMU for co-simulation.
-    roles : StructureRoles
-        The role of each of its variables.
+        The declarations for co-simulation.
     fmi : {2, 3}
-        The version of FMI: the same sources but for its functions. In FMI 3, numbered variables,
-        and inputs and outputs such as `health.z1`, pass as arrays.
+        The version of FMI. The sources are the same except for its functions. In FMI 3, numbered
+        variables, and inputs and outputs such as `health.z1`, are passed as arrays.
     interface : {"co-simulation", "model-exchange"}
         The interface of the FMU; in model exchange the modes are states.
 
@@ -221,16 +204,14 @@ def variable_sources(
     roles: StructureRoles,
     arrays: Sequence[description.ArrayVariable] = (),
 ) -> dict[str, bytes]:
-    """Return the C sources that declare the variables; placeholders stand for GUID and content tag.
+    """Return the C sources that declare the variables, with placeholders for GUID and content tag.
 
     Parameters
     ----------
     table : sequence of FmuVariable
-        The variables, in order of their value reference.
-    roles : StructureRoles
-        The role of each of them.
+        In the order of the value references.
     arrays : sequence of ArrayVariable
-        The rows of the table that pass together, in FMI 3.
+        Rows of the table that are passed together in FMI 3.
 
     Returns
     -------
@@ -257,7 +238,7 @@ def variable_sources(
 
 
 def _common_sources(fmi: FmiVersion) -> dict[str, bytes]:
-    """Return the C files that every compiled FMU of a version of FMI has, by name."""
+    """Return the C files that all compiled FMUs of a version of FMI share, by name."""
     other_version = 3 if fmi == 2 else 2
     sources = {}
     for entry in (files("fmu_asset.compiled") / "sources").iterdir():
@@ -268,7 +249,7 @@ def _common_sources(fmi: FmiVersion) -> dict[str, bytes]:
 
 
 def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
-    """Return the headers of a version of FMI by name, from the installed fmpy.
+    """Return the headers of a version of FMI by name, as fmpy ships them.
 
     Their licence (2-clause BSD) is in them.
 
@@ -293,24 +274,17 @@ def compiled_binaries(
     fmi: FmiVersion = 2,
     platforms: Sequence[Platform] | None = None,
 ) -> dict[str, bytes]:
-    """Return the binaries of a compiled FMU, made from the sources among its files.
+    """Compile the sources among an FMU's files, and return the binaries by name.
 
     Parameters
     ----------
     members : mapping of str to bytes
         The files of the FMU.
-    identifier : str
-        The model identifier.
     fmi : {2, 3}
         The version of FMI.
     platforms : sequence of str, optional
-        The platforms that the FMU runs on, see `targets_by_folder`; zig compiles for them. By
-        default, the C compiler of this host compiles for this host.
-
-    Returns
-    -------
-    dict of str to bytes
-        Each binary under its name in the archive.
+        The platforms of the binaries, see `targets_by_folder`; zig compiles for them. By default,
+        the C compiler of this host compiles for this host.
 
     Raises
     ------

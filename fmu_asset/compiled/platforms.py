@@ -37,7 +37,7 @@ _SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
 def targets_by_folder(
     platforms: Sequence[Platform], fmi: FmiVersion
 ) -> dict[str, tuple[Target, ...]]:
-    """Return the targets whose libraries a folder of binaries holds, by the name of the folder.
+    """Return the targets of each folder of binaries.
 
     A folder has one library. The folder `darwin64` of FMI 2 has two targets, whose libraries are
     joined to one.
@@ -45,9 +45,8 @@ def targets_by_folder(
     Parameters
     ----------
     platforms : sequence of str
-        The names of platforms, see `Platform`. In either version of FMI, a name of FMI 2 stands
-        for the targets that it covers. "all" stands for all targets that the version has a folder
-        for.
+        Names of platforms, see `Platform`. In either version of FMI, a name of FMI 2 stands for the
+        targets that it covers. "all" stands for all targets for which the version has a folder.
     fmi : {2, 3}
         The version of FMI.
 
@@ -82,14 +81,14 @@ def targets_by_folder(
 
 
 def binary_name(folder: str, target: Target, identifier: str) -> str:
-    """Return the name of a library in the archive of an FMU.
+    """Return the name in the archive of the library for a target.
 
     Parameters
     ----------
     folder : str
         The folder of the platform, such as "linux64".
     target : str
-        A target of the library, such as "x86_64-linux".
+        A target such as "x86_64-linux".
     identifier : str
         The model identifier.
     """
@@ -102,11 +101,11 @@ def suffix_of(target: Target) -> str:
 
 
 def host_binary_name(identifier: str, fmi: FmiVersion) -> str:
-    """Return the name of the library for this host in the archive of an FMU of a version of FMI."""
+    """Return the name in the archive of the library for this host."""
     folder = HOST_TARGET if fmi == 3 else _FMI_2_FOLDERS[HOST_TARGET]
     return binary_name(folder, HOST_TARGET, identifier)
 
 
 def _platform_list() -> str:
-    """Return the names of all platforms as a list in words."""
+    """Return the names of all platforms as a list for a message."""
     return comma_list(get_args(Platform))

@@ -29,26 +29,24 @@ class CoupledAsset(FmiAsset):
 
     The step size of the binding is that of the system: outputs are exchanged once a step. With
     ``"gauss_seidel"`` each component takes the newest outputs of those that were stepped before it,
-    in the order of `schedule`; with ``"jacobi"`` all take the outputs of the beginning of the step.
-    With more than one iteration, components that are connected in a circle repeat the step until
-    what they exchange has settled.
+    in the order of `schedule`; with ``"jacobi"`` all take the outputs at the beginning of the step.
+    With more than one iteration, components that form a cycle repeat the step until the exchanged
+    values have converged.
 
-    After a step that failed, the components no longer stand at the same time: reset the asset or
-    restore a state of it. Where an FMU ends its simulation, `simulate` ends with the step before.
+    After a failed step the components are no longer at the same time: reset the asset or restore a
+    state of it. If an FMU ends its simulation, `simulate` ends with the step before.
 
     Parameters
     ----------
-    structure : SystemStructure or Wiring
-        The system.
     binding : Binding
         The binding; its variables are connectors of the system, or `component.variable`.
     algorithm : {"gauss_seidel", "jacobi"}
         How values pass between components within a step.
     iterations : int
-        Largest number of times that a step of a circle of components is made.
+        Largest number of times that a step of a cycle is made.
     tolerance : float
-        A circle has settled when no value exchanged in it changes by more than this times the
-        larger of one and its magnitude.
+        A cycle has converged when no exchanged value changes by more than this times the larger of
+        one and its magnitude.
     isolated : bool
         Whether each FMU runs in a worker process of its own.
     step_timeout : float, optional
@@ -59,8 +57,8 @@ class CoupledAsset(FmiAsset):
     Raises
     ------
     CouplingError
-        If the system cannot be joined, or has an algebraic loop, and the algorithm is Gauss-Seidel
-        without iterations.
+        If the components do not fit each other, or if the system has an algebraic loop and the
+        algorithm is Gauss-Seidel without iterations.
     BindingError
         If the binding does not fit.
     FmuFileError, FmuUnsupportedError
@@ -130,8 +128,8 @@ class CoupledAsset(FmiAsset):
 
 
 def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) -> None:
-    """Refuse a circle of components that cannot save their state, as an iteration repeats steps."""
-    for group in order.circles:
+    """Raise an error if a component of a cycle cannot save its state, as iterations require."""
+    for group in order.cycles:
         for name in group:
             if assets[name].state_method != "serialised":
                 raise CouplingError(
@@ -141,12 +139,9 @@ def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) 
 
 
 def _system_blocks(system: SystemDescription, binding: Binding) -> Blocks:
-    """Return the request and the reply of a system as one FMU.
+    """Resolve a binding against a system as one FMU.
 
-    Raises
-    ------
-    BindingError
-        If the binding does not fit the system, or has a health that acts at the start only.
+    A `BindingError` is raised if it does not fit, or has health that acts at the start only.
     """
     # Inputs are interpolated at the components, not at the system.
     blocks = Blocks(system, binding.with_header(interpolation="zero-order"))
@@ -161,7 +156,7 @@ def _system_blocks(system: SystemDescription, binding: Binding) -> Blocks:
 
 
 def _check_algorithm(algorithm: str, iterations: int, tolerance: float) -> None:
-    """Refuse an algorithm that does not exist, and numbers that it cannot have."""
+    """Raise an error for an unknown algorithm, or impossible iterations or tolerance."""
     if algorithm not in ALGORITHMS:
         raise CouplingError(
             f"The algorithm must be one of {comma_list(ALGORITHMS)}, but {algorithm!r} was given."

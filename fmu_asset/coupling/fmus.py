@@ -1,4 +1,4 @@
-"""Several FMUs as one: what they exchange in a step, and their state.
+"""Steps several FMUs as one: exchanges their values in each step, and saves their state.
 
 To `CoupledAsset`, which is an `FmiAsset`, `CoupledFmus` looks like one FMU: a request with the
 inputs, a step, a reply with the outputs.
@@ -40,7 +40,7 @@ from .wiring import ConnectedVariable
 
 
 class CoupledState(PackedState):
-    """A saved state of coupled FMUs; its body holds the states of the components in their order.
+    """A saved state of coupled FMUs, whose states follow one another in the body.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class _SystemInput(NamedTuple):
 
 @contextmanager
 def errors_of_component(component: str) -> Iterator[None]:
-    """Give errors of an FMU the name of its component."""
+    """Raise errors of an FMU again with the name of its component in the message."""
     try:
         yield
     except FmuError as error:
@@ -89,7 +89,7 @@ def errors_of_component(component: str) -> Iterator[None]:
 
 
 class OutputSelection:
-    """Selects some of all outputs of a system, and converts them to the units of their reader.
+    """Selects some outputs of a system, and converts them to the units of their reader.
 
     Parameters
     ----------
@@ -120,12 +120,9 @@ class OutputSelection:
         self._is_identity = is_identity
 
     def values(self, outputs: FloatArray, outputs_before: FloatArray) -> FloatArray:
-        """Return the selected outputs in the reader's units.
+        """Return the selected outputs in the reader's units, given all outputs (O,).
 
-        Parameters
-        ----------
-        outputs, outputs_before : (O,) array
-            All outputs, now and at the beginning of the step.
+        `outputs_before` are those at the beginning of the step, for delayed connections.
         """
         values: FloatArray = np.concatenate((outputs, outputs_before))[self._indices]
         if self._is_identity:
@@ -150,9 +147,9 @@ class CoupledFmus(Host):
     jacobi : bool
         Whether all components take the outputs at the beginning of the step.
     iterations : int
-        The largest number of times that a step of a circle of components is made.
+        The largest number of times that a step of a cycle of components is made.
     tolerance : float
-        The relative change at which the values in a circle have settled.
+        The relative change below which the values in a cycle have converged.
     """
 
     def __init__(
@@ -195,9 +192,9 @@ class CoupledFmus(Host):
         read_variables = blocks.reply.layout.variables
         shown_ports = [self._system.ends[variable.name][0] for variable in read_variables]
         self._shown_outputs = OutputSelection(shown_ports, position_of_end)
-        self._begin(assets)
+        self._attach(assets)
 
-    def _begin(self, assets: dict[str, FmiAsset]) -> None:
+    def _attach(self, assets: dict[str, FmiAsset]) -> None:
         """Take FMUs that have not exchanged anything yet."""
         self.assets = assets
         value_count = REQUEST_HEAD + len(self._blocks.request.layout.variables)
@@ -207,7 +204,7 @@ class CoupledFmus(Host):
         # outputs now, at the beginning of the last step, and at the beginning of the step before it
         self._outputs = np.zeros(len(self._output_ends))
         self._outputs_before = self._outputs.copy()
-        self._outputs_two_before = self._outputs_before
+        self._outputs_two_steps_before = self._outputs_before
         self._stepped: set[str] = set()
         self._at_different_times = False
 
@@ -251,7 +248,7 @@ class CoupledFmus(Host):
     def sibling(self) -> Self:
         """Return the same system with FMUs of its own."""
         sibling = copy(self)
-        sibling._begin({name: asset.sibling() for name, asset in self.assets.items()})
+        sibling._attach({name: asset.sibling() for name, asset in self.assets.items()})
         return sibling
 
     def close(self) -> None:
@@ -271,7 +268,7 @@ class CoupledFmus(Host):
             name: dict(component.constants) for name, component in self._components.items()
         }
         if start.with_inputs:
-            self._take_inputs()
+            self._hold_inputs()
         self._at_different_times = True
         initialised: set[str] = set()
         for name in self._schedule.order:
@@ -291,19 +288,19 @@ class CoupledFmus(Host):
         self._at_different_times = False
 
     def step(self) -> None:
-        """Make the step that the request describes."""
+        """Make the step in the request."""
         if self._at_different_times:
             raise FmuStateError(
                 "A step or a restoration failed, and the FMUs no longer stand at the same time; "
                 "reset the asset or restore a state."
             )
-        self._take_inputs()
-        self._outputs_two_before = self._outputs_before
+        self._hold_inputs()
+        self._outputs_two_steps_before = self._outputs_before
         self._outputs_before = self._outputs.copy()
         self._stepped.clear()
         self._at_different_times = True
         for group in self._schedule.groups:
-            if self.iterations > 1 and group in self._schedule.circles:
+            if self.iterations > 1 and group in self._schedule.cycles:
                 self._iterate(group)
             else:
                 self._step_group(group, self._outputs_before if self._jacobi else self._outputs)
@@ -318,11 +315,11 @@ class CoupledFmus(Host):
         run_steps(self.step, requests, replies, report, request=request, reply=self._reply)
 
     def read(self) -> None:
-        """Put the current outputs into the reply."""
+        """Write the present outputs to the reply."""
         self._reply[:] = self._shown_outputs.values(self._outputs, self._outputs_before)
 
     def save(self) -> bytes:
-        """Return the states of the components and the values that they had exchanged."""
+        """Return the states of the components with the values that they have exchanged."""
         states = [asset.save_state() for asset in self.assets.values()]
         held_inputs = {
             name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()
@@ -337,7 +334,7 @@ class CoupledFmus(Host):
         return state.to_bytes()
 
     def restore(self, content: bytes) -> None:
-        """Bring the components to a state that `save` returned."""
+        """Restore a state that `save` returned."""
         saved_state = CoupledState.from_bytes(content)
         component_states = saved_state.components
         self._at_different_times = True
@@ -351,8 +348,8 @@ class CoupledFmus(Host):
 
     # ------------------------------------------------------------------ stepping
 
-    def _take_inputs(self) -> None:
-        """Hand on the inputs in the request; NaN stands for one that nobody has given."""
+    def _hold_inputs(self) -> None:
+        """Convert the inputs in the request for the components; NaN means that nobody gave one."""
         for position, port in self._inputs:
             value = self._request[position]
             if not math.isnan(value):
@@ -362,13 +359,8 @@ class CoupledFmus(Host):
     def _step_group(self, group: Sequence[str], source_outputs: FloatArray) -> None:
         """Step components one after the other.
 
-        Parameters
-        ----------
-        group : sequence of str
-            The components.
-        source_outputs : (O,) array
-            The outputs that feed them: the current ones (Gauss-Seidel), which change on the way, or
-            others (Jacobi).
+        `source_outputs` (O,) feed them: the current outputs, which change on the way
+        (Gauss-Seidel), or those before the step (Jacobi).
         """
         for name in group:
             component, asset = self._components[name], self.assets[name]
@@ -376,8 +368,8 @@ class CoupledFmus(Host):
             fed_values = self._fed_values(component, source_outputs, self._outputs_before)
             with errors_of_component(name):
                 if component.linear:
-                    line_begins = self._begin_lines(component, fed_values, source_outputs)
-                    asset.hold(load=line_begins)
+                    start_values = self._interpolation_starts(component, fed_values, source_outputs)
+                    asset.hold(load=start_values)
                 inputs.update(fed_values)
                 observation = asset.step(load=inputs)
                 for _ in range(component.substeps - 1):
@@ -390,62 +382,41 @@ class CoupledFmus(Host):
     def _fed_values(
         self, component: SteppedComponent, outputs: FloatArray, outputs_before: FloatArray
     ) -> dict[str, float]:
-        """Return the values that feed the inputs of a component, by the inputs' names.
+        """Return the values of a component's fed inputs by name, given all outputs (O,).
 
-        Parameters
-        ----------
-        component : SteppedComponent
-            The component of the coupled system.
-        outputs, outputs_before : (O,) array
-            All outputs, now and at the beginning of the step.
+        `outputs_before` are those at the beginning of the step, for delayed connections.
         """
         values = self._fed_outputs[component.name].values(outputs, outputs_before)
         return dict(zip(component.fed, values.tolist(), strict=True))
 
-    def _begin_lines(
+    def _interpolation_starts(
         self, component: SteppedComponent, fed_values: dict[str, float], source_outputs: FloatArray
     ) -> dict[str, float]:
-        """Return where the straight lines of a component's fed inputs begin.
+        """Return the values of a component's fed inputs at the beginning of an interpolated step.
 
-        Where a source has not been stepped yet, the line of the step before goes on, within the
-        range of the input; its end then takes the place of the value in `fed_values`.
-
-        Parameters
-        ----------
-        component : SteppedComponent
-            The component of the coupled system.
-        fed_values : dict of str to float
-            The ends of the lines by input; changed by this call.
-        source_outputs : (O,) array
-            The outputs that the ends come from.
-
-        Returns
-        -------
-        dict of str to float
-            The begins of the lines by input.
+        A source that has not been stepped yet has no value at the end of the step. It is
+        extrapolated linearly from the step before, within the range of the input, and replaces the
+        one in `fed_values`.
         """
-        begins = self._fed_values(component, self._outputs_before, self._outputs_before)
-        earlier_begins = self._fed_values(
-            component, self._outputs_two_before, self._outputs_two_before
+        start_values = self._fed_values(component, self._outputs_before, self._outputs_before)
+        previous_starts = self._fed_values(
+            component, self._outputs_two_steps_before, self._outputs_two_steps_before
         )
         for variable, source in component.fed.items():
             if variable not in component.moving:
-                begins[variable] = fed_values[variable]
+                start_values[variable] = fed_values[variable]
                 continue
             source_is_stepped = source.end.component in self._stepped
             if source.delayed or source_outputs is self._outputs_before or not source_is_stepped:
                 low, high = self.assets[component.name].input_range("load", variable)
-                extrapolated = 2.0 * begins[variable] - earlier_begins[variable]
+                extrapolated = 2.0 * start_values[variable] - previous_starts[variable]
                 fed_values[variable] = min(max(extrapolated, low), high)
-        return begins
+        return start_values
 
     def _iterate(self, group: Sequence[str]) -> None:
-        """Repeat the step of a circle of components until the exchanged values have converged.
+        """Repeat the step of a cycle of components until the exchanged values have converged.
 
-        Raises
-        ------
-        IterationError
-            If they have not after `iterations` steps.
+        An `IterationError` is raised if they have not converged after `iterations` steps.
         """
         begin_states = {name: self.assets[name].save_state() for name in group}
         exchanged = self._exchanged_in(group)

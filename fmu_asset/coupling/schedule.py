@@ -2,7 +2,7 @@
 
 Both follow from two graphs. In the graph of *components*, a connection leads from one to another.
 In the graph of *variables*, a connection leads from an output to an input, and direct feedthrough
-from an input to an output of the same FMU; a circle in it is an algebraic loop. A circle of
+from an input to an output of the same FMU; a cycle in it is an algebraic loop. A cycle of
 components alone is not one: somewhere on it stands a state, whose value at the beginning of the
 step can be used.
 """
@@ -36,20 +36,18 @@ class Schedule:
     Attributes
     ----------
     groups : tuple of tuple of str
-        The components: each one after those that it depends on directly, as far as that is
-        possible. A group is either a circle of components (more than one, or one that is connected
-        to itself) or one component.
-    circles : frozenset of tuple of str
-        The groups that are a circle.
+        The components, each one after those that it depends on directly, as far as that is
+        possible. A group is one component, or the components of a cycle.
+    cycles : frozenset of tuple of str
+        The groups that are a cycle: several components, or one that is connected to itself.
     held : tuple of Connection
-        The connections that, in one pass in this order, carry the value at the beginning of the
-        step.
+        The connections against this order, which carry the value from the beginning of the step.
     loops : tuple of tuple of Endpoint
-        The algebraic loops, each as a shortest circle of variables.
+        The algebraic loops, each as a shortest cycle of variables.
     """
 
     groups: tuple[tuple[str, ...], ...]
-    circles: frozenset[tuple[str, ...]]
+    cycles: frozenset[tuple[str, ...]]
     held: tuple[Connection, ...]
     loops: tuple[tuple[Endpoint, ...], ...]
 
@@ -68,10 +66,8 @@ def schedule(
 
     Parameters
     ----------
-    names : sequence of str
-        The components.
     connections : sequence of Connection
-        The connections between them that are not delayed.
+        The connections between components that are not delayed.
     feedthrough : mapping
         The inputs that each output depends on directly.
     """
@@ -85,7 +81,7 @@ def schedule(
             direct_followers[source].add(target)
     groups = []
     for group in strong_components(followers):
-        # Within a circle, direct feedthrough says the order; what even it joins in a circle keeps
+        # Within a cycle, direct feedthrough says the order; what even it joins in a cycle keeps
         # its order.
         direct_inside = {
             name: [follower for follower in direct_followers[name] if follower in group]
@@ -95,11 +91,11 @@ def schedule(
         for component_group in strong_components(direct_inside):
             ordered_names += component_group
         groups.append(tuple(ordered_names))
-    circles = []
+    cycles = []
     for group in groups:
         first_name = group[0]
         if len(group) > 1 or first_name in followers[first_name]:
-            circles.append(group)
+            cycles.append(group)
     position: dict[str, int] = {}
     for group in groups:
         for name in group:
@@ -110,7 +106,7 @@ def schedule(
             held_connections.append(connection)
     return Schedule(
         groups=tuple(groups),
-        circles=frozenset(circles),
+        cycles=frozenset(cycles),
         held=tuple(held_connections),
         loops=algebraic_loops(connections, feedthrough),
     )
@@ -119,7 +115,7 @@ def schedule(
 def algebraic_loops(
     connections: Sequence[Connection], feedthrough: Feedthrough
 ) -> tuple[tuple[Endpoint, ...], ...]:
-    """Return one shortest circle for each set of variables that depend on each other.
+    """Return one shortest cycle for each set of variables that depend on each other.
 
     Parameters
     ----------
@@ -144,9 +140,9 @@ def algebraic_loops(
                     successors[input_end].add(output_end)
     loops = []
     for strong_component in strong_components(successors):
-        circle = shortest_circle(successors, strong_component)
-        if circle:
-            loops.append(circle)
+        cycle = shortest_cycle(successors, strong_component)
+        if cycle:
+            loops.append(cycle)
     return tuple(loops)
 
 
@@ -194,22 +190,20 @@ def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node
     return order
 
 
-def shortest_circle(
+def shortest_cycle(
     graph: Mapping[Node, Collection[Node]], strong_component: Sequence[Node]
 ) -> tuple[Node, ...]:
-    """Return a shortest circle inside a strongly connected component of a graph.
+    """Return a shortest cycle inside a strongly connected component of a graph.
 
     Parameters
     ----------
     graph : mapping
         The successors by node.
-    strong_component : sequence
-        The nodes of the strongly connected component.
 
     Returns
     -------
     tuple
-        The nodes of the circle, the first repeated at the end; empty for a node alone that has no
+        The nodes of the cycle, the first repeated at the end; empty for a node alone that has no
         connection to itself.
     """
     members = set(strong_component)
@@ -234,15 +228,15 @@ def shortest_circle(
 
 def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
     """Return the sentence that reports algebraic loops."""
-    circles = []
+    cycles = []
     for loop in loops[:_SHOWN_LOOPS]:
-        circles.append(" -> ".join(str(end) for end in loop))
-    circle_list = "; ".join(circles)
+        cycles.append(" -> ".join(str(end) for end in loop))
+    cycle_list = "; ".join(cycles)
     if len(loops) > _SHOWN_LOOPS:
-        circle_list += f" and {len(loops) - _SHOWN_LOOPS} more"
+        cycle_list += f" and {len(loops) - _SHOWN_LOOPS} more"
     subject = "an algebraic loop" if len(loops) == 1 else f"{len(loops)} algebraic loops"
     return (
-        f"The connections close {subject} ({circle_list}): every value in it depends on itself at "
+        f"The connections close {subject} ({cycle_list}): every value in it depends on itself at "
         "the same moment; delay one of its connections, allow iterations, or take the algorithm "
         "jacobi, which delays all of them."
     )

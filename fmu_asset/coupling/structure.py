@@ -1,7 +1,7 @@
 """The records of a system of FMUs: components, connectors of the system, and connections.
 
-They hold what a scenario or an SSP file says; no FMU is opened here. `wiring` checks them against
-the FMUs.
+They hold what a scenario or an SSP file states, without opening any FMU. `wiring` checks them
+against the FMUs.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,12 +23,12 @@ SettingValue = float | bool | str | bytes
 
 
 class Endpoint(NamedTuple):
-    """An end of a connection.
+    """An end of a connection: `component.variable`, or a connector of the system.
 
     Attributes
     ----------
     component : str
-        The name of the component; empty for a connector of the system.
+        Empty for a connector of the system.
     variable : str
         The name of the variable, or of the connector.
     """
@@ -70,13 +70,11 @@ class Component:
     Attributes
     ----------
     name : str
-        A name of its own in the system.
-    fmu : Path
-        The FMU file.
+        A name that is unique in the system.
     settings : mapping of str to ComponentSetting
         Parameters and start values by variable name.
     substeps : int
-        The number of steps that the FMU makes in one step of the system, its inputs held.
+        The number of steps that the FMU makes in one step of the system, with constant inputs.
     interface : {"co-simulation", "model-exchange"}, optional
         The interface to be used; by default co-simulation where the FMU offers it.
     shown_as : str
@@ -93,18 +91,16 @@ class Component:
 
 @dataclass(frozen=True)
 class Connector:
-    """A connector of a system, or a connector of a component as a file declares it.
+    """A connector of a system, or one that a file declares for a component.
 
     Attributes
     ----------
-    name : str
-        The name of the connector.
     kind : str
-        The kind; for a connector of the system one of `CONNECTOR_KINDS`.
+        For a connector of the system one of `CONNECTOR_KINDS`.
     unit : str or None
         The unit; None for the unit of what the connector is connected to.
     type : str or None
-        The type in the words of SSP 1.0; None if no file says it.
+        The type as SSP 1.0 calls it; None if no file states it.
     """
 
     name: str
@@ -115,7 +111,7 @@ class Connector:
 
 @dataclass(frozen=True)
 class Connection:
-    """A value that goes from one end to another: target = factor * source + offset.
+    """A connection from one end to another: target = factor * source + offset.
 
     Attributes
     ----------
@@ -182,7 +178,7 @@ class SystemStructure:
     unused: tuple[str, ...] = ()
 
     def component(self, name: str) -> Component:
-        """Return the component of that name.
+        """Return the component of a name.
 
         Raises
         ------
@@ -196,7 +192,7 @@ class SystemStructure:
         raise CouplingError(f"The system {self.name} has no component {name!r}; it has {names}.")
 
     def delayed(self, targets: Iterable[str]) -> "SystemStructure":
-        """Return the system with the connections to some ends delayed by a step.
+        """Return the system with the connections to some targets delayed by a step.
 
         Parameters
         ----------
@@ -264,8 +260,6 @@ def expand_connection(
 
     Parameters
     ----------
-    source, target : str
-        The patterns of the ends.
     components : sequence of str
         The names of the components.
     factor, offset, convert_units, delayed
@@ -299,7 +293,7 @@ def expand_connection(
 
 
 def two_sources_sentence(target: object, first_source: object, second_source: object) -> str:
-    """Return the message on a target that two connections lead to."""
+    """Return the message about a target that two connections lead to."""
     return (
         f"{target} has two sources, {first_source} and {second_source}; keep one of the two "
         "connections."

@@ -1,4 +1,4 @@
-"""A system of FMUs described as if it were one FMU, and its components as the system steps them.
+"""A system of FMUs described as one FMU, and the components that the system steps.
 
 A binding names variables of a system as it names variables of an FMU. For that,
 `system_description` lists the connectors of the system and all variables of its components.
@@ -33,9 +33,9 @@ class SystemDescription(FmuDescription):
     Attributes
     ----------
     ends : dict of str to tuple of ConnectedVariable
-        For each variable of the system the variables of components that it goes to, or comes from.
+        For each variable of the system, the components' variables that it sets or reads.
     definitions : dict of str to tuple of UnitInfo
-        For each variable the unit definitions that hold for it: FMUs may differ in them.
+        For each variable, the unit definitions that hold for it: FMUs may differ in them.
     """
 
     ends: dict[str, tuple[ConnectedVariable, ...]] = field(default_factory=dict)
@@ -46,12 +46,12 @@ class SystemDescription(FmuDescription):
         return self.definitions[variable.name]
 
     def settings_of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
-        """Return the values to set in each component, by its name and that of the FMU's variable.
+        """Return the values to set in each component, by component and variable name.
 
         Parameters
         ----------
         settings : InitialValues
-            Values of variables of the system, by value reference.
+            Values of the system's variables, by value reference.
         """
         by_component: dict[str, dict[str, float]] = {}
         for _, reference, (value,) in settings:
@@ -73,15 +73,13 @@ class _SystemVariable(NamedTuple):
 def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     """Return a system as the description of one FMU, all of whose variables are real numbers.
 
-    Outputs of components that a connector shows are local variables. The ranges and types of inputs
-    are those of the components, which check them.
+    An output that a connector exposes is a local variable of the system. Ranges and types of inputs
+    are left out, since the components check them.
 
     Parameters
     ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
     sha256 : str
-        A hash of everything that the meaning of a saved state depends on.
+        A hash of everything that the meaning of a saved state depends on, see `wiring_hash`.
     """
     structure = wiring.structure
     system_variables = [
@@ -151,19 +149,7 @@ def _connector_variable(wiring: Wiring, connector: Connector) -> _SystemVariable
 def _component_variable(
     wiring: Wiring, end: Endpoint, info: VariableInfo, *, is_shown: bool
 ) -> _SystemVariable:
-    """Return a variable of a component as a variable of the system.
-
-    Parameters
-    ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
-    end : Endpoint
-        The component and its variable.
-    info : VariableInfo
-        The variable as its FMU declares it.
-    is_shown : bool
-        Whether it is an output that a connector of the system shows.
-    """
+    """Return a component's variable as one of the system; local if a connector exposes it."""
     causality = info.causality
     if end in wiring.feeds:
         causality = "an input that is fed by a connection already"
@@ -196,14 +182,12 @@ def _smallest_step(wiring: Wiring) -> float | None:
 def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> str:
     """Return the SHA-256 of everything that the meaning of a saved state depends on.
 
-    Where the files of the FMUs lie does not count.
+    The paths of the FMU files do not count.
 
     Parameters
     ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
     binding : Binding
-        A binding of it.
+        A binding of the system.
     *algorithm : str or float
         The algorithm, its iterations and its tolerance.
     """
@@ -222,28 +206,28 @@ def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> st
 
 @dataclass(frozen=True)
 class SteppedComponent:
-    """A component of a system as the system steps it.
+    """A component of a system with everything that is needed to step it.
 
     Attributes
     ----------
     name : str
         The component.
     ends : tuple of Endpoint
-        The outputs that are read, in the order of its binding; at least one, to see that it is
-        alive.
+        The outputs that are read, in the order of its binding. There is at least one, to see that
+        the FMU works.
     fed : dict of str to ConnectedVariable
         The output that feeds each input, by the input's name.
     moving : frozenset of str
         The fed inputs with a continuous real number at both ends.
     linear : bool
-        Whether its inputs move in straight lines over a step.
+        Whether its inputs are interpolated linearly over a step.
     substeps : int
         The number of calls that step its FMU in a step of the system. With linear inputs one call
-        makes all its steps.
+        makes all communication steps.
     settings : dict of str to float or str
-        Parameters.
+        Parameters, by variable name.
     constants : dict of str to float
-        Inputs that have a value from the start.
+        Inputs with a constant value, unless the system sets them.
     binding : Binding
         A binding of the FMU by its own names and units.
     """
@@ -266,12 +250,10 @@ def stepped_components(
 
     Parameters
     ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
     blocks : Blocks
         The request and the reply of the system as one FMU.
     linear : bool
-        Whether inputs move in straight lines where they can.
+        Whether inputs are interpolated linearly where this is possible.
 
     Raises
     ------
@@ -296,7 +278,7 @@ def stepped_components(
 def _stepped_component(
     wiring: Wiring, blocks: Blocks, component: Component, *, linear: bool
 ) -> SteppedComponent:
-    """Return one component of a system, ready to be stepped; see `stepped_components`."""
+    """Return a component ready to be stepped; see `stepped_components`."""
     name = component.name
     infos = {info.name: info for info in wiring.declared[name].variables}
     fed = {}
@@ -356,7 +338,7 @@ def _stepped_component(
 
 
 def _component_header(binding: Binding, component: Component, *, is_linear: bool) -> BindingHeader:
-    """Return the head of a component's binding, from the binding of its system."""
+    """Return the table `[binding]` of a component, derived from the binding of the system."""
     return BindingHeader(
         name=component.name,
         step_size=binding.step_size / component.substeps,
@@ -370,7 +352,7 @@ def _component_header(binding: Binding, component: Component, *, is_linear: bool
 
 
 def _ends_at(blocks: Blocks, component: str, variables: Iterable[str]) -> list[Endpoint]:
-    """Return the ends at a component of variables of the system, in their order."""
+    """Return the variables of a component that belong to variables of the system, in order."""
     description = cast("SystemDescription", blocks.description)
     ends = []
     for variable in variables:
@@ -381,12 +363,9 @@ def _ends_at(blocks: Blocks, component: str, variables: Iterable[str]) -> list[E
 
 
 def _read_outputs(wiring: Wiring, blocks: Blocks, component: str) -> tuple[Endpoint, ...]:
-    """Return the outputs of a component that are read by others or by the binding; at least one.
+    """Return the outputs of a component that others or the binding read; at least one.
 
-    Raises
-    ------
-    CouplingError
-        If it has no output of a single number.
+    If nobody reads any, the first output is taken; a component without an output is refused.
     """
     ends = [port.end for port in wiring.feeds.values() if port.end.component == component]
     read_names = [variable.name for variable in blocks.reply.layout.variables]

@@ -1,4 +1,4 @@
-"""Checking a system of FMUs against its FMUs: every end exists, fits, and has one source."""
+"""Checks a system against its FMUs: every end of a connection exists, fits and has one source."""
 
 import math
 from dataclasses import replace
@@ -30,18 +30,16 @@ _TARGET_TYPES = {
 
 
 class ConnectedVariable(NamedTuple):
-    """A variable of a component at a connection, with the conversion of its value.
+    """A component's variable at one end of a connection, with the conversion of its value.
 
     Attributes
     ----------
-    end : Endpoint
-        The component and its variable.
     conversion : Conversion
         variable = factor * connector + offset for inputs and parameters, connector = factor *
-        variable + offset for outputs, and target = factor * variable + offset for what feeds
-        another component.
+        variable + offset for outputs, and target = factor * variable + offset if it feeds another
+        component.
     delayed : bool
-        Whether the value is that of the beginning of the step.
+        Whether the target gets the value from the beginning of the step.
     """
 
     end: Endpoint
@@ -50,7 +48,7 @@ class ConnectedVariable(NamedTuple):
 
 
 def read_component(component: Component) -> FmuDescription:
-    """Return the model description of a component's FMU; messages name it as the component does.
+    """Return the model description of a component's FMU; messages use the component's name for it.
 
     Raises
     ------
@@ -68,31 +66,28 @@ def read_component(component: Component) -> FmuDescription:
 
 
 class Wiring:
-    """A system whose connections were checked.
+    """A system of FMUs with checked connections, units and parameters.
 
     Parameters
     ----------
-    structure : SystemStructure
-        The system.
     leave_out_unknown : bool
-        Whether settings of variables that the FMU does not have are left out instead of refused.
+        Whether settings of variables that the FMU does not have are skipped instead of refused.
 
     Attributes
     ----------
-    structure : SystemStructure
-        The system.
     left_out : list of str
-        The names of the settings that were left out.
+        The names of the skipped settings.
     declared : dict of str to FmuDescription
         The descriptions of the FMUs by component.
     feeds : dict of Endpoint to ConnectedVariable
         The source of each connection between components, by its target.
     ends : dict of str to tuple of ConnectedVariable
-        For each input and parameter of the system its targets, for each output its source.
+        For each input and parameter of the system the variables that it sets, for each output the
+        one that it reads.
     units : dict of str to (str or None)
         The unit of each connector: its own, or that of what it is connected to.
     settings : dict of str to (dict of str to float or str)
-        Parameters and start values of each component, in the FMU's units; texts of text parameters.
+        Parameters and start values of each component, in the FMU's units.
     schedule : Schedule
         The order of the components, and the algebraic loops.
 
@@ -147,7 +142,7 @@ class Wiring:
         self.schedule: Schedule = schedule(names, immediate, self._used_feedthrough())
 
     def _used_feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the inputs that act at once on each output, and on other variables in use."""
+        """Return the inputs that act at once on each output, or on another connected variable."""
         sources = {connection.source for connection in self.structure.connections}
         used_inputs: dict[str, dict[str, frozenset[str]]] = {}
         for component, description in self.declared.items():
@@ -180,16 +175,9 @@ class Wiring:
         return variable
 
     def _connector(self, end: Endpoint, kinds: tuple[str, ...], role: str) -> VariableInfo:
-        """Return a connector of the system as a variable without type.
+        """Return a connector of the system; raise an error unless its kind may stand there.
 
-        Parameters
-        ----------
-        end : Endpoint
-            The end that names the connector.
-        kinds : tuple of str
-            The kinds of connectors that may stand there.
-        role : str
-            The role of the end in its connection, for the message.
+        `role` names its end of the connection, for the message.
         """
         kind = self._connector_kinds.get(end.variable)
         if kind is None:
@@ -206,15 +194,7 @@ class Wiring:
         return VariableInfo(end.variable, 0, kind="", causality=kind, unit=unit)
 
     def _connect(self, connection: Connection, source_of_target: dict[Endpoint, Endpoint]) -> None:
-        """Check a connection and add it to `feeds` or `ends`.
-
-        Parameters
-        ----------
-        connection : Connection
-            The connection to check and add.
-        source_of_target : dict of Endpoint to Endpoint
-            The sources of the connections before it, by target; it is added to them.
-        """
+        """Check a connection and add it to `feeds` or `ends`, and to the sources by target."""
         source, target = connection.source, connection.target
         if target in source_of_target:
             raise CouplingError(two_sources_sentence(target, source_of_target[target], source))
@@ -246,7 +226,7 @@ class Wiring:
             self.units[connector] = unit
 
     def _source(self, connection: Connection) -> VariableInfo:
-        """Return the variable or connector at the source of a connection; refuse any other end."""
+        """Return the variable or connector at the source of a connection, if it can be one."""
         source = connection.source
         if source.component:
             requirement = "an output of a single number is needed"
@@ -275,16 +255,9 @@ class Wiring:
     def _single(
         self, end: Endpoint, causalities: tuple[str, ...], role: str, requirement: str
     ) -> VariableInfo:
-        """Return the variable at an end, which must be a single number of one of these causalities.
+        """Return the variable at an end, which must be a single number of an allowed causality.
 
-        Parameters
-        ----------
-        end : Endpoint
-            The end of a connection: a component and its variable, or a connector of the system.
-        causalities : tuple of str
-            The causalities that the variable may have.
-        role, requirement : str
-            The role of the end, and the requirement that it must meet, for the message.
+        `role` and `requirement` say in the message what the end is and must be.
         """
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:
@@ -299,10 +272,7 @@ class Wiring:
     ) -> Conversion:
         """Return the conversion of a value between the ends of a connection.
 
-        Raises
-        ------
-        CouplingError
-            If their types or units do not fit.
+        A `CouplingError` is raised if their types or units do not fit.
         """
         source, target, scale = connection.source, connection.target, connection.scale
         both_have_types = source_info.kind != "" and target_info.kind != ""  # connectors have none
@@ -339,15 +309,7 @@ class Wiring:
     # ------------------------------------------------------------------ parameters
 
     def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float | str]:
-        """Return the checked parameters and start values of a component, in the FMU's units.
-
-        Parameters
-        ----------
-        component : Component
-            The component of the coupled system.
-        leave_out_unknown : bool
-            Whether those of unknown variables are added to `left_out` instead of refused.
-        """
+        """Return the checked parameters and start values of a component, in the FMU's units."""
         if component.substeps < 1:
             raise CouplingError(
                 f"The component {component.name!r} needs at least one step in a step of the system."
@@ -361,14 +323,7 @@ class Wiring:
         return settings
 
     def start_value(self, end: Endpoint, setting: ComponentSetting) -> float | str:
-        """Return a checked parameter or start value: a string, or a number in the FMU's unit.
-
-        Parameters
-        ----------
-        end : Endpoint
-            The component and the variable whose value it is.
-        setting : ComponentSetting
-            The user's value, with its unit.
+        """Return a checked parameter or start value: a text, or a number in the FMU's unit.
 
         Raises
         ------
@@ -420,7 +375,7 @@ class Wiring:
 
 
 def _check_settable_number(end: Endpoint, variable: VariableInfo) -> None:
-    """Refuse a variable that cannot be set before the start, or is not a single number."""
+    """Raise an error if a variable is no single number that can be set before the start."""
     if variable.causality not in ("parameter", "input") and not variable.startable:
         raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
     if variable.single:
@@ -437,17 +392,7 @@ def _check_settable_number(end: Endpoint, variable: VariableInfo) -> None:
 
 
 def _fits_type(variable: VariableInfo, value: float | bool, number: float) -> bool:
-    """Return whether a value is of the type of a variable.
-
-    Parameters
-    ----------
-    variable : VariableInfo
-        The variable.
-    value : float or bool
-        The value that a user gives.
-    number : float
-        The value in the unit of the variable.
-    """
+    """Return whether a user's value, converted to the number, is of the type of a variable."""
     if variable.kind == "Boolean":
         return value in (0, 1)
     if isinstance(value, bool) or not math.isfinite(number):

@@ -1,4 +1,4 @@
-"""An instance of an FMU in this process, the same for all versions of FMI and both interfaces.
+"""An FMU instance in this process, alike for all versions of FMI and both interfaces.
 
 A step is one batch of prepared set calls, the step itself, and one batch of get calls. The worker
 process runs this; `FmiAsset` runs it directly if isolation is switched off.
@@ -61,12 +61,12 @@ _instance_numbers = itertools.count(1)
 
 
 class FmiCall(NamedTuple):
-    """A prepared call of a C function that sets or reads a group of variables.
+    """A prepared call that sets or reads a group of variables.
 
     Attributes
     ----------
     function : str
-        Name of the function, without the prefix of its version.
+        Name of the C function, without the prefix of its version.
     call : callable
         Makes the call and returns its status.
     convert_before, convert_after : callable or None
@@ -81,19 +81,14 @@ class FmiCall(NamedTuple):
 
 
 class FmuInstance(Instance):
-    """An instance in this process.
+    """An FMU instance in this process, by way of fmpy.
 
     Subclasses implement the two interfaces; `classes` names fmpy's class for each version of FMI.
-
-    Parameters
-    ----------
-    plan : Plan
-        The variables that each call exchanges with the FMU.
 
     Attributes
     ----------
     messages : deque of (int, str)
-        Last messages of the FMU that nobody has taken yet: status and text.
+        The last messages of the FMU that were not taken yet: status and text.
 
     Raises
     ------
@@ -114,7 +109,7 @@ class FmuInstance(Instance):
         self._plan = plan
         self._version = plan.fmu.major_version
         self._prefix = "fmi" if self._version == 1 else f"fmi{self._version}"
-        self._lines = LinearInputs(self.request, plan) if plan.linear_count else None
+        self._linear_inputs = LinearInputs(self.request, plan) if plan.linear_count else None
         self._name = f"{plan.instance_name}-{os.getpid()}-{next(_instance_numbers)}"
         self.messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
         self._error_count = 0
@@ -122,13 +117,15 @@ class FmuInstance(Instance):
         self._phase: Literal["instantiated", "stepping"] = "instantiated"
         self._fmu = self._load()
         # prepare the calls of a step
-        self._values = self.request if self._lines is None else self._lines.values
+        self._values = self.request if self._linear_inputs is None else self._linear_inputs.values
         self._set_calls = self._group_calls("Set", plan.inputs, self._values, 2)
         self._get_calls = self._group_calls("Get", plan.outputs, self.reply, 0)
-        self._motion_calls = [] if self._lines is None else self._calls_that_move(self._lines)
+        self._per_step_calls = (
+            [] if self._linear_inputs is None else self._interpolation_calls(self._linear_inputs)
+        )
 
     def _load(self) -> FmpyInstance:
-        """Load the binary, instantiate the FMU, and return fmpy's object of it."""
+        """Load the binary, instantiate the FMU, and return fmpy's object for it."""
         register(self._name, self)
         with chdir("."):
             try:
@@ -144,7 +141,7 @@ class FmuInstance(Instance):
         return fmu
 
     def _instantiate(self) -> FmpyInstance:
-        """Instantiate the FMU and return fmpy's object of it."""
+        """Instantiate the FMU and return fmpy's object for it."""
         plan = self._plan
         fmu = self.classes[self._version](
             guid=plan.fmu.guid,
@@ -167,7 +164,7 @@ class FmuInstance(Instance):
     def _go_to_start(
         self, start_time: float, parameters: InitialValues, *, with_inputs: bool
     ) -> None:
-        """Set the parameters and initialise the FMU; parameters as in `initialise`."""
+        """Set the parameters and initialise the FMU; see `initialise`."""
         fmu = self._fmu
         experiment = {
             "startTime": start_time,
@@ -191,26 +188,25 @@ class FmuInstance(Instance):
 
     @abstractmethod
     def _do_step(self) -> None:
-        """Make one communication step from `_step_begin` over `_step_size`; the inputs are set."""
+        """Make the step from `_step_begin` over `_step_size`; the inputs are set already."""
 
     @abstractmethod
-    def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
+    def _interpolation_calls(self, linear_inputs: LinearInputs) -> list[FmiCall]:
         """Return the calls that make linear inputs change over a step.
 
-        Co-simulation sets their derivatives; model exchange sets the inputs themselves at each
-        evaluation.
+        Co-simulation sets their derivatives; model exchange sets the inputs at each evaluation.
         """
 
     def _send_inputs(self) -> None:
-        """Set the inputs of the request block."""
-        if self._lines is not None:
-            self._lines.begin_step()
-        self._make_calls(self._set_calls + self._motion_calls)
+        """Set the inputs of the request."""
+        if self._linear_inputs is not None:
+            self._linear_inputs.begin_step()
+        self._make_calls(self._set_calls + self._per_step_calls)
 
-    def _send_moved_inputs(self, lines: LinearInputs) -> None:
-        """Set the inputs at a later communication point between two observations."""
-        lines.move_to(self._step_begin.value)
-        self._make_calls(self._set_calls + self._motion_calls)
+    def _send_interpolated_inputs(self, linear_inputs: LinearInputs) -> None:
+        """Set linear inputs at a later communication point between two observations."""
+        linear_inputs.move_to(self._step_begin.value)
+        self._make_calls(self._set_calls + self._per_step_calls)
 
     def _terminate_and_free(self) -> None:
         """Terminate the simulation if it has begun, and free the instance.
@@ -228,10 +224,10 @@ class FmuInstance(Instance):
     # ------------------------------------------------------------------ calls of `Instance`
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
-        """Set parameters, and inputs if wanted, and go to the first communication point."""
+        """Set parameters, and inputs if asked for, and go to the first communication point."""
         previous_error_count = self._error_count
-        if self._lines is not None:
-            self._lines.hold()
+        if self._linear_inputs is not None:
+            self._linear_inputs.hold()
         with self._fmpy_calls("initialisation"):
             self._go_to_start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
@@ -240,7 +236,7 @@ class FmuInstance(Instance):
             raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._last_messages())
 
     def step(self) -> None:
-        """Make the step that the request block describes."""
+        """Make the step in the request."""
         if self.lost:
             raise FmuWorkerError(_LOST)
         if self._end_time is not None:
@@ -259,7 +255,7 @@ class FmuInstance(Instance):
     def _do_substeps(self) -> None:
         """Make all communication steps between two observations.
 
-        If one fails after the first, the instance is lost: it cannot return to the last
+        If one fails after the first, the instance is lost, because it cannot return to the last
         observation.
         """
         begin = self._step_begin.value
@@ -268,8 +264,8 @@ class FmuInstance(Instance):
         try:
             for substep in range(self._plan.substeps):
                 self._step_begin.value = begin + substep * size
-                if substep and self._lines is not None:
-                    self._send_moved_inputs(self._lines)
+                if substep and self._linear_inputs is not None:
+                    self._send_interpolated_inputs(self._linear_inputs)
                 self._do_step()
         except FmuError as error:
             if substep == 0 or isinstance(error, FmuEndedError):
@@ -286,7 +282,7 @@ class FmuInstance(Instance):
             self._step_begin.value = begin
 
     def read(self) -> None:
-        """Read the outputs of this moment into the reply block."""
+        """Read the present outputs into the reply."""
         with self._fmpy_calls("reading the outputs"):
             self._make_calls(self._get_calls, "reading outputs")
 
@@ -315,7 +311,7 @@ class FmuInstance(Instance):
             raise FmuStateError("The FMU refused the state.", self._last_messages())
 
     def reset(self) -> None:
-        """Bring the instance back to the moment after its instantiation."""
+        """Return the instance to its state after instantiation."""
         with self._fmpy_calls("reset"):
             if self._phase == "stepping":
                 self._fmu.terminate()
@@ -324,20 +320,20 @@ class FmuInstance(Instance):
             self._end_time = None
 
     def log(self, environment: object, status: int, category: bytes, message: bytes) -> None:
-        """Keep a message of the FMU; the signature is that of fmpy's callback in FMI 3."""
+        """Store a message of the FMU; the signature is that of fmpy's callback in FMI 3."""
         if status in (ERROR, FATAL):
             self._error_count += 1
         text = (message or b"").decode("utf-8", "replace").rstrip()
         self.messages.append((int(status), visible(text)))
 
     def take_log(self) -> list[tuple[int, str]]:
-        """Return and forget the messages that the FMU has logged: status and text."""
+        """Return status and text of the messages that the FMU has logged, and clear them."""
         messages = list(self.messages)
         self.messages.clear()
         return messages
 
     def close(self) -> None:
-        """Free the instance, unless it was lost to a fatal error: freeing that one can crash."""
+        """Free the instance, unless a fatal error has occurred: freeing it could then crash."""
         unregister(self._name)
         if self.lost:
             return
@@ -348,15 +344,7 @@ class FmuInstance(Instance):
     # ------------------------------------------------------------------ C calls
 
     def _prepared_call(self, name: str, *arguments: object) -> Callable[[], int]:
-        """Return a call of a C function of the instance, such as SetReal.
-
-        Parameters
-        ----------
-        name : str
-            The name of the function without the prefix of its version.
-        *arguments
-            C values, see `prepare_call`.
-        """
+        """Return a prepared call of a C function, named without the prefix of its version."""
         model_prefix = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
         function = getattr(self._fmu.dll, f"{model_prefix}{self._prefix}{name}")
         component = ctypes.c_void_p.from_param(self._fmu.component)
@@ -371,16 +359,7 @@ class FmuInstance(Instance):
     ) -> list[FmiCall]:
         """Return the calls that set or read groups of variables.
 
-        Parameters
-        ----------
-        verb : {"Set", "Get"}
-            Whether the calls set or read the variables.
-        groups : tuple of VariableGroup
-            The groups, which follow one another in the block.
-        doubles : C array of double
-            The block.
-        begin : int
-            Position of the first value.
+        The groups follow one another in the block of doubles from position `begin` on.
         """
         is_sent = verb == "Set"
         calls = []
@@ -396,7 +375,7 @@ class FmuInstance(Instance):
         return calls
 
     def _set_initial_values(self, initial_values: InitialValues) -> None:
-        """Set start values or parameters, one variable after the other."""
+        """Set start values and parameters, one variable after the other."""
         for kind, reference, values in initial_values:
             if kind == "String":
                 self._fmu.setString([reference], values)
@@ -406,20 +385,7 @@ class FmuInstance(Instance):
             self._make_calls(self._group_calls("Set", (group,), doubles, 0))
 
     def _make_calls(self, calls: list[FmiCall], purpose: str = "setting inputs") -> None:
-        """Make prepared calls in order.
-
-        Parameters
-        ----------
-        calls : list of FmiCall
-            The calls.
-        purpose : str
-            The purpose of the calls, for the message if the FMU refuses one.
-
-        Raises
-        ------
-        FmuCallError
-            If a call returns a status that is not accepted.
-        """
+        """Make prepared calls in order; raise an error that names the purpose if one is refused."""
         for function, call, convert_before, convert_after in calls:
             if convert_before is not None:
                 convert_before()
@@ -431,10 +397,7 @@ class FmuInstance(Instance):
 
     @contextmanager
     def _fmpy_calls(self, purpose: str) -> Iterator[None]:
-        """Return a context for calls by fmpy's methods.
-
-        It turns their failures into `FmuCallError`, and restores the working directory.
-        """
+        """Turn failures of fmpy's methods into `FmuCallError`, and keep the working directory."""
         if self.lost:
             raise FmuWorkerError(_LOST)
         with chdir("."):
@@ -447,7 +410,7 @@ class FmuInstance(Instance):
     # ------------------------------------------------------------------ errors
 
     def _ended_error(self, time: float) -> FmuEndedError:
-        """Record that the FMU has ended its simulation at a time [s]; return the error."""
+        """Record that the FMU has ended its simulation at a time [s], and return the error."""
         self._end_time = time
         return FmuEndedError(
             f"The FMU asked to end the simulation in {self._step_label()}, and ended at "
@@ -461,19 +424,10 @@ class FmuInstance(Instance):
         return f"the step from t = {self._step_begin.value:g} s"
 
     def _call_error(self, function: str, status: int, purpose: str) -> FmuCallError:
-        """Return the error for a call that the FMU did not accept.
+        """Return the error for a call that the FMU did not accept, such as in "initialisation".
 
-        Unless the FMU only discarded the call, the instance is marked as lost. FMI would allow some
-        further calls to a lost instance. None is made, and the asset replaces the instance.
-
-        Parameters
-        ----------
-        function : str
-            The full name of the C function that was called.
-        status : int
-            The status that the function returned.
-        purpose : str
-            The purpose of the call, for the message: "initialisation".
+        The instance then counts as lost, unless the FMU only discarded the call. FMI would allow
+        some further calls to it; none is made, and the asset replaces the instance.
         """
         self.lost = self.lost or status != DISCARD
         consequence = {
@@ -490,5 +444,5 @@ class FmuInstance(Instance):
         )
 
     def _last_messages(self) -> list[str]:
-        """Return the last messages of the FMU, and remove all messages from its log."""
+        """Return the last messages of the FMU, and clear its log."""
         return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]

@@ -33,7 +33,7 @@ class FMU1CoSimulation(FMU1Slave):  # type: ignore[misc]
     def setupExperiment(
         self, *, startTime: float, stopTime: float | None, tolerance: float | None
     ) -> None:
-        """Keep start and end of the experiment until the initialisation."""
+        """Store start and end of the experiment until the initialisation."""
         self._start_time = startTime
         self._stop_time = stopTime
 
@@ -48,12 +48,7 @@ class FMU1CoSimulation(FMU1Slave):  # type: ignore[misc]
 class CoSimulation(FmuInstance):
     """A co-simulation instance: each step is one call of the FMU.
 
-    In FMI 3.0 it uses neither event mode nor early return.
-
-    Parameters
-    ----------
-    plan : Plan
-        The variables that each call exchanges with the FMU.
+    In FMI 3.0 neither event mode nor early return is used.
     """
 
     classes = {1: FMU1CoSimulation, 2: FMU2Slave, 3: FMU3Slave}  # noqa: RUF012
@@ -71,7 +66,7 @@ class CoSimulation(FmuInstance):
         )
 
     def _further_arguments(self) -> tuple[object, ...]:
-        """Return the C arguments of doStep after time and step size; they depend on the version."""
+        """Return the arguments of the C function doStep after time and step size, by version."""
         if self._version == 1:
             return (ctypes.c_char.from_param(b"\x01"),)  # newStep
         if self._version == 2:
@@ -84,7 +79,7 @@ class CoSimulation(FmuInstance):
             ctypes.byref(self._reached_time),
         )
 
-    def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
+    def _interpolation_calls(self, linear_inputs: LinearInputs) -> list[FmiCall]:
         """Return the call that sets the first derivatives of the linear inputs."""
         references: list[int] = []
         for group in self._plan.inputs:
@@ -98,7 +93,7 @@ class CoSimulation(FmuInstance):
             ctypes.byref((ctypes.c_uint * count)(*references)),
             ctypes.c_size_t.from_param(count),
             ctypes.byref((ctypes.c_int * count)(*first_order)),
-            ctypes.byref(lines.slopes),
+            ctypes.byref(linear_inputs.slopes),
         )
         return [FmiCall(function, call)]
 
@@ -124,19 +119,14 @@ class CoSimulation(FmuInstance):
             )
 
     def _limited_to_step(self, time: float) -> float:
-        """Return a time [s] that the FMU claims to have reached, limited to the present step."""
+        """Return a time [s] that the FMU reports, limited to the present step."""
         begin = self._step_begin.value
         return min(max(time, begin), begin + self._step_size.value)
 
     def _raise_ended_if_terminated(self, status: int) -> None:
-        """Raise an error if an FMU of FMI 2 has discarded a step because it ended its simulation.
+        """Raise an error if a step was discarded because the FMU ended its simulation.
 
-        FMI 2 reports the end of a simulation in this way; details must be asked for.
-
-        Parameters
-        ----------
-        status : int
-            The status of the step.
+        FMI 2 reports the end of a simulation in this way; the details must be queried.
         """
         if status != DISCARD or self._version != 2:
             return

@@ -1,7 +1,7 @@
-"""Callbacks that FMI 1 and 2 hand to an FMU: its logger, and its allocation of memory.
+"""Callbacks that FMI 1 and 2 pass to an FMU: its logger, and its memory allocation.
 
-fmpy formats the messages of C FMUs by a native proxy, which knows one logger in a process.
-Instances therefore register by name, and the one logger finds them.
+fmpy formats the messages of C FMUs in a native proxy, which knows one logger per process. Instances
+therefore register by name, and the logger finds them.
 """
 
 import ctypes
@@ -12,10 +12,10 @@ from fmpy.logging import addLoggerProxy
 
 
 class MessageReceiver(Protocol):
-    """An instance that takes the messages of its FMU."""
+    """An instance that receives the messages of its FMU."""
 
     def log(self, environment: object, status: int, category: bytes, message: bytes) -> None:
-        """Take a message of the FMU; the signature is that of fmpy's callback in FMI 3."""
+        """Receive a message of the FMU; the signature is that of fmpy's callback in FMI 3."""
 
 
 _receivers: dict[bytes, MessageReceiver] = {}
@@ -42,7 +42,7 @@ _LOGGERS = {1: fmi1.fmi1CallbackLoggerTYPE(_log), 2: fmi2.fmi2CallbackLoggerTYPE
 
 
 def callbacks(fmi_version: int) -> ctypes.Structure:
-    """Return new callback functions for FMI 1 or 2, as fmpy's structure of that version."""
+    """Return new callback functions for FMI 1 or 2, as fmpy's structure for that version."""
     module = _FMPY_MODULES[fmi_version]
     prefix = f"fmi{fmi_version}Callback"
     # functions that are not set, such as `stepFinished`, are null

@@ -1,6 +1,6 @@
 """Model exchange of FMI 1.0, 2.0 and 3.0, solved by SUNDIALS CVODE as if it were co-simulation.
 
-The solver is fmpy's, with the failures and the memory that its wrapper loses.
+The solver is fmpy's; failures and memory that its wrapper loses are handled here.
 """
 
 # ruff: noqa: N802, N815 - methods and arguments have fmpy's names
@@ -41,7 +41,7 @@ class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
     def setupExperiment(
         self, *, startTime: float, stopTime: float | None, tolerance: float | None
     ) -> None:
-        """Set the time, and keep the tolerance; this interface takes no end time."""
+        """Set the time, and store the tolerance; this interface has no end time."""
         self._tolerance = tolerance
         self.setTime(startTime)
 
@@ -51,64 +51,64 @@ class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
     enterEventMode = enterContinuousTimeMode = enterInitializationMode
 
     def exitInitializationMode(self) -> None:
-        """Initialise, which is the first iteration of an event."""
+        """Initialise the FMU, which also is the first iteration of an event."""
         is_controlled = b"\x00" if self._tolerance is None else b"\x01"
         self._first_event = self.initialize(is_controlled, self._tolerance or 0.0)
 
     def newDiscreteStates(self) -> tuple[bool, bool, bool, bool, bool, float]:
-        """Iterate once over an event."""
+        """Make one iteration of an event."""
         event = self._first_event or self.eventUpdate()
         self._first_event = None
         converged, _, _, terminated, has_next_event, next_event_time = event
         return not converged, terminated, False, False, has_next_event, next_event_time
 
     def completedIntegratorStep(self) -> tuple[bool, bool]:
-        """Return whether the FMU wants an event, and False: it cannot want to end."""
+        """Return whether the FMU asks for an event, and False: it cannot ask to end."""
         return bool(super().completedIntegratorStep()), False
 
     def reset(self) -> None:
-        """Refuse: FMI 1.0 model exchange has no reset, so the asset makes a new instance."""
+        """Raise an error: FMI 1.0 has no reset here, so the asset makes a new instance."""
         raise FmuCallError("FMI 1.0 model exchange has no reset.")
 
 
 class FMU3ModelExchange(FMU3Model):  # type: ignore[misc]
-    """FMI 3.0 model exchange under the names of methods of FMI 2.0."""
+    """FMI 3.0 model exchange with the method names of FMI 2.0."""
 
     getDerivatives = FMU3Model.getContinuousStateDerivatives
     newDiscreteStates = FMU3Model.updateDiscreteStates
 
 
-class MovingInputs(Protocol):
-    """The inputs of a model that change with time between two communication points."""
+class InterpolatedInputs(Protocol):
+    """The inputs of a model that change between two communication points."""
 
     def apply(self, time: float) -> None:
         """Set the inputs at a time [s]."""
 
 
 class CvodeSolver(CVodeSolver):  # type: ignore[misc]
-    """The solver CVODE for one model-exchange instance: BDF with root finding at events.
+    """The CVODE solver of a model-exchange instance: BDF with root finding at events.
 
     Parameters
     ----------
     fmu : fmpy model
         The FMU, with the methods of FMI 2.0.
     plan : Plan
-        The numbers of states and event indicators, and the relative tolerance. The absolute
+        Gives the numbers of states and event indicators, and the relative tolerance. The absolute
         tolerance of a state is the relative one times its nominal value.
-    inputs : MovingInputs
-        The inputs; they are set before each evaluation of the model.
+    inputs : InterpolatedInputs
+        Sets the inputs before each evaluation of the model.
     start_time : float
         The start of the integration [s].
     largest_step : float
-        The limit of the solver's internal steps [s]. It bounds how long an event can stay unnoticed
-        whose indicator changes its sign twice within a step.
+        Limit of the internal steps [s]. It bounds how long an event can stay undetected whose
+        indicator changes sign twice within a step.
     """
 
     def __init__(
         self,
         fmu: FmpyInstance,
         plan: Plan,
-        inputs: MovingInputs,
+        inputs: InterpolatedInputs,
         start_time: float,
         largest_step: float,
     ) -> None:
@@ -170,7 +170,7 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
             return 1 if getattr(error, "status", None) == DISCARD else -1
 
     def advance(self, begin: float, end: float) -> tuple[bool, float]:
-        """Integrate until a given time or the first event, whichever comes first.
+        """Integrate to the end of an interval, or to the first event in it.
 
         Parameters
         ----------
@@ -217,11 +217,11 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
 
 
 class ModelExchange(FmuInstance):
-    """A model-exchange instance together with its solver.
+    """A model-exchange instance with its solver.
 
     Over a communication step an input is constant, or changes linearly if the binding says so. If
     inputs jump at a communication point, this is an event, and the solver restarts. It also
-    restarts where the slope of a linear input changes. Otherwise it keeps its step size and order.
+    restarts if the slope of a linear input changes. Otherwise it keeps its step size and order.
     """
 
     classes = {1: FMU1ModelExchange, 2: FMU2Model, 3: FMU3ModelExchange}  # noqa: RUF012
@@ -232,24 +232,24 @@ class ModelExchange(FmuInstance):
     def _go_to_start(
         self, start_time: float, parameters: InitialValues, *, with_inputs: bool
     ) -> None:
-        """Initialise the FMU and settle its discrete states, as at an event."""
+        """Initialise the FMU and iterate its discrete states to convergence, as at an event."""
         self._close_solver()
         super()._go_to_start(start_time, parameters, with_inputs=with_inputs)
         self._settle_discrete_states(start_time)
         self._sent_inputs = self._inputs_now() if with_inputs else None
 
     def _inputs_now(self) -> bytes:
-        """Return the bytes of all present inputs, for an exact comparison."""
+        """Return all present inputs as bytes, for an exact comparison."""
         # The block begins with time and step size, 8 bytes each.
         return bytes(self._values)[16:]
 
     def _send_inputs(self) -> None:
-        """Set the inputs of a new step; a change of their values is an event."""
+        """Set the inputs of a new step; a jump of their values is an event."""
         slope_changes = False
-        if self._lines is not None:
-            previous_slopes = bytes(self._lines.slopes)
-            self._lines.begin_step()
-            slope_changes = bytes(self._lines.slopes) != previous_slopes
+        if self._linear_inputs is not None:
+            previous_slopes = bytes(self._linear_inputs.slopes)
+            self._linear_inputs.begin_step()
+            slope_changes = bytes(self._linear_inputs.slopes) != previous_slopes
         inputs = self._inputs_now()
         has_changed = inputs != self._sent_inputs
         if not has_changed and not slope_changes:
@@ -263,20 +263,20 @@ class ModelExchange(FmuInstance):
             if self._solver is not None:
                 self._solver.reset(self.request[0])
 
-    def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
-        """Return the calls that set the linear inputs; the solver makes them at each evaluation."""
+    def _interpolation_calls(self, linear_inputs: LinearInputs) -> list[FmiCall]:
+        """Return the calls that set linear inputs, which the solver makes at each evaluation."""
         linear_groups = tuple(group for group in self._plan.inputs if group.linear)
         # Values begin behind time and step size in the block.
         return self._group_calls("Set", linear_groups, self._values, 2)
 
-    def _send_moved_inputs(self, lines: LinearInputs) -> None:
-        """Do nothing: `apply` already sets the linear inputs at every time of the solver."""
+    def _send_interpolated_inputs(self, linear_inputs: LinearInputs) -> None:
+        """Do nothing: `apply` sets the linear inputs at every evaluation."""
 
     def apply(self, time: float) -> None:
         """Set the linear inputs to their values at a time [s]; called before each evaluation."""
-        if self._lines is not None:
-            self._lines.move_to(time)
-            self._make_calls(self._motion_calls)
+        if self._linear_inputs is not None:
+            self._linear_inputs.move_to(time)
+            self._make_calls(self._per_step_calls)
 
     def _do_step(self) -> None:
         """Integrate over one communication step, which may contain several events."""
@@ -301,25 +301,12 @@ class ModelExchange(FmuInstance):
     def _integrate_to_event(
         self, solver: CvodeSolver, time: float, end: float, resolution: float
     ) -> float:
-        """Integrate to the next event or to the end of the step, and handle the event.
+        """Integrate to the next event or the end of the step, and return the time reached [s].
 
-        There are three kinds of events: a state event, which the solver finds as a change of sign
-        of an event indicator; a step event, which the FMU asks for after a step of the solver; and
-        a time event, which the FMU has announced at the last event.
-
-        Parameters
-        ----------
-        solver : CvodeSolver
-            The solver.
-        time, end : float
-            The present time, and the end of the communication step [s].
-        resolution : float
-            Times that differ by less than this count as equal [s].
-
-        Returns
-        -------
-        float
-            The time that was reached [s].
+        An event is handled at once. There are three kinds: state events, which the solver finds as
+        a change of sign of an event indicator; step events, which the FMU asks for after a step of
+        the solver; and time events, which the FMU announced at the last event. Times [s] that
+        differ by less than `resolution` count as equal.
         """
         # Integrate to the announced time event if it lies inside the step, else to the end. A time
         # event that is overdue is handled at once.
@@ -356,14 +343,10 @@ class ModelExchange(FmuInstance):
         return time
 
     def _settle_discrete_states(self, time: float) -> None:
-        """Iterate an event until the discrete states are settled, and return to continuous time.
+        """Iterate the event at a time [s] until the discrete states have converged.
 
-        The FMU must be in event mode. Its next time event is kept for the integration.
-
-        Parameters
-        ----------
-        time : float
-            The time of the event [s], for messages.
+        The FMU must be in event mode; it then returns to continuous time. Its next time event is
+        recorded.
         """
         for _ in range(_MOST_EVENT_ITERATIONS):
             update = self._fmu.newDiscreteStates()
@@ -395,7 +378,7 @@ class ModelExchange(FmuInstance):
         self._sent_inputs = None
 
     def reset(self) -> None:
-        """Bring the instance back to the moment after its instantiation."""
+        """Return the instance to its state after instantiation."""
         self._close_solver()
         super().reset()
 

@@ -1,4 +1,4 @@
-"""A new instance of an FMU, and the modules of Python that it leaves behind."""
+"""Opens a new instance of an FMU, and removes the Python modules that it leaves behind."""
 
 import os
 import sys
@@ -10,12 +10,7 @@ from .plan import Plan
 
 
 def open_instance(plan: Plan) -> FmuInstance:
-    """Return a new instance of the plan's FMI version and interface.
-
-    Parameters
-    ----------
-    plan : Plan
-        The variables that each call exchanges with the FMU.
+    """Return a new instance for the plan's FMI version and interface.
 
     Raises
     ------
@@ -30,8 +25,8 @@ def open_instance(plan: Plan) -> FmuInstance:
 def forget_modules(folder: str) -> None:
     """Remove the modules that an FMU in Python has imported from its folder.
 
-    Otherwise the next FMU with a module of the same name, or the caller, would be given that
-    module, and the folder is about to be removed. Instances that still run keep their modules.
+    Otherwise the next FMU with a module of the same name would get that module, and the folder is
+    about to be removed. Instances that still run keep their modules.
     """
     prefix = folder.rstrip(os.sep) + os.sep
     sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(prefix)]

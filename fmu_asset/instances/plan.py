@@ -1,4 +1,4 @@
-"""The interface of FMU instances, and the plan of what one exchanges with its FMU.
+"""The interface of FMU instances, and the plan of what an instance exchanges with its FMU.
 
 The plan is sent to the worker process, and the C calls of a step are prepared from it.
 """
@@ -60,9 +60,9 @@ class VariableGroup:
     kind : str
         FMI base type: Real, Integer, Boolean; Float64, Int32, ... in FMI 3.
     references : tuple of int
-        Value references, in the order of the block.
+        Value references, in the order of the values.
     count : int
-        The number of values; it exceeds that of the references if there are arrays.
+        The number of values; with arrays it exceeds that of the references.
     linear : bool
         Whether the values change linearly over a step. Such inputs come first in the block.
     """
@@ -86,7 +86,7 @@ class FmuIdentity:
     states, event_indicators : int
         Numbers of continuous states and event indicators (model exchange).
     completed_step : bool
-        Whether it wants to be told of completed integrator steps (model exchange).
+        Whether it needs a call after each completed integrator step (model exchange).
     """
 
     fmi_version: str = "2.0"
@@ -105,18 +105,14 @@ class FmuIdentity:
 
 @dataclass(frozen=True)
 class Plan:
-    """What an instance is and what it exchanges with its FMU.
+    """How an instance is made, and what each call exchanges with it.
 
     Attributes
     ----------
-    folder : str
-        Folder of the extracted FMU.
-    fmu : FmuIdentity
-        The FMU.
     instance_name : str
-        Name that FMI asks for.
+        Name that FMI requires.
     inputs, outputs : tuple of VariableGroup
-        Variables that are set and read at every step, in the order of the request and reply blocks.
+        Variables that are set and read at every step, in the order of request and reply.
     substeps : int
         Communication steps of the FMU between two observations.
     tolerance : float or None
@@ -124,7 +120,7 @@ class Plan:
     solver_tolerance : float
         Relative tolerance of our solver (model exchange).
     stop_time : float or None
-        End of the experiment that is passed to the FMU [s].
+        End of the experiment [s], which is passed to the FMU.
     configuration : list of InitialValue
         Structural parameters (FMI 3), set before everything else.
     """
@@ -147,9 +143,9 @@ class Plan:
 
     @property
     def input_count(self) -> int:
-        """The number of values after time and step size in a request block.
+        """The number of values after time and step size in a request.
 
-        These are all inputs, and then the values of the linear inputs at the beginning of the step.
+        These are all inputs, and then the values of linear inputs at the beginning of the step.
         """
         return sum(group.count for group in self.inputs) + self.linear_count
 
@@ -177,15 +173,15 @@ _BOOLEAN_TYPES: dict[int, CType] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctype
 
 
 class GroupArguments(NamedTuple):
-    """The arguments, after the instance, of a C function that sets or reads a group of variables.
+    """The arguments of a C function that sets or reads a group, after the instance.
 
     Attributes
     ----------
     values : tuple
-        The C values.
+        C values.
     convert : callable or None
-        Converts the numbers of the block before they are set, or into the block after they are
-        read. None if the FMU reads and writes the block itself, because its type is double.
+        Converts the numbers before they are set or after they are read. None for doubles, which the
+        FMU reads and writes in place.
     """
 
     values: tuple[object, ...]
@@ -208,12 +204,10 @@ def group_arguments(
         1, 2 or 3.
     group : VariableGroup
         The variables; enumerations are integers, see `FmuDescription.exchange_kind`.
-    doubles : C array of double
-        The block of values.
     begin : int
-        Position of the first value of the group in it.
+        Position of the group's first value in `doubles`.
     sent : bool
-        Whether the values are set.
+        Whether the values are set, not read.
     """
     c_type = _BOOLEAN_TYPES[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
     convert = None
@@ -246,7 +240,7 @@ _Function = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
 def prepare_call(function: "CFunction", *arguments: object) -> Callable[[], int]:
-    """Return a call without arguments, so that a step looks up and converts nothing.
+    """Return a call with fixed arguments, so that a step neither looks up nor converts anything.
 
     Parameters
     ----------
@@ -254,7 +248,7 @@ def prepare_call(function: "CFunction", *arguments: object) -> Callable[[], int]
         Function that returns an FMI status.
     *arguments
         C values: results of `from_param` and `byref`, or objects such as `c_double`, whose value at
-        the moment of the call is passed. A Python number would not be of the right type.
+        the time of the call is passed. A Python number would not be of the right type.
 
     Returns
     -------
@@ -271,7 +265,7 @@ _ROUNDING = 1e-12
 
 
 class LinearInputs:
-    """Inputs that change linearly over a step (FMI's input derivatives).
+    """Inputs that change linearly over a step, by their derivatives in FMI.
 
     The request block holds their values at the end of the step, before the other inputs, and in its
     last part their values at the beginning of the step.
@@ -279,10 +273,8 @@ class LinearInputs:
     Parameters
     ----------
     request : C array of double
-        The request block: time, step size, inputs at the end of the step, linear inputs at its
-        begin.
-    plan : Plan
-        The variables that each call exchanges with the FMU.
+        The request: time, step size, all inputs at the end of the step beginning with the linear
+        ones, and the linear ones at its beginning.
 
     Attributes
     ----------
@@ -300,35 +292,35 @@ class LinearInputs:
         self._at_end = self._request[2 : 2 + count]
         self._at_begin = self._request[-count:]
         self._present = values_of(self.values)
-        self._present_moving = self._present[2 : 2 + count]
+        self._present_linear = self._present[2 : 2 + count]
         self._slopes = values_of(self.slopes)
         self._substeps = plan.substeps
         self._start_time = 0.0
         self._duration = 1.0
 
     def hold(self) -> None:
-        """Set all present inputs to those of the request, as for an initialisation."""
+        """Set the present inputs to those at the end of the step, as for an initialisation."""
         self._present[:] = self._request[: len(self._present)]
 
     def begin_step(self) -> None:
-        """Compute the slopes of a new request, and set the inputs to those of its beginning."""
+        """Compute the slopes for a new request, and set the inputs to the beginning of the step."""
         self._start_time = self._request[0]
         self._duration = self._request[1] * self._substeps
         self._slopes[:] = (self._at_end - self._at_begin) / self._duration
         self.hold()
-        self._present_moving[:] = self._at_begin
+        self._present_linear[:] = self._at_begin
 
     def move_to(self, time: float) -> None:
         """Set the linear inputs to their values at a time [s].
 
-        At the end of the step they equal the request bit by bit, whatever the rounding of the time.
+        At the end of the step they equal the request bit by bit, despite rounding of the time.
         """
         fraction = (time - self._start_time) / self._duration
         if fraction >= 1.0 - _ROUNDING:
-            self._present_moving[:] = self._at_end
+            self._present_linear[:] = self._at_end
         else:
             change = fraction * (self._at_end - self._at_begin)
-            self._present_moving[:] = self._at_begin + change
+            self._present_linear[:] = self._at_begin + change
 
 
 def run_steps(
@@ -341,12 +333,12 @@ def run_steps(
     reply: Float,
     report_period: float = REPORT_PERIOD,
 ) -> None:
-    """Make many steps one by one; stop after one whose outputs are not all finite.
+    """Make many steps one by one; stop after one with an output that is not finite.
 
     Parameters
     ----------
     step : callable
-        Makes the step of `request`, and puts its outputs into `reply`.
+        Makes the step in `request`, and writes its outputs to `reply`.
     requests, replies, report
         As for `Instance.run`.
     request, reply : ndarray
@@ -375,22 +367,17 @@ def run_steps(
 
 
 class Instance(Protocol):
-    """An instance of an FMU: in this process, in a worker process, or of several coupled FMUs.
-
-    Parameters
-    ----------
-    plan : Plan
-        The variables that each call exchanges with the FMU.
+    """An FMU instance in this process or in a worker, or several coupled FMUs.
 
     Attributes
     ----------
     request, reply : C array of double
-        Two blocks of memory that are allocated once. The request holds time, step size and all
-        inputs, the reply all outputs. Integers and Booleans are stored as doubles.
+        Blocks of memory that are allocated once. The request holds time, step size and all inputs,
+        the reply all outputs. Integers and Booleans are stored as doubles.
     lost : bool
         Whether the instance can no longer be used.
     report_period : float
-        Seconds after which a run of many steps reports; at 0 it reports each step.
+        Seconds between two reports of a run of many steps; at 0 each step is reported.
     """
 
     request: DoubleBlock
@@ -405,7 +392,7 @@ class Instance(Protocol):
         self.lost = False
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
-        """Set parameters, and inputs if wanted, and go to the first communication point.
+        """Set parameters, and inputs if asked for, and go to the first communication point.
 
         Parameters
         ----------
@@ -414,16 +401,17 @@ class Instance(Protocol):
         parameters : list of InitialValue
             Values that are set before the initialisation.
         with_inputs : bool
-            Whether the inputs of the request block are set, instead of the FMU's start values.
+            Whether the inputs of the request are set during the initialisation; if not, the FMU's
+            start values hold.
 
         Raises
         ------
         FmuCallError
-            If a call fails, or the FMU logs an error on the way.
+            If a call fails, or the FMU logs an error meanwhile.
         """
 
     def step(self) -> None:
-        """Make the step that the request block describes; the outputs are then in the reply block.
+        """Make the step in the request; its outputs are then in the reply.
 
         Raises
         ------
@@ -436,16 +424,17 @@ class Instance(Protocol):
         """
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make many steps; stop after one whose outputs are not all finite.
+        """Make many steps; stop after one with an output that is not finite.
 
         Parameters
         ----------
         requests : (N, 2 + n_inputs) ndarray
-            The request block of each step.
+            The request of each step.
         replies : (N, n_outputs) ndarray
-            Filled with the reply block of each step.
+            Filled with the reply of each step.
         report : callable
-            Called with the number of steps made, now and then and in the end, also when one fails.
+            Called with the number of steps made, from time to time and at the end, even if a step
+            fails.
 
         Raises
         ------
@@ -463,13 +452,13 @@ class Instance(Protocol):
         )
 
     def read(self) -> None:
-        """Read the outputs of this moment into the reply block."""
+        """Read the present outputs into the reply."""
 
     def save(self) -> bytes:
         """Return the serialised state."""
 
     def restore(self, content: bytes) -> None:
-        """Go back to a serialised state.
+        """Restore a serialised state.
 
         Raises
         ------
@@ -480,10 +469,10 @@ class Instance(Protocol):
         """
 
     def reset(self) -> None:
-        """Go back to the moment after the instantiation."""
+        """Return to the state after instantiation."""
 
     def take_log(self) -> list[tuple[int, str]]:
-        """Return and forget the messages that the FMU has logged: status and text."""
+        """Return status and text of the messages that the FMU has logged, and clear them."""
 
     def close(self) -> None:
         """Free the instance."""

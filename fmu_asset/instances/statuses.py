@@ -1,4 +1,4 @@
-"""Statuses that FMI functions return, and the failure to make an instance."""
+"""Statuses that FMI functions return, and the message about a failed instantiation."""
 
 from typing import TYPE_CHECKING
 
@@ -18,14 +18,14 @@ def status_name(status: int) -> str:
 
 
 def refuse_negative(status: int, function: "CFunction", arguments: tuple[object, ...]) -> int:
-    """Raise for a negative status of a C function that fmpy calls (a hook of ctypes)."""
+    """Raise an error for a negative status of a C function that fmpy calls (a hook of ctypes)."""
     if status < 0:
         raise FMICallException(function=function.__name__, status=status)
     return status
 
 
 def instantiation_failure(error: Exception) -> str:
-    """Return the sentence on an FMU that could not be instantiated."""
+    """Return the message about an FMU that could not be instantiated."""
     text = " ".join(str(error).split())
     reason = text.rpartition(".so: ")[2].removesuffix(".")  # without our folder
     if "shared library" in str(error):

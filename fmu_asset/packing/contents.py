@@ -1,8 +1,7 @@
-"""The parts that all FMUs built by this package have in common.
+"""What all FMUs built by this package have in common.
 
 The identifier, the GUID and the module names of an FMU contain a hash of its content. The files are
-therefore first written with a placeholder in the place of the hash. The hash of these files then
-replaces the placeholder.
+therefore first written with a placeholder, which the hash of these files then replaces.
 """
 
 import os
@@ -50,10 +49,8 @@ class FmuInfo:
 
     Attributes
     ----------
-    path : Path
-        The path of the file.
     guid : str
-        The GUID, which follows from the content.
+        The GUID, which is computed from the content.
     design_hash : str
         The hash of the design that the reduced model was made of; empty if there is none.
     size : int
@@ -67,7 +64,7 @@ class FmuInfo:
 
 
 class SealedFmu(NamedTuple):
-    """The bytes of an FMU file, and the GUID that follows from its content."""
+    """The bytes of an FMU file, and the GUID computed from its content."""
 
     content: bytes
     guid: str
@@ -80,8 +77,6 @@ class ContentIdentity(NamedTuple):
     ----------
     tag : str
         The first characters of the content hash, which are added to identifiers in the FMU.
-    guid : str
-        The GUID of the FMU.
     """
 
     tag: str
@@ -100,12 +95,10 @@ def checked_target(
     suffix: str = ".fmu",
     error: type[FmuError] = FmuBuildError,
 ) -> Path:
-    """Check that a file may be written to a path, and return the path.
+    """Return a path after checking that a file may be written to it.
 
     Parameters
     ----------
-    path : path-like
-        The path of the file to write.
     replace : bool
         Whether an existing file may be replaced.
     file_kind : str
@@ -132,7 +125,7 @@ def checked_target(
 
 
 def write_fmu(target: Path, fmu: SealedFmu, design_hash: str = "") -> FmuInfo:
-    """Write an FMU to a file, completely or not at all; return its path, GUID, hash and size."""
+    """Write an FMU to a file, completely or not at all."""
     atomic_write_bytes(target, fmu.content)
     return FmuInfo(path=target, guid=fmu.guid, design_hash=design_hash, size=len(fmu.content))
 
@@ -186,9 +179,10 @@ def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[st
     Parameters
     ----------
     module : str
-        The identifier of the FMU. It is also the name of the binaries and of the script they load.
+        The model identifier of the FMU, which is also the name of the binaries and of the script
+        that they load.
     folder : str
-        The folder of the archive for the Python files.
+        The folder in the archive for the Python files.
     names : iterable of str
         The Python files that are needed.
 
@@ -226,7 +220,7 @@ def package_members(package: str, folder: str) -> dict[str, bytes]:
         A package that imports from this project only itself, `fe.runtime`, and packages that are
         packed into the same folder, by relative imports with `..`.
     folder : str
-        The folder of the archive for the package.
+        The folder in the archive for the package.
     """
     content_of_member = {}
     for name, content in read_members(Path(str(files(package))), [".py"]).items():
@@ -252,20 +246,18 @@ def python_members(
     resources: Mapping[str, bytes],
     host: str = "It runs in a Python host that has NumPy.",
 ) -> dict[str, bytes]:
-    """Return the files of a Python FMU, with the placeholder in the place of the content hash.
+    """Return the files of a Python FMU, with the placeholder instead of the content hash.
 
     Parameters
     ----------
-    declaration : Declaration
-        The model name, variables and dependencies.
     class_name : str
-        The name of the slave class in the FMU's script, to which the tag is added.
+        The name of the slave class in the FMU's script; the tag is appended.
     imports : str
         Python lines that import or define the function `load_contents`, which reads the resources.
     resources : mapping of str to bytes
         The files that `load_contents` reads, by name.
     host : str
-        A sentence on the host that the FMU needs, for its documentation.
+        A sentence on the host that the FMU needs, for its documentation page.
     """
     module = declaration.identifier
     runtime = f"resources/{module}_runtime"
@@ -288,7 +280,7 @@ def python_members(
 
 
 def guid_of_hash(content_hash: str) -> str:
-    """Return the GUID for a content hash, its first 32 hexadecimal digits in braces."""
+    """Return the GUID that the first 32 hexadecimal digits of a content hash form."""
     return f"{{{UUID(content_hash[:32])}}}"
 
 
@@ -296,7 +288,7 @@ def sealed(
     template: Mapping[str, bytes],
     make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
 ) -> SealedFmu:
-    """Replace the placeholder in an FMU's files by their hash, and pack the files.
+    """Pack an FMU's files after their hash has replaced the placeholder.
 
     The hash is taken over the names and contents of the files with the placeholder, so that equal
     files give equal bytes.
@@ -306,8 +298,8 @@ def sealed(
     template : mapping of str to bytes
         The files by name, with the placeholder.
     make_binaries : callable, optional
-        A function that makes further files from the files with their hash, and the tag. These files
-        are not part of the hash.
+        Makes further files, which are not part of the hash, from the files with their hash and the
+        tag.
     """
     content_hash = hash_members(template)
     tag = content_hash[: len(PLACEHOLDER)]
@@ -321,14 +313,12 @@ def sealed(
 def with_identity(
     members: Mapping[str, bytes], old_identity: ContentIdentity, new_identity: ContentIdentity
 ) -> dict[str, bytes]:
-    """Return the files of an FMU with another tag and GUID, in their names and texts.
+    """Return the files of an FMU with another tag and GUID in their names and texts.
 
     Parameters
     ----------
-    members : mapping of str to bytes
-        The files by name.
     old_identity, new_identity : ContentIdentity
-        The tag and GUID in the files, and those to be written instead.
+        Tag and GUID in the files, and those that replace them.
     """
     renamed_members = {}
     for name, content in members.items():

@@ -3,13 +3,10 @@
 An effect has an id and a list of primitives, which are elementary changes of the model or of a
 sensor. A patch file may contain more, such as a posterior and a data hash. This module reads
 
-```json
-{"schema": "uav-twin patch 2",
- "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17",
- ...}]}], "channels": {"g17": "strain[17]"}}
-```
+```json {"schema": "uav-twin patch 2", "effects": [{"id": "gauge_zero_drift", "primitives":
+[{"kind": "sensor_drift", "channel": "g17", ...}]}], "channels": {"g17": "strain[17]"}} ```
 
-where `channels` gives the output of the FMU for each channel. The key `id` may also be called
+where `channels` maps each channel to an output of the FMU. The key `id` may also be called
 `identifier`, and `primitives` may be called `patch`.
 """
 
@@ -80,7 +77,7 @@ class PatchFile:
     effects : tuple of PatchFileEffect
         The effects in the order of the file. The later ones of a repeated id get `_2`, `_3`, ...
     channels : mapping of str to str
-        The output of the FMU for each channel, by the name of the channel.
+        The output of the FMU for each channel.
     """
 
     effects: tuple[PatchFileEffect, ...]
@@ -107,7 +104,7 @@ class PatchFile:
         return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
     def for_gauges(self, gauge_count: int, patch_label: str = "The patch") -> PatchFile:
-        """Return the patch with each channel replaced by the name of an output of the FMU.
+        """Return the patch with the names of FMU outputs instead of those of channels.
 
         Parameters
         ----------
@@ -134,26 +131,12 @@ class PatchFile:
     def _with_output(
         self, primitive: Primitive, outputs: Sequence[tuple[str, str]], effect_label: str
     ) -> Primitive:
-        """Return a primitive of a patch with its channel replaced by an output of the FMU.
+        """Return a primitive with the name of an FMU output instead of its channel.
 
-        A patch consists of primitives: elementary changes of a model or of one of its sensors. It
-        names the channels of a measurement; `self.channels` maps them to outputs of the FMU. A
-        primitive that acts on every channel is returned unchanged.
-
-        Parameters
-        ----------
-        primitive : Primitive
-            The primitive change of the model.
-        outputs : sequence of (str, str)
-            Name and quantity of each output of the FMU.
-        effect_label : str
-            The name in messages of the effect to which the primitive belongs.
-
-        Raises
-        ------
-        PatchFileError
-            If the FMU has no such output, if the primitive cannot act on the quantity of the
-            output, or if it changes something that an FMU does not simulate.
+        `self.channels` maps the channels of a measurement to outputs, given by name and quantity. A
+        primitive that acts on every channel stays as it is. A `PatchFileError` is raised if there
+        is no such output, if the primitive cannot act on its quantity, or if an FMU does not
+        simulate what it changes.
         """
         label = f"{effect_label} has the primitive {primitive.kind!r}"
         _check_meaning_in_fmu(primitive, label)
@@ -182,7 +165,7 @@ class PatchFile:
 
 
 def _check_meaning_in_fmu(primitive: Primitive, label: str) -> None:
-    """Refuse a primitive that has no meaning in an FMU, or that an FMU cannot evaluate."""
+    """Raise an error if a primitive has no meaning in an FMU, or an FMU cannot evaluate it."""
     for kind, reason in _REASONS_WITHOUT_MEANING.items():
         if isinstance(primitive, kind):
             raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
@@ -194,7 +177,7 @@ def _check_meaning_in_fmu(primitive: Primitive, label: str) -> None:
 
 
 def _listed_outputs(outputs: Sequence[tuple[str, str]]) -> str:
-    """Return the names of outputs for a message; the strain gauges are shortened to a range."""
+    """Return the names of outputs for a message, with the gauges abbreviated to a range."""
     gauges = [name for name, quantity in outputs if quantity == "strain"]
     names = [f"{gauges[0]} to {gauges[-1]}"] if gauges else []
     names += [name for name, quantity in outputs if quantity != "strain"]
@@ -219,7 +202,7 @@ def parse_patch(content: bytes, file_label: str = "The patch file") -> PatchFile
 
 
 def _patch_of_record(record: object, file_label: str) -> PatchFile:
-    """Return the patch from the parsed JSON of a patch file; messages name it by the label."""
+    """Return the patch in the parsed JSON of a patch file."""
     schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
     if not isinstance(record, dict) or schema not in (SCHEMA, FIRST_SCHEMA):
         raise PatchFileError(f'{file_label} must have "schema": "{SCHEMA}", but has {schema!r}.')
@@ -254,21 +237,10 @@ def _read_effects(
 
 
 def _read_effect(row: Mapping[str, object], number: int, file_label: str) -> PatchFileEffect:
-    """Return an effect of a patch file, with the id that the file states.
+    """Return an effect from its table in the JSON file, with the id that the file states.
 
-    Parameters
-    ----------
-    row : mapping
-        The effect as a table of the JSON file.
-    number : int
-        The number of the effect in the file, from 1.
-    file_label : str
-        The name of the file in messages.
-
-    Raises
-    ------
-    PatchFileError
-        If the effect has no id or no primitives, or an FMU cannot carry one of them.
+    `number` counts the effects from 1, for messages. A `PatchFileError` is raised if the effect has
+    no id or no primitives, or if an FMU cannot contain one of them.
     """
     effect_id = row.get("id", row.get("identifier"))
     if not isinstance(effect_id, str) or not _IDENTIFIER.fullmatch(effect_id):

@@ -1,16 +1,16 @@
-"""Packing a script for pythonfmu as an FMU.
+"""Packs a script for pythonfmu as an FMU.
 
-pythonfmu's own builder takes the same scripts, but leaves out units and ranges, and stamps a time
-and a random GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script
-may say more in two class attributes, both optional:
+pythonfmu's own builder takes the same scripts, but it leaves out units and ranges, and adds the
+time and a random GUID, so that no two builds are equal. Here equal scripts give equal bytes. A
+script may declare more in two optional class attributes:
 
 - `unit_table`: for each unit its exponents of the base units `kg, m, s, A, K, mol, cd, rad`, the
   `factor` and `offset` of the conversion to them (1 and 0 by default), and `displays`, the factors
   of display units;
-- `variable_table`: for each variable a tuple of its causality, unit, least, largest and start value
-  (each may be None), and meaning.
+- `variable_table`: for each variable a tuple of its causality, unit, minimum, maximum and start
+  value (each may be None), and meaning.
 
-The script is run once in this process, since only an instance of its model lists the variables.
+The script is run once in this process, since only an instance of its model knows the variables.
 """
 
 import os
@@ -58,7 +58,7 @@ def build_script_fmu(
         A Python file with one subclass of pythonfmu's `Fmi2Slave`. It may use the standard library
         and the packages that are installed on the machine that runs the FMU.
     path : path-like
-        Where to write, with the suffix .fmu.
+        The file to write, with the suffix .fmu.
     replace : bool
         Whether an existing file may be replaced.
 
@@ -98,7 +98,7 @@ def script_fmu(script: str | os.PathLike[str]) -> SealedFmu:
 
 
 def _model_class(file: Path) -> "type[Fmi2Slave]":
-    """Run a script and return the one slave class that it defines."""
+    """Run a script and return the only slave class that it defines."""
     from pythonfmu import Fmi2Slave
 
     module_name = f"_uav_twin_script_{file.stem}"
@@ -125,16 +125,7 @@ def _script_description(file: Path, model_class: "type[Fmi2Slave]", identifier: 
     """Return the model description of a script's FMU as XML.
 
     pythonfmu writes it. Units, ranges and initial unknowns are added, and the time of the build is
-    removed, so that equal scripts give equal bytes.
-
-    Parameters
-    ----------
-    file : Path
-        The path of the script.
-    model_class : type of Fmi2Slave
-        The slave class that it defines.
-    identifier : str
-        The model identifier.
+    removed, so that equal scripts give equal bytes. `identifier` is the model identifier.
     """
     try:
         model = model_class(instance_name="description", resources=str(file.parent))
@@ -200,17 +191,7 @@ def _set_units_and_ranges(
     table: Mapping[str, _VariableEntry],
     units: UnitTable,
 ) -> None:
-    """Add units and ranges from a script's `variable_table` to its model description, in place.
-
-    Parameters
-    ----------
-    file : Path
-        The path of the script.
-    variables : Element
-        The XML element of the model description with the variables; it is changed.
-    table, units : mapping
-        The script's `variable_table` and `unit_table`.
-    """
+    """Add units and ranges from a script's tables to its `ModelVariables` element, in place."""
     # The first child of a variable's element is that of its type, such as `Real`.
     type_elements = {str(variable.get("name")): variable[0] for variable in variables}
     for name, (_, unit, low, high, _, _) in table.items():

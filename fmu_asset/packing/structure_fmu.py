@@ -1,8 +1,8 @@
-"""Packing a wing or any reduced structure as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
+"""Packs a wing or any reduced structure as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
 The files of the compiled kind are made in `fmu_asset.compiled`. The Python kind uses the slave base
-class and the binaries of pythonfmu. Its archive is not packed by pythonfmu's builder, which writes
-times, a random GUID, and module names that two FMUs in one process would share.
+class and the binaries of pythonfmu, but not its builder, which writes times, a random GUID, and
+module names that two FMUs in one process would share.
 """
 
 import json
@@ -93,8 +93,6 @@ def build_fmu(
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced wing or structure.
     path : path-like
         The file to write, with the suffix .fmu.
     state : DigitalState, optional
@@ -102,15 +100,15 @@ def build_fmu(
     start : mapping of str to float, optional
         Start values by the names of variables; they take precedence over those of `state`.
     kind : {"python", "compiled", "source"}
-        The evaluation of the model: by Python in the host, by C that is compiled now, or by C
+        How the model is evaluated: by Python in the host, by C that is compiled now, or by C
         sources that are compiled elsewhere.
     note : str
-        A text that is added to the description, such as the calibration of the wing; it has no
+        A text that is added to the description, such as the calibration of the wing, without
         control characters.
     resources : mapping of str to bytes, optional
         Further files of the archive's folder `resources`, by name.
     patch : PatchFile, optional
-        Missing effects that the FMU carries, with tunable parameters.
+        Missing effects that the FMU contains, with tunable parameters.
     activate : bool
         Whether these effects are switched on from the start.
     arrays : PatchArrays, optional
@@ -131,7 +129,7 @@ def build_fmu(
     Returns
     -------
     FmuInfo
-        The path, GUID, design hash and size of the FMU.
+        Path, GUID, design hash and size of the FMU.
 
     Raises
     ------
@@ -202,14 +200,7 @@ def _python_structure_members(
 ) -> dict[str, bytes]:
     """Return the files of an FMU whose model is evaluated by Python.
 
-    Parameters
-    ----------
-    model : ReducedModel
-        The reduced model of the structure.
-    declaration : Declaration
-        The name, description and variables of the FMU.
-    start : mapping of str to float
-        The start values that differ from the defaults, by variable name.
+    `start` has the start values that differ from the defaults, by variable name.
     """
     start_text = json.dumps(start, sort_keys=True, indent=1) + "\n"
     members = python_members(
@@ -223,7 +214,7 @@ def _python_structure_members(
 
 
 def _add_resources(template: dict[str, bytes], resources: Mapping[str, bytes]) -> None:
-    """Add a user's files to `resources` in the template of an archive; refuse names in use."""
+    """Add a user's files to the folder `resources`; raise an error for names in use."""
     for file, content in resources.items():
         name = f"resources/{file}"
         if name in template or "/" in file or not file:
@@ -236,21 +227,11 @@ def _add_resources(template: dict[str, bytes], resources: Mapping[str, bytes]) -
 def _patched_members(
     model: ReducedModel, effects: Sequence[EffectRecord], arrays: PatchArrays | None
 ) -> dict[str, bytes]:
-    """Return the further files of an FMU that carries effects, by their names in the archive.
+    """Return the further files of an FMU with effects, by their names in the archive.
 
-    Parameters
-    ----------
-    model : ReducedModel
-        The reduced model of the wing.
-    effects : sequence of dict
-        The effects as `PatchFile.plain` has them.
-    arrays : PatchArrays or None
-        The same wing in the basis for patches; needed if an effect changes more than sensors.
-
-    Raises
-    ------
-    PatchFileError
-        If the arrays are missing or belong to another wing, or the wing cannot carry an effect.
+    The arrays are the wing in the basis for patches; they are needed if an effect changes more than
+    sensors. A `PatchFileError` is raised if they are missing or belong to another wing, or if the
+    wing cannot have an effect.
     """
     # Keys are not sorted: their order in the file sets the order of the FMU's variables.
     text = json.dumps(effects, indent=1, allow_nan=False)
@@ -289,7 +270,7 @@ def _patched_members(
 
 
 def stem_of(model: ReducedModel) -> str:
-    """Return an identifier of C made from the first 40 characters of a structure's name."""
+    """Return a C identifier made from the first 40 characters of a structure's name."""
     plain_name = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:_LONGEST_STEM]
     if plain_name[:1].isalpha():
         return plain_name
@@ -304,7 +285,7 @@ def check_form(
     patched: bool = False,
     platforms: Sequence[Platform] | None = None,
 ) -> None:
-    """Refuse a combination of kind, FMI version, interface and platform that cannot be built here.
+    """Check that an FMU of this kind, FMI version, interface and platform can be built here.
 
     Commands call this function before they reduce a model, which can take minutes.
 
@@ -313,7 +294,7 @@ def check_form(
     kind, fmi, interface, platforms
         The form of the FMU; see `build_fmu`.
     patched : bool
-        Whether the FMU carries missing effects.
+        Whether the FMU contains missing effects.
 
     Raises
     ------
@@ -321,7 +302,7 @@ def check_form(
         If the kind does not exist for that version of FMI, or has no platforms; if that version of
         FMI has no folder for a platform; or if a compiler is missing.
     PatchFileError
-        If the kind cannot carry missing effects.
+        If the kind cannot contain missing effects.
     InvalidChoiceError
         If a kind, a version of FMI, an interface or a platform is not one of those of `build_fmu`.
     """
@@ -353,7 +334,7 @@ def check_form(
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
-    """Return a digital state of a wing as start values of its FMU, by variable name."""
+    """Return a wing's state as start values of its FMU, by variable name."""
     values = {
         "young_modulus_factor": float(state.young_modulus_factor),
         "damping.alpha": float(state.damping_alpha),
@@ -367,22 +348,10 @@ def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
 
 
 def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
-    """Return the GUID that an FMU of this package declares, and the GUID computed from its content.
+    """Return the GUID that an FMU of this package declares, and the one computed from its content.
 
     The two differ if the file was changed after it was built. Compiled binaries are left out of the
     hash, since different compilers make different binaries from the same sources.
-
-    Parameters
-    ----------
-    path : path-like
-        An FMU that this package has built.
-
-    Returns
-    -------
-    declared : str
-        The GUID in the model description.
-    actual : str
-        The GUID that follows from the content.
     """
     with zipfile.ZipFile(path) as archive:
         # If another tool has packed the archive again, it lists folders too; they are not files.
@@ -418,21 +387,19 @@ def pack_wing(
     Parameters
     ----------
     design : WingDesign
-        The design of the wing. A calibrated wing has the design of its calibration, and the options
-        that `calibration.result.file.tailoring` returns.
+        A calibrated wing has the design of its calibration, and the options that
+        `calibration.result.file.tailoring` returns.
     path : path-like
         The file to write, with the suffix .fmu.
     replace, **options
-        See `fmu_asset.packing.structure_fmu.build_fmu`.
-    progress : Progress, optional
-        Receives reports on the progress.
+        See `build_fmu`.
 
     Raises
     ------
     FiniteElementError
         If the design cannot be modelled.
     FmuBuildError, PatchFileError
-        See `fmu_asset.packing.structure_fmu.build_fmu`.
+        See `build_fmu`.
     """
     model = reduced_model(design, progress=progress)
     options["arrays"] = needed_patch_arrays(design, options.get("patch"), progress)
@@ -442,16 +409,7 @@ def pack_wing(
 def needed_patch_arrays(
     design: WingDesign, patch: PatchFile | None, progress: Progress | None = None
 ) -> PatchArrays | None:
-    """Return the wing in the basis for patches; None if the patch does not need it.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The design of the wing.
-    patch : PatchFile or None
-        Missing effects that the FMU carries.
-    progress : Progress, optional
-        Shows what takes long.
+    """Return the wing in the basis for patches; None if no effect needs it.
 
     Raises
     ------

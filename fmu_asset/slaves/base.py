@@ -1,9 +1,9 @@
 """The FMI slave of all FMUs that are packed here: phases, values, refusals, log and saved states.
 
-A table of variables and a behaviour say what an FMU does. This file is copied into the FMUs:
-standard library and relative imports only. No method raises an exception, because one that reaches
-the FMI wrapper of pythonfmu is fatal to the instance. A call that cannot be carried out is logged
-and named by the output `status`, and leaves the state and the other outputs as they were.
+A table of variables and a behaviour say what an FMU does. This file is copied into the FMUs, so it
+imports only the standard library and neighbouring files. No method raises an exception, because one
+that reaches the FMI wrapper of pythonfmu is fatal to the instance. A call that cannot be executed
+is logged and sets the output `status`; state and other outputs stay as they were.
 """
 
 from __future__ import annotations
@@ -51,12 +51,10 @@ class LogMessage(NamedTuple):
 
 
 class Slave:
-    """An FMI co-simulation slave; the build joins a subclass of it with pythonfmu's `Fmi2Slave`.
+    """An FMI co-simulation slave; packing combines a subclass with pythonfmu's `Fmi2Slave`.
 
-    Class attributes
-    ----------------
-    content_tag : str
-        The content hash of the FMU; a state that was saved by another FMU is refused.
+    Class attributes ---------------- content_tag : str
+        The content hash of the FMU; a state that another FMU has saved is refused.
     load_contents : static method
         Takes the folder of resources and returns `SlaveContents`.
     """
@@ -170,18 +168,10 @@ class Slave:
         action: str,
         consequence: str,
     ) -> bool:
-        """Compute the outputs and store them; return whether the values were accepted.
+        """Compute the outputs for the inputs and store them; return whether this succeeded.
 
-        Parameters
-        ----------
-        compute : callable
-            Returns the outputs for inputs.
-        checked_rows : int
-            The number of rows, from the first, whose values must lie in their ranges.
-        action : str
-            The action, for messages.
-        consequence : str
-            The consequence of a refusal, for messages.
+        The values of the first `checked_rows` rows must lie in their ranges. `action` and
+        `consequence` say in messages what was tried and what a refusal means.
         """
         try:
             if not self._check_ranges(checked_rows, consequence):
@@ -199,10 +189,7 @@ class Slave:
         return True
 
     def _check_ranges(self, checked_rows: int, consequence: str) -> bool:
-        """Check that values lie in their ranges; give tunable values to the behaviour.
-
-        The parameters are those of `_compute_outputs`. Returns whether all values are accepted.
-        """
+        """Return whether values lie in their ranges; pass tunable values to the behaviour."""
         if not self._in_range(0, checked_rows, consequence):
             return False
         if self._tunable:
@@ -213,7 +200,7 @@ class Slave:
         return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
-        """Return whether a step is possible now; if it is not, log a message that says why."""
+        """Return whether a step is possible now; log the reason if it is not."""
         if self._phase != READY:
             phase = _PHASE_NAMES[self._phase]
             return self._refuse(Status.BAD_CALL, f"a step was requested {phase}")
@@ -235,26 +222,17 @@ class Slave:
         return True
 
     def _parameters(self, values: Sequence[float]) -> dict[str, float]:
-        """Return the parameters by name among the values of all rows."""
+        """Return the parameters by name, given the values of all rows."""
         rows = [row for row in self._table if row.causality == "parameter"]
         return {row.name: values[row.reference] for row in rows}
 
     # ------------------------------------------------------------------ values
 
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set variables by their value references.
+        """Set variables by their value references, in a call for a base type.
 
-        Inputs and tunable parameters can be set at any time, other parameters until the
-        initialisation.
-
-        Parameters
-        ----------
-        kind : str
-            The base type of the call: Real, Integer or Boolean.
-        vrs : sequence of int
-            The value references.
-        values : sequence of float
-            The values.
+        Inputs and tunable parameters can be set at any time, other parameters before the
+        initialisation only.
         """
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
@@ -277,7 +255,7 @@ class Slave:
     set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return values of variables; groups of outputs that are pending are computed now."""
+        """Return values of variables; pending outputs among them are computed now."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
@@ -292,7 +270,7 @@ class Slave:
         return [values[vr] for vr in vrs]
 
     def _compute_group(self, number: int) -> None:
-        """Compute a group of outputs that are read, and store them."""
+        """Compute and store a pending group of outputs."""
         group = self._groups[number]
         try:
             self._values[group] = self._behaviour.later(number)
@@ -352,13 +330,7 @@ class Slave:
         self._values[:] = values
 
     def _numbers_of_state(self, state: object) -> tuple[float, ...]:
-        """Return the numbers of a saved state.
-
-        Raises
-        ------
-        ValueError
-            If it is damaged, or of another FMU.
-        """
+        """Return the numbers in a saved state; raise `ValueError` if it is damaged or foreign."""
         if not isinstance(state, bytes) or len(state) < _STATE_HEADER.size:
             raise ValueError("it is not a state of this kind of FMU")
         magic, tag, count = _STATE_HEADER.unpack_from(state)
@@ -376,12 +348,8 @@ class Slave:
     def _in_range(self, first: int, end: int, consequence: str) -> bool:
         """Return whether the values of rows lie in their ranges; refuse the first that does not.
 
-        Parameters
-        ----------
-        first, end : int
-            First row, and end of the rows.
-        consequence : str
-            The consequence of a refusal, for messages.
+        Rows are counted from `first` to before `end`. `consequence` says in the message what the
+        refusal means.
         """
         values = self._values
         for index in range(first, end):
@@ -403,15 +371,7 @@ class Slave:
         return True
 
     def _refuse(self, status: int, sentence: str) -> bool:
-        """Refuse a call: set the output `status`, log a sentence, and return False.
-
-        Parameters
-        ----------
-        status : Status
-            The reason as a code.
-        sentence : str
-            The reason as a sentence for users.
-        """
+        """Refuse a call: set the output `status`, log the reason, and return False."""
         self._values[self._status] = status
         is_discarded = self._phase == READY and status != Status.BAD_STATE
         if is_discarded:

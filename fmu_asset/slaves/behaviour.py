@@ -40,19 +40,15 @@ _NONE_LENGTH = -1.0
 class StructureBehaviour:
     """The behaviour of a structure: each call completes, or raises and changes nothing.
 
-    The outputs are gauges, displacements and accelerations. There are two models of the structure.
-    The reduced model gives the response as long as no effect changes structure or loads. Otherwise,
-    and in every motion of a structure that can have such effects, the patched wing gives it (see
-    `SwitchableEffects.wing`).
+    The outputs are gauges, displacements and accelerations. Two models can give them: the reduced
+    model, and for wings with missing effects the patched wing (`SwitchableEffects.wing`). The
+    reduced model is used for static responses as long as no effect changes structure or loads; also
+    for transient ones if there is no patched wing.
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced model of the structure.
     table : sequence of FmuVariable
         The variables of the FMU, the inputs first.
-    roles : StructureRoles
-        Roles of variables.
     effects : SwitchableEffects, optional
         Missing effects of a wing.
     """
@@ -87,14 +83,9 @@ class StructureBehaviour:
         self._readings: list[float] = []
 
     def tune(self, values: Mapping[str, float], start_time: float) -> None:
-        """Set the variables of the effects, which take effect at the next start or step.
+        """Set the variables of the effects by name, for the next start or step.
 
-        Parameters
-        ----------
-        values : mapping of str to float
-            The values by name.
-        start_time : float
-            The time at the start of the simulation [s].
+        `start_time` is the start of the simulation [s].
         """
         self._tuned = values
         self._tuned_start_time = start_time
@@ -102,12 +93,10 @@ class StructureBehaviour:
     def start(
         self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
     ) -> Sequence[float]:
-        """Return the outputs in equilibrium under the inputs, or just after a release.
+        """Return the outputs at equilibrium under the inputs, or just after a release.
 
         Parameters
         ----------
-        parameters : mapping of str to float
-            Parameters by name.
         time : float
             Start time [s].
         inputs : sequence of float
@@ -121,12 +110,12 @@ class StructureBehaviour:
         return self._completely(time, 0.0, inputs, parameters)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Return the outputs after one step, over which inputs and effects are constant.
+        """Return the outputs after a step with constant inputs and effects.
 
         Parameters
         ----------
         time, duration : float
-            The begin and the duration of the step [s].
+            Beginning and length of the step [s].
         inputs : sequence of float
             Inputs in the order of the table.
 
@@ -140,7 +129,7 @@ class StructureBehaviour:
         return self._completely(time, duration, inputs)
 
     def later(self, group: int) -> list[float]:
-        """Return the outputs of a group that is computed only when it is read.
+        """Return a group of outputs that is computed only when it is read.
 
         Parameters
         ----------
@@ -160,7 +149,7 @@ class StructureBehaviour:
         return [static.displacement_error_bound]
 
     def _modes(self, vector: FloatArray) -> list[float]:
-        """Return the frequencies [Hz] and then the damping ratios [1] of the tabulated modes."""
+        """Return the frequencies [Hz], then the damping ratios, of the modes with outputs."""
         integrator = self._integrator
         modes = self._model.modes(vector) if integrator is None else integrator.modes
         frequency = modes.frequency[:MODE_COUNT]
@@ -175,10 +164,7 @@ class StructureBehaviour:
         return self._static
 
     def _point_displacement(self) -> float:
-        """Return the displacement of the load point [m].
-
-        That is the point at which a load holds the structure before a release.
-        """
+        """Return the displacement [m] of the point at which a load holds the structure."""
         if self._integrator is not None and self._state is not None:
             load = self._holding_load(self._integrator)
             return self._integrator.point_displacement(self._state, load)
@@ -189,9 +175,9 @@ class StructureBehaviour:
     # ------------------------------------------------------------ saved states
 
     def state(self) -> list[float]:
-        """Return everything that is needed to continue, except the parameters.
+        """Return all numbers that are needed to continue, except the parameters.
 
-        The first number is that of the parts; then each part follows as its length and its numbers.
+        The first number counts the parts; each part follows as its length and its numbers.
         """
         motion: list[Sequence[float] | FloatArray] = []
         if self._state is not None:
@@ -266,14 +252,7 @@ class StructureBehaviour:
     ) -> list[float]:
         """Return the outputs after a start or a step; restore the previous state after an error.
 
-        Parameters
-        ----------
-        time, duration : float
-            The begin and the duration of the step [s].
-        inputs : sequence of float
-            Inputs in the order of the table.
-        start_parameters : mapping of str to float, optional
-            The parameters of a start; None for a step.
+        `start_parameters` are those of a start, and None for a step.
         """
         previous_attributes = dict(self.__dict__)
         try:
@@ -293,10 +272,7 @@ class StructureBehaviour:
             raise UnacceptableValuesError(f"{sentence}.") from error
 
     def _outputs_after(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
-        """Return the outputs after a step, or those at the start if there is no state yet.
-
-        Arguments are those of `advance`.
-        """
+        """Return the outputs after a step, or at the start if there is no state yet."""
         has_changed = self._effects is not None and self._take_effects(self._effects)
         values = {**self._parameters, **dict(zip(self._inputs, inputs, strict=True))}
         vector = np.array([values[name] for name in self._roles.chosen])
@@ -325,16 +301,10 @@ class StructureBehaviour:
     def _next_motion(
         self, vector: FloatArray, time: float, duration: float, *, has_changed: bool
     ) -> tuple[ModalIntegrator, TransientState]:
-        """Return the integrator and the state of the motion after a start or a step.
+        """Return the integrator and the state after a start or a step.
 
-        Parameters
-        ----------
-        vector : (V,) ndarray
-            The values of the model.
-        time, duration : float
-            The begin and the duration of the step [s].
-        has_changed : bool
-            Whether the effects have changed.
+        `vector` (V,) are the values of the model; `has_changed` says whether the effects have
+        changed.
         """
         integrator = self._integrator
         state = self._state
@@ -356,14 +326,14 @@ class StructureBehaviour:
         return integrator, integrator.state_after_release(release, load, holding_load)
 
     def _structure_differs(self, vector: FloatArray) -> bool:
-        """Return whether a value that changes the modes differs from that of the last step."""
+        """Return whether a value that determines the modes has changed since the last step."""
         if self._vector is None:
             return True
         count = self._structural_count
         return vector[:count].tobytes() != self._vector[:count].tobytes()
 
     def _holding_load(self, integrator: ModalIntegrator) -> int:
-        """Return the number of the load that holds the displaced structure before a release."""
+        """Return the index of the load that holds the displaced structure before a release."""
         holding = integrator.structure.holding_load
         return self._roles.point_load if holding is None else holding
 
@@ -392,16 +362,9 @@ class StructureBehaviour:
     def _read_by_sensors(
         self, active: ActiveEffects, outputs: list[float], duration: float, end: float
     ) -> list[float]:
-        """Return the outputs as read by sensors with effects, and keep the memory of their filters.
+        """Return the outputs as sensors with the active effects read them.
 
-        Parameters
-        ----------
-        active : ActiveEffects
-            The effects that are on, with their values.
-        outputs : list of float
-            The true outputs of the structure.
-        duration, end : float
-            The duration and the end of the step [s].
+        The memory of the sensors' filters is kept for the next step.
         """
         assert self._effects is not None
         if not len(active.patch):
@@ -429,19 +392,10 @@ class StructureBehaviour:
         return self._readings[:-1]
 
     def _strains_across(self, active: ActiveEffects, channels: int) -> FloatArray | None:
-        """Return the strains transverse to the gauges, and the shear strains there.
+        """Return the strains (2, C) transverse to the gauges and in shear, for C channels.
 
-        Parameters
-        ----------
-        active : ActiveEffects
-            The effects that are on, with their values.
-        channels : int
-            The number of channels C; the first are the gauges.
-
-        Returns
-        -------
-        (2, C) array or None
-            Zero for channels that are not gauges; None if no sensor needs them.
+        They are zero for channels other than gauges. None unless an effect changes structure or
+        loads, or turns a gauge.
         """
         if self._integrator is None or self._state is None or not active.changes_structure:
             return None

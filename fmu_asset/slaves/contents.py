@@ -1,4 +1,4 @@
-"""What a slave runs: a table of variables and a behaviour; copied into the FMUs.
+"""What a slave needs: a table of variables and a behaviour. Copied into the FMUs.
 
 Standard library and relative imports only.
 """
@@ -12,29 +12,29 @@ from .variables import FmuVariable
 
 
 class UnacceptableValuesError(ValueError):
-    """The values lie in their ranges, but the asset cannot have them; one sentence."""
+    """Values that lie in their ranges but are impossible together; the message is one sentence."""
 
 
 class Behaviour(Protocol):
-    """What an FMU does: its outputs at the start and after steps.
+    """The behaviour of an FMU: its outputs at the start and after steps.
 
-    A call either completes or raises and leaves everything as it was. Outputs are returned as the
-    first of the table in order; Booleans are 0 or 1.
+    A call either completes, or raises and changes nothing. Outputs are returned in the order of the
+    table, beginning with the first; Booleans are 0 or 1.
     """
 
     def start(
         self, parameters: Mapping[str, float], time: float, inputs: Sequence[float], /
     ) -> Sequence[float]:
-        """Return the outputs at the start: parameters by name, time [s], inputs in order."""
+        """Return the outputs at the start; time in s, inputs in the order of the table."""
 
     def advance(self, time: float, duration: float, inputs: Sequence[float], /) -> Sequence[float]:
-        """Return the outputs after a step: time at its beginning [s], its duration [s], inputs."""
+        """Return the outputs after a step; time at its beginning and duration in s."""
 
     def state(self) -> Sequence[float]:
-        """Return everything that is remembered, without the parameters."""
+        """Return all numbers that are needed to continue, except the parameters."""
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float], /) -> None:
-        """Go back to what `state` returned, under the parameters of that moment."""
+        """Restore a state that `state` returned, with the parameters of that time."""
 
 
 class TunableBehaviour(Behaviour, Protocol):

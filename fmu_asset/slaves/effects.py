@@ -1,8 +1,8 @@
-"""Missing effects of a wing's FMU: their variables, the patch that they make, and sensor readings.
+"""Missing effects of a wing's FMU: their variables, their patch of the model, and sensor readings.
 
-An effect has a switch, and every number of its primitives, as tunable parameters. They stand at the
-end of the table, so that value references before them stay. This file is copied into the FMU; a
-structure without effects does not need it.
+For each effect there is a switch, and a tunable parameter for every number of its primitives. They
+stand at the end of the table, so that the value references before them do not change. This file is
+copied into the FMU; a structure without effects does not need it.
 """
 
 from __future__ import annotations
@@ -47,13 +47,7 @@ class EffectRecord(TypedDict):
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
-    """Return name and quantity of the wing's measured outputs, in the order of the FMU's behaviour.
-
-    Parameters
-    ----------
-    gauge_count : int
-        The number of strain gauges of the wing.
-    """
+    """Return name and quantity of the wing's measured outputs, in the order of the FMU."""
     strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
     displacements = (
         ("tip_displacement", "displacement"),
@@ -63,7 +57,7 @@ def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
 
 
 class PrimitiveNumber(NamedTuple):
-    """Where a number of an effect stands: the position of its primitive, and its key in that."""
+    """A number of an effect: the position of its primitive, and its key there."""
 
     primitive: int
     key: str
@@ -75,11 +69,6 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
     The variable of a number is called `effect.<id>.<key>`. If several primitives of the effect have
     a number with this key, it is called `effect.<id>.<key>[n]`, with the number n of the primitive
     from 1.
-
-    Parameters
-    ----------
-    effect : mapping
-        The effect, see `EffectRecord`.
     """
     numbers = []
     for position, primitive in enumerate(effect["primitives"]):
@@ -97,17 +86,7 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
 
 
 def _unit(primitive: PrimitiveRecord, key: str) -> str:
-    """Return the unit of a primitive's parameter as FMI spells it, such as "N.s".
-
-    The unit is "1" if the parameter has no unit.
-
-    Parameters
-    ----------
-    primitive : dict
-        The primitive, see `PrimitiveRecord`.
-    key : str
-        The key of the parameter.
-    """
+    """Return the unit of a primitive's number as FMI spells it, such as "N.s" or "1"."""
     unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
     # Two units stand for others. CHANNEL_UNIT is that of the channel, which reads a displacement
     # [m] or a strain [1]. PER_RELEASE is that unit divided by the release amplitude, the
@@ -140,13 +119,11 @@ def effect_rows(
 
     Parameters
     ----------
-    effects : sequence of mapping
-        The effects, see `EffectRecord`.
     first : int
         The value reference of the first row.
     start : mapping of str to float
-        Start values by variable name. Without one, an effect is switched off, and a number has its
-        value in the patch.
+        Start values by variable name. By default an effect is off, and a number has its value in
+        the patch.
     """
     table = VariableTable({}, first)
     for effect in effects:
@@ -169,7 +146,7 @@ def effect_rows(
 
 
 def _add_switch(table: VariableTable, effect: EffectRecord, start: Mapping[str, float]) -> None:
-    """Add the variable that switches an effect on to a table; `start` as in `effect_rows`."""
+    """Add the variable that switches an effect on."""
     kinds = dict.fromkeys(str(primitive["kind"]) for primitive in effect["primitives"])
     words = " and ".join(kinds).replace("_", " ")
     name = switch_name(effect)
@@ -191,21 +168,7 @@ def _add_number(
     key: str,
     start: Mapping[str, float],
 ) -> None:
-    """Add the variable of a primitive's number to a table.
-
-    Parameters
-    ----------
-    table : VariableTable
-        The table to which the variable is added.
-    name : str
-        The name of the variable.
-    primitive : dict
-        The primitive change that has the number, see `PrimitiveRecord`.
-    key : str
-        The key of the number in the primitive.
-    start : mapping of str to float
-        Start values by variable name; without one, the value in the primitive.
-    """
+    """Add the variable of a primitive's number, which by default keeps its value."""
     value = primitive[key]
     assert isinstance(value, int | float)  # `numbers_of` names no other values
     location = primitive.get("port") or primitive.get("channel") or ""
@@ -228,12 +191,10 @@ def _add_number(
 def active_primitives(
     effects: Sequence[EffectRecord], values: Mapping[str, float]
 ) -> list[PrimitiveRecord]:
-    """Return the primitives of the effects that are switched on, with the present values.
+    """Return the primitives of the active effects, with the present values.
 
     Parameters
     ----------
-    effects : sequence of mapping
-        The effects, see `EffectRecord`.
     values : mapping of str to float
         The values by variable name. An effect is on if its switch is above one half.
     """
@@ -253,18 +214,18 @@ def active_primitives(
 
 
 class ActiveEffects(NamedTuple):
-    """The effects that are switched on, at the present values of all variables.
+    """The active effects with the present values of all variables.
 
     Attributes
     ----------
     values : tuple of float
-        The values of all variables of the effects.
+        The values of the effects' variables.
     patch : ModelPatch
-        The effects that are on.
+        The active effects as one patch.
     temperature : float
-        The temperature of the wing less the reference temperature [K].
+        The temperature of the wing minus the reference temperature [K].
     changes_structure : bool
-        Whether an effect is on that changes more than the readings of sensors.
+        Whether an active effect changes more than the readings of sensors.
     filters : list of (str, str, float)
         Channel, quantity and order of each filter. The memory of the filters is kept while these
         stay the same.
@@ -278,7 +239,7 @@ class ActiveEffects(NamedTuple):
 
 
 class SensorReadings(NamedTuple):
-    """The readings of all channels at one instant.
+    """The readings of all channels at one time.
 
     Attributes
     ----------
@@ -293,16 +254,14 @@ class SensorReadings(NamedTuple):
 
 
 class SwitchableEffects:
-    """Missing effects that can be switched on and changed between steps.
+    """Missing effects that can be switched and changed between steps.
 
     Parameters
     ----------
-    effects : sequence of mapping
-        The effects, see `EffectRecord`.
     gauge_count : int
         Number of gauges of the wing.
     arrays : PatchArrays, optional
-        The wing for patches; None if the effects are of sensors alone.
+        The wing for patches; None if all effects are those of sensors.
 
     Attributes
     ----------
@@ -325,11 +284,11 @@ class SwitchableEffects:
         self._last_key: object = None
 
     def values(self, tuned: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the values of the variables in their order, from values by name."""
+        """Return values by name as a tuple in the order of the effects' variables."""
         return tuple(tuned[name] for name in self._names)
 
     def active(self, values: Sequence[float]) -> ActiveEffects:
-        """Return the effects that are on, for values of the variables in the order of the table.
+        """Return the active effects, given the variables in the order of the table.
 
         Raises
         ------
@@ -363,19 +322,16 @@ class SwitchableEffects:
         start: float,
         release: float,
     ) -> SensorReadings:
-        """Return the readings of the sensors at the end of a step, with the effects on sensors.
+        """Return the sensor readings at the end of a step, with the active effects.
 
         Parameters
         ----------
-        active : ActiveEffects
-            The effects that are on, with their values.
         values : (C,) ndarray
             The true values of the channels.
         strains_across : (2, C) ndarray, optional
             The strains transverse to the gauges and in shear; None if no sensor needs them.
         filter_memory : sequence of float, optional
-            The memory of the filters from the last readings; None if the filters are in steady
-            state.
+            The memory of the filters from the last readings; None starts them in steady state.
         duration : float
             The time since the last readings [s].
         kind : {"flight", "forced", "ringdown"}
@@ -418,19 +374,16 @@ class SwitchableEffects:
     def integrator(
         self, vector: FloatArray, damping: tuple[float, float], active: ActiveEffects
     ) -> ModalIntegrator:
-        """Return the time integrator of the wing with the effects that are on.
+        """Return the time integrator of the wing with the active effects.
 
         If nothing has changed since the last call, the last integrator is returned.
 
         Parameters
         ----------
         vector : (V,) ndarray
-            The values of the model's parameters. The last two are controls, which do not affect the
-            integrator.
+            The values of the model. The last two are controls, which do not affect the integrator.
         damping : (float, float)
-            The Rayleigh coefficients of mass [1/s] and stiffness [s].
-        active : ActiveEffects
-            The effects that are on, with their values.
+            The coefficients of Rayleigh damping for mass [1/s] and stiffness [s].
         """
         assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, active.values)

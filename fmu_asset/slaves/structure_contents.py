@@ -16,16 +16,9 @@ from .variables import FmuVariable
 
 
 def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[slice, ...]:
-    """Return the rows of outputs that are computed when they are read, by group.
+    """Return the rows of the outputs that are computed only when they are read, by group.
 
     The groups are `BOUND`, `POINT_OR_BOUND` and `MODES` of `behaviour`.
-
-    Parameters
-    ----------
-    table : sequence of FmuVariable
-        Variables of the FMU.
-    roles : StructureRoles
-        Roles of variables.
     """
     reference = {row.name: row.reference for row in table}
     bound_row = reference["strain_error_bound"]
@@ -40,13 +33,7 @@ def later_outputs(table: Sequence[FmuVariable], roles: StructureRoles) -> tuple[
 
 
 def load_contents(resources: Path) -> SlaveContents:
-    """Return the structure in the files that `fmu_asset.packing.structure_fmu` packed.
-
-    Parameters
-    ----------
-    resources : Path
-        Folder of resources in the FMU.
-    """
+    """Return the structure in the resources that `fmu_asset.packing.structure_fmu` packed."""
     model = ReducedModel.load(resources / "reduced_model.npz")
     start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
     structure_start = {}

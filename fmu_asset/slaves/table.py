@@ -34,7 +34,7 @@ _BOUND_TEXT = "Certified bound of the error of any static {} against the full fi
 
 
 class _ValueGroup(NamedTuple):
-    """Variables of the FMU for a group of values that can be chosen in the model.
+    """What the variables of a group have in common; each sets a value of the model.
 
     Attributes
     ----------
@@ -65,20 +65,20 @@ _MASS = _ValueGroup("mass.", "parameter", "Mass of {}", "kg", "g")
 
 @dataclass(frozen=True)
 class StructureRoles:
-    """Roles of variables in the table; the outputs of the model come first among the outputs.
+    """The roles of variables in the table.
 
     Attributes
     ----------
     chosen : tuple of str
-        Names of all values that can be chosen, in the order of the model: parameters, losses,
-        masses, controls.
+        Variables of all values that the model takes, in its order: parameters, losses, masses,
+        controls.
     displacement_bound : str or None
-        The bound of the displacements, where it is an output.
+        The bound of the displacements; None for the wing, which has no such output.
     point_load : int
-        Index of the load that holds the structure aside before a release, and whose point may be an
-        output.
+        Index of the load that holds the structure displaced before a release; the displacement of
+        its point may be an output.
     release, load_point : str or None
-        The parameter for the displacement of that point before a release, and the output of its
+        The parameter for the displacement of that point before a release, and the output for its
         displacement.
     """
 
@@ -90,21 +90,19 @@ class StructureRoles:
 
 
 def is_wing(model: ReducedModel) -> bool:
-    """Return whether a model is that of a wing, not of a structure that only has its name."""
+    """Return whether a model is a wing; a structure that only has the wing's name is none."""
     return model.name == WING_MODEL_NAME and len(model.followed_shapes) > 0
 
 
 def structure_table(
     model: ReducedModel, start: Mapping[str, float]
 ) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
-    """Return the table of a structure's FMU, and the roles of its variables.
+    """Return the variables of a structure's FMU, and their roles.
 
     The order of the rows is fixed, since value references depend on it.
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced model of the structure.
     start : mapping of str to float
         Start values by variable name that replace the nominal ones.
 
@@ -126,7 +124,7 @@ def structure_table(
 def _wing_table(
     model: ReducedModel, start: Mapping[str, float]
 ) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
-    """Return the table of the wing; see `structure_table`."""
+    """Return the variables of the wing, and their roles."""
     table = _ModelTable(model, start, _TEXTS_OF_WING)
     table.add_values(_CONTROL, model.controls[:1])
     table.add_values(_REGION, model.regions)
@@ -173,7 +171,7 @@ def _wing_table(
 def _table_of_structure(
     model: ReducedModel, start: Mapping[str, float]
 ) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
-    """Return the table of a structure that is not a wing; see `structure_table`."""
+    """Return the variables of a structure other than the wing, and their roles."""
     table = _ModelTable(model, start, {})
     table.add_values(_CONTROL, model.controls)
     table.add_values(_REGION, model.regions)
@@ -197,16 +195,14 @@ def _table_of_structure(
 
 
 class _ModelTable(VariableTable):
-    """A table with the rows that wings and other structures share.
+    """The table of a reduced model, with the rows that all structures share.
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced model of the structure.
     start : mapping of str to float
-        Start values by variable name that replace the nominal ones.
+        Start values that replace the nominal ones, by variable name.
     texts : mapping of str to str
-        Descriptions by variable name that replace those of a structure.
+        Descriptions that replace the usual ones, by variable name.
     """
 
     def __init__(
@@ -220,24 +216,16 @@ class _ModelTable(VariableTable):
         self._variables: dict[str, str] = {}
 
     def chosen(self) -> tuple[str, ...]:
-        """Return the variables of all values that can be chosen, in the order of the model."""
+        """Return the variables of all values that the model takes, in its order."""
         return tuple(self._variables[name] for name in self._model.input_names)
 
     def add_values(self, group: _ValueGroup, names: Sequence[str]) -> None:
-        """Append values that can be chosen in the model, by their names there."""
+        """Append values of the model under the names that they have there."""
         for name in names:
             self.add_value(group, name, f"{group.prefix}{name}")
 
     def add_value(self, group: _ValueGroup, name: str, variable: str) -> None:
-        """Append a value that can be chosen in the model.
-
-        Parameters
-        ----------
-        group : _ValueGroup
-            The group of the variable.
-        name, variable : str
-            The name of the value in the model, and that of the variable in the FMU.
-        """
+        """Append a value of the model, given its name there and that of its variable."""
         self.add(
             variable,
             group.causality,

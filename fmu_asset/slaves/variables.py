@@ -1,4 +1,4 @@
-"""The table of an FMU's variables, from which model description, slave and documentation are made.
+"""The table of an FMU's variables, which model description, slave and documentation are made from.
 
 Standard library only: the file is copied into the FMU.
 """
@@ -39,7 +39,7 @@ class EnumerationType:
     Attributes
     ----------
     name, description : str
-        The name of the variable, and a line that describes it to people.
+        The type's name.
     items : tuple of (str, int, str)
         Name, value and description of each item.
     """
@@ -89,12 +89,12 @@ ENUMERATIONS = (
 
 @dataclass(frozen=True)
 class FmuVariable:
-    """A variable of an FMU, one row of the table.
+    """A variable of an FMU: one row of the table.
 
     Attributes
     ----------
     name : str
-        Name in the structured naming convention.
+        Name in FMI's structured naming convention.
     reference : int
         FMI value reference; also the index of the row.
     kind : {"Real", "Integer", "Boolean", "Enumeration"}
@@ -104,7 +104,7 @@ class FmuVariable:
     description : str
         One line for people.
     unit, display_unit : str or None
-        In the spelling of FMI.
+        As FMI spells them.
     minimum, maximum : float or None
         Range that is enforced for inputs and parameters; None where there is no limit.
     start : float or None
@@ -128,7 +128,7 @@ class FmuVariable:
 
 
 class VariableTable:
-    """A table of variables that is made row by row.
+    """A table of variables that is built row by row.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class VariableTable:
         limits : (float or None, float or None)
             Range; None where it has no limit.
         default : float
-            Start value of an input or parameter, unless the table was given another.
+            Start value of an input or parameter, unless the table has another.
         tunable : bool
             Whether a parameter can change between steps.
         """
@@ -209,7 +209,7 @@ class VariableTable:
 
 
 def _variability(kind: Kind, causality: Causality, *, tunable: bool) -> Variability:
-    """Return the variability of FMI: tunable or fixed parameters, other values by their kind."""
+    """Return the variability in FMI: tunable or fixed for parameters, else by type."""
     if tunable:
         return "tunable"
     if causality == "parameter":

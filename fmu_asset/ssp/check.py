@@ -1,4 +1,4 @@
-"""Checking an SSP file against the FMUs in it: its connections are joined, and one step is made."""
+"""Checks an SSP file: its connections are compared with its FMUs, and one step is made."""
 
 import difflib
 import os
@@ -31,23 +31,20 @@ class SspCheck:
 
     Attributes
     ----------
-    path : Path
-        The path of the file.
     problems : tuple of str
         One sentence for each problem; empty if none was found.
     components : tuple of (str, str)
-        Name of each component and of its model, in the order in which they are evaluated.
+        Name and model name of each component, in the order of their evaluation.
     connections, parameters : int
         The number of connections and of parameters.
     step : float or None
-        The step that was made [s]; None where none could be made.
+        The size of the step that was made [s]; None if the step failed.
     loops : tuple of str
-        Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to
-        break it.
+        Algebraic loops. They are allowed, but `ssp simulate` needs a way to break them.
     unused : tuple of str
-        Parameters that the file sets and nothing takes, which SSP allows.
+        Parameters of the file that no element has, which SSP allows.
     left_out : str
-        A sentence on them, with the nearest names of the system; empty if there are none.
+        A sentence about these, with the most similar names of the system; empty if there are none.
     """
 
     path: Path
@@ -62,19 +59,17 @@ class SspCheck:
 
 
 def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
-    """Join a system that was read, and check that its connectors are those of its FMUs.
+    """Check that a system fits its FMUs, as the connectors of the SSP file declare them.
 
     Parameters
     ----------
-    structure : SystemStructure
-        The system as `reader.read_ssp` returns it.
     delayed : iterable of str
         Ends whose connections are delayed by a step, whatever the file says.
 
     Raises
     ------
     SspError
-        If a connector of a component is declared otherwise than its FMU has it.
+        If the file declares a connector of a component otherwise than its FMU.
     CouplingError, FmuFileError, FmuUnsupportedError
         If the system does not fit its FMUs.
     """
@@ -88,17 +83,7 @@ def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
 
 
 def _difference_from_fmu(wiring: Wiring, end: Endpoint, connector: Connector) -> str:
-    """Return how a component's connector differs from the FMU's variable; empty if they agree.
-
-    Parameters
-    ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
-    end : Endpoint
-        The component and its variable.
-    connector : Connector
-        The connector as the SSP file declares it.
-    """
+    """Return how a declared connector differs from the FMU's variable; empty if they agree."""
     variable = wiring.variable(end)
     # SSP 1.0 has no local variables.
     kind_of_fmu = "output" if variable.causality == "local" else variable.causality
@@ -114,14 +99,12 @@ def _difference_from_fmu(wiring: Wiring, end: Endpoint, connector: Connector) ->
 
 
 def left_out_sentence(wiring: Wiring, file: Path) -> str:
-    """Return the sentence on parameters of a file that nothing takes; empty if all are used.
+    """Return the warning about parameters that no element has; empty if all are used.
 
     Parameters
     ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
     file : Path
-        The SSP file that it comes from.
+        The SSP file, for the message.
     """
     if not wiring.left_out:
         return ""
@@ -138,7 +121,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
 
 
 def _settable_names(wiring: Wiring) -> list[str]:
-    """Return the names of all parameters and inputs that the system and its components have."""
+    """Return the names of all parameters and inputs of the system and its components."""
     names = [
         connector.name for connector in wiring.structure.connectors if connector.kind != "output"
     ]
@@ -150,17 +133,7 @@ def _settable_names(wiring: Wiring) -> list[str]:
 
 
 def _name_with_hint(name: str, settable_names: list[str], components: list[str]) -> str:
-    """Return the name of a parameter that nothing takes, with a hint at the probable mistake.
-
-    Parameters
-    ----------
-    name : str
-        The name, such as "wing.mass" for a parameter of the component "wing".
-    settable_names : list of str
-        The names of all parameters and inputs that can be set.
-    components : list of str
-        The names of the components.
-    """
+    """Return the name of an unused parameter, such as "wing.mass", with a hint at the mistake."""
     # names are compared with those of the same component, without its prefix
     prefixes = [f"{component}." for component in components if name.startswith(f"{component}.")]
     prefix = max(prefixes, key=len, default="")
@@ -182,9 +155,9 @@ def _name_with_hint(name: str, settable_names: list[str], components: list[str])
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
-    """Check an SSP file: archive, schemas, connections against the FMUs, and one step in workers.
+    """Check an SSP file: archive, schemas, connections, and one step of its FMUs.
 
-    The step is the one that `ssp simulate` takes, of the default experiment.
+    The step is the first one of `ssp simulate`, with the default experiment, in worker processes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reading the default experiment of an SSP file: times, and the step of the system."""
+"""Reads the default experiment of an SSP file: its times, and the step of the system."""
 
 from math import isfinite
 
@@ -22,12 +22,10 @@ _STEP_ATTRIBUTES = {"FixedStepAlgorithm": "baseStepSize", "FixedStepMaster": "st
 
 
 def base_step_of(root: XmlElement, path: str) -> float | None:
-    """Return the step that annotations declare for the outermost system [s]; None if none does.
+    """Return the step that annotations declare for the outermost system [s]; None without one.
 
     Parameters
     ----------
-    root : XmlElement
-        The system structure.
     path : str
         The SSP file, for the message.
 
@@ -50,7 +48,7 @@ def base_step_of(root: XmlElement, path: str) -> float | None:
 
 
 def _positive_step(text: str, attribute: str, path: str) -> float:
-    """Return a step size [s] that an attribute declares."""
+    """Return the step size [s] in an attribute."""
     try:
         step = float(text)
     except ValueError:

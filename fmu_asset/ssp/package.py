@@ -66,19 +66,12 @@ _LONGEST_SCHEMA_MESSAGE = 400
 
 
 class SspPackage:
-    """An SSP file that was checked: sound, safe, and with a system structure in it.
-
-    Parameters
-    ----------
-    path : path-like
-        The path of the file.
+    """An SSP file whose archive is sound and safe, and has a system structure.
 
     Attributes
     ----------
-    path : Path
-        The path of the file.
     names : set of str
-        The names of the files in the archive.
+        The files in the archive.
 
     Raises
     ------
@@ -110,14 +103,12 @@ class SspPackage:
             raise SspError(f"{name} in {self.path} cannot be read ({error}).") from error
 
     def resolve(self, source: str, element_label: str) -> str:
-        """Return the name in the archive that a URI of the system structure stands for.
+        """Return the file in the archive to which a URI of the system structure refers.
 
         Parameters
         ----------
-        source : str
-            The URI.
         element_label : str
-            The name in messages of the element that has it.
+            The element with the URI, for messages.
 
         Raises
         ------
@@ -150,7 +141,7 @@ class SspPackage:
         name : str
             The file in the archive, or the name of `content` in messages.
         content : bytes, optional
-            The text of the document; by default the content of the file.
+            The document; by default the content of the file.
         """
         label = f"{name} in {self.path}"
         root = parse_xml(self.read(name) if content is None else content, label)
@@ -162,19 +153,17 @@ class SspPackage:
 
 
 def parse_xml(content: bytes, label: str) -> XmlElement:
-    """Return the root of an XML text; neither entities nor anything outside is read.
+    """Return the root of an XML text, without resolving entities or loading anything.
 
     Parameters
     ----------
-    content : bytes
-        The text of the file.
     label : str
         The name of the text in messages.
 
     Raises
     ------
     SspError
-        If the text is not well-formed, or declares entities.
+        If the text is not well-formed, or has a document type declaration.
     """
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
@@ -192,22 +181,11 @@ def parse_xml(content: bytes, label: str) -> XmlElement:
 
 
 def _convert_to_ssp1(root: XmlElement, label: str) -> None:
-    """Change those parts of an SSP 2.0 document that are read here into SSP 1.0.
+    """Convert an SSP 2.0 document to SSP 1.0, as far as it is read here, in place.
 
-    SSP 2.0 has the same namespaces and more words. The numbers of FMI 3 become the two that SSP 1.0
-    knows; the FMU that they come from decides their size. Metadata and signatures are left out.
-
-    Parameters
-    ----------
-    root : XmlElement
-        The root of the document; it is changed.
-    label : str
-        The name of the document in messages.
-
-    Raises
-    ------
-    SspError
-        If it has an element that is not supported.
+    SSP 2.0 has the same namespaces and more elements. The number types of FMI 3 become the two of
+    SSP 1.0; the FMU that they belong to decides their size. Metadata and signatures are removed. An
+    `SspError` is raised for an unsupported element.
     """
     for element in list(root.iter(etree.Element)):
         tag = etree.QName(element)
@@ -228,7 +206,7 @@ def _convert_to_ssp1(root: XmlElement, label: str) -> None:
 
 
 def _unsupported_part(element: XmlElement, tag: etree.QName) -> str:
-    """Return the unsupported part of an element, for a message; empty if all of it is supported."""
+    """Return what is unsupported in an element, for a message; empty if nothing is."""
     if tag.localname == "Component" and element.get("source") is None:
         return f"the component {element.get('name')!r} without a source"
     if element.get("kind") in ("clock", "structuralParameter"):
@@ -248,12 +226,10 @@ def _add_namespaces(element: XmlElement, kind: str) -> None:
 
 
 def validate(root: XmlElement, kind: str, label: str) -> None:
-    """Check a document against the published schema of its kind, as fmpy ships it.
+    """Check a document against the published schema of its kind, which fmpy ships.
 
     Parameters
     ----------
-    root : XmlElement
-        The root of the document.
     kind : {"ssd", "ssv", "ssm"}
         The kind of document.
     label : str
@@ -262,7 +238,7 @@ def validate(root: XmlElement, kind: str, label: str) -> None:
     Raises
     ------
     SspError
-        If it is not valid; the sentence gives the first violation.
+        If it is not valid; the message quotes the first violation.
     """
     import fmpy.ssp
 

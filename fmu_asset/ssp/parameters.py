@@ -1,4 +1,4 @@
-"""Reading the parameter sets and mappings of an SSP file, and other values in its XML."""
+"""Reads the parameter sets and mappings of an SSP file, and other values in its XML."""
 
 from dataclasses import replace
 from math import isfinite
@@ -17,7 +17,7 @@ from .package import NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
 
 
 class _RequiredAttribute(NamedTuple):
-    """An attribute of which one value is supported, and what a message says of the others."""
+    """An attribute with its only supported value, and what is wrong with any other."""
 
     name: str
     value: str
@@ -48,19 +48,13 @@ _REQUIRED_ATTRIBUTES = {
 
 
 class ParameterReader:
-    """Reads the parameter sets and mappings that the elements of a system structure refer to.
-
-    Parameters
-    ----------
-    package : SspPackage
-        The SSP file.
-    """
+    """Reads the parameter sets and mappings that a system structure refers to."""
 
     def __init__(self, package: SspPackage) -> None:
         self.package = package
 
     def check_required_attributes(self, element: XmlElement, label: str) -> None:
-        """Refuse an element with attributes that have values which are not supported."""
+        """Raise an error if an attribute of an element has an unsupported value."""
         for attribute in _REQUIRED_ATTRIBUTES[etree.QName(element).localname]:
             value = element.get(attribute.name, attribute.value)
             if value != attribute.value:
@@ -78,7 +72,7 @@ class ParameterReader:
         return Conversion(factor, offset)
 
     def _finite(self, text: str, label: str) -> float:
-        """Return a number; the schemas allow NaN and INF, which are refused."""
+        """Return a finite number; the schemas also allow NaN and INF, which are refused."""
         value = float(text)
         if not isfinite(value):
             raise package_error(
@@ -91,16 +85,8 @@ class ParameterReader:
     ) -> XmlElement:
         """Return the parameter set or mapping that an element refers to or contains.
 
-        Parameters
-        ----------
-        element : XmlElement
-            The parameter binding or mapping.
-        inline : str
-            The path of the document inside the element, where it is not in a file of its own.
-        kind : {"ssv", "ssm"}
-            The kind of document.
-        label : str
-            The name of the element in messages.
+        `inline` is the path of the document inside the element, `label` the element's name in
+        messages.
         """
         self.check_required_attributes(element, label)
         source = element.get("source")
@@ -153,19 +139,15 @@ class ParameterReader:
     ) -> dict[str, ComponentSetting]:
         """Return the values of a parameter set by the names that a mapping gives them.
 
-        Values that the mapping does not name are not used.
+        Values that the mapping does not name are dropped.
 
         Parameters
         ----------
-        values : dict of str to ComponentSetting
-            The values of the parameter set.
-        mapping : XmlElement
-            The parameter mapping.
         binding_label : str
             The name of the parameter binding in messages.
         unmapped_names : list of str
-            The names that the mapping gives to values which the set does not have are added to it:
-            one mapping may serve several sets.
+            Extended by the mapped names of values that the set does not have, which is allowed: one
+            mapping may serve several sets.
         """
         label = f"the mapping of {binding_label}"
         root = self._parameter_document(mapping, "ssm:ParameterMapping", "ssm", label)
@@ -194,12 +176,12 @@ class ParameterReader:
 
 
 def package_error(package: SspPackage, sentence: str) -> SspError:
-    """Return the error for a fault of the system structure of an SSP file."""
+    """Return the error for a fault in the system structure of an SSP file."""
     return SspError(f"{SSD_NAME} in {package.path}: {sentence}")
 
 
 def unit_definitions(root: XmlElement, kind: str) -> tuple[UnitInfo, ...]:
-    """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
+    """Return the unit definitions of a document of the kind "ssd" or "ssv"."""
     units = []
     for element in root.iterfind(f"{kind}:Units/ssc:Unit", NAMESPACES):
         base = element.find("ssc:BaseUnit", NAMESPACES)
@@ -214,12 +196,12 @@ def unit_definitions(root: XmlElement, kind: str) -> tuple[UnitInfo, ...]:
 
 
 def flag(attributes: XmlElement | dict[str, str], name: str) -> bool:
-    """Return a Boolean attribute; false if it is absent."""
+    """Return a Boolean attribute, by default false."""
     return str(attributes.get(name, "false")).strip() in ("true", "1")
 
 
 def coupling_attributes(element: XmlElement) -> dict[str, str]:
-    """Return the attributes of our annotation of a component or connection, if any."""
+    """Return the attributes of our own annotation of a component or connection, if any."""
     path = f"ssd:Annotations/ssc:Annotation/{{{OWN_NAMESPACE}}}Coupling"
     annotation = element.find(path, NAMESPACES)
     return {} if annotation is None else dict(annotation.attrib)

@@ -1,9 +1,8 @@
-"""Reading an SSP file: nested systems flattened, parameters and mappings applied, FMUs taken out.
+"""Reads an SSP file: flattens nested systems, applies parameters and mappings, extracts FMUs.
 
-SSP 1.0 allows more than is read here. The following is refused with a sentence: signal
-dictionaries, components that are systems of their own files, mappings of Booleans, integers and
-enumerations, texts that are not parameters, and binary values. The same is read of SSP 2.0; see
-`package`.
+SSP 1.0 allows more than is read here. The following is refused: signal dictionaries, components
+that are systems in files of their own, mappings of Booleans, integers and enumerations, texts that
+are not parameters, and binary values. The same is read of SSP 2.0; see `package`.
 """
 
 import os
@@ -37,14 +36,12 @@ _INWARD_KINDS = ("input", "parameter")
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SystemStructure:
-    """Read an SSP file, and write the FMUs in it to a folder.
+    """Read an SSP file, and extract its FMUs to a folder.
 
     Parameters
     ----------
-    path : path-like
-        The path of the file.
     folder : path-like
-        The folder for its FMUs; made if it is missing.
+        The folder for the FMUs; made if it is missing.
 
     Returns
     -------
@@ -89,9 +86,9 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
 def _extracted_component(
     name: str, component: Component, reader: "_SystemReader", folder: Path
 ) -> Component:
-    """Return a component with its FMU, which is written to a folder, and its settings.
+    """Return a component with its settings and its FMU, which is extracted to a folder.
 
-    Components of one FMU share the file, which has the name that it has in the archive.
+    Components of one FMU share the file, which keeps its name from the archive.
     """
     package = reader.package
     file = folder / component.fmu
@@ -105,15 +102,13 @@ def _extracted_component(
 
 
 class _SystemReader:
-    """Reads the nested systems of a system structure, and makes them one flat system.
+    """Reads the nested systems of an SSP file as one flat system.
 
     An element is known by its path: the names that lead to it from the outermost system, with dots
     between. The path of the outermost system is empty. A connector is an `Endpoint` of its element.
 
     Parameters
     ----------
-    package : SspPackage
-        The SSP file.
     system : XmlElement
         The outermost system.
 
@@ -126,7 +121,7 @@ class _SystemReader:
     settings : dict of Endpoint to ComponentSetting
         The values that parameter bindings give to parameters and connectors.
     unused : list of str
-        The names of parameters that nothing takes.
+        The names of parameters that no element has.
     """
 
     def __init__(self, package: SspPackage, system: XmlElement) -> None:
@@ -208,7 +203,7 @@ class _SystemReader:
     def _read_connection(self, element: XmlElement, path: str) -> None:
         """Read a connection of a system.
 
-        The kinds of the connectors say which way a value goes; "start" and "end" do not (SSP 1.0,
+        The direction follows from the kinds of the connectors, not from "start" and "end" (SSP 1.0,
         5.3).
         """
         start = self._connection_end(element, "start", path)
@@ -241,17 +236,7 @@ class _SystemReader:
         )
 
     def _connection_end(self, element: XmlElement, side: str, path: str) -> Endpoint:
-        """Return an end of a connection, which must be a connector that is declared.
-
-        Parameters
-        ----------
-        element : XmlElement
-            The XML element of the connection.
-        side : {"start", "end"}
-            The side of the connection.
-        path : str
-            The path of the system that the connection is in.
-        """
+        """Return the "start" or "end" of a connection, which must be a declared connector."""
         owner = element.get(f"{side}Element") or ""
         end = Endpoint(_joined_path(path, owner), str(element.get(f"{side}Connector")))
         if end.component not in self._element_paths:
@@ -269,7 +254,7 @@ class _SystemReader:
     def _gives_values(self, end: Endpoint, path: str) -> bool:
         """Return whether a connector is a source of values in the system with this path.
 
-        A connector of the system itself is seen from inside, where its inputs give values.
+        A connector of the system itself is seen from inside, where its inputs are sources.
         """
         is_of_system = end.component == path
         is_inward = self.connectors[end].kind in _INWARD_KINDS
@@ -278,7 +263,7 @@ class _SystemReader:
     # ------------------------------------------------------------------ parameters
 
     def _read_parameter_bindings(self, element: XmlElement, path: str) -> None:
-        """Read the parameter bindings of an element; they replace those of its elements."""
+        """Read the parameter bindings of an element, which override those of elements inside it."""
         label = f"a parameter binding of the element {path or str(element.get('name'))!r}"
         values: dict[str, ComponentSetting] = {}
         unmapped_names: list[str] = []
@@ -296,16 +281,9 @@ class _SystemReader:
             self._set(name, setting, path)
 
     def _set(self, name: str, setting: ComponentSetting, path: str) -> None:
-        """Give a value to everything that the name of a parameter can mean.
+        """Set every parameter or connector that a name can mean in an element.
 
-        Parameters
-        ----------
-        name : str
-            The name, in which an element may stand before one of the dots.
-        setting : ComponentSetting
-            The value to set, with its unit.
-        path : str
-            The path of the element whose binding gives it.
+        The name may begin with the path of an inner element, which ends at one of its dots.
         """
         candidates = [Endpoint(path, name)]
         for position, letter in enumerate(name):
@@ -335,15 +313,15 @@ class _SystemReader:
         return end.component in self.components or end.component == ""
 
     def flat_connections(self) -> Iterator[Connection]:
-        """Yield the connections between components, and between them and the outermost connectors.
+        """Yield the connections between components, and those with the system's own connectors.
 
         A value that is set at a connector on the way becomes the value of the target.
 
         Raises
         ------
         SspError
-            If connections go round in a circle of systems, or are transformed where units or values
-            forbid it.
+            If connections form a cycle of systems, or are transformed where units or values forbid
+            it.
         """
         for target in self._connection_to:
             if not self._is_flat_end(target):
@@ -355,21 +333,21 @@ class _SystemReader:
                 yield self._joined(chain)
 
     def _chain_to(self, target: Endpoint) -> list[Connection]:
-        """Return the connections that lead to an end through nested systems, in their order."""
+        """Return the connections that lead to an end through nested systems, in order."""
         chain = [self._connection_to[target]]
         while not self._is_flat_end(chain[0].source) and chain[0].source in self._connection_to:
             chain.insert(0, self._connection_to[chain[0].source])
             if len(chain) > len(self._connection_to) + 1:
                 raise package_error(
                     self.package,
-                    f"the connections to {str(target)!r} go round in a circle of systems.",
+                    f"the connections to {str(target)!r} form a cycle of systems.",
                 )
         return chain
 
     def _set_from_chain(self, target: Endpoint, chain: list[Connection]) -> None:
-        """Set the value at the end of a chain of connections that is set at a connector on its way.
+        """Set the end of a chain to the value that is set at a connector on its way.
 
-        Of several such connectors the outermost one counts.
+        If several connectors on the way are set, the outermost one counts.
         """
         for index, connection in enumerate(chain):
             connector = connection.source
@@ -386,7 +364,7 @@ class _SystemReader:
             return
 
     def _joined(self, chain: list[Connection]) -> Connection:
-        """Return one connection in the place of a chain of connections through nested systems."""
+        """Return one connection that replaces a chain of connections through nested systems."""
         source, target = chain[0].source, chain[-1].target
         scale = reduce(Conversion.then, (connection.scale for connection in chain))
         has_units_on_the_way = any(
@@ -412,5 +390,5 @@ class _SystemReader:
 
 
 def _joined_path(*names: str) -> str:
-    """Return the path of an element from the names that lead to it; empty names are left out."""
+    """Return the path of an element from the names that lead to it; skip empty names."""
     return ".".join(name for name in names if name)

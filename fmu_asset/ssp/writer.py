@@ -46,14 +46,12 @@ def write_ssp(
     step_size: float | None = None,
     replace: bool = False,
 ) -> Path:
-    """Write a system as an SSP 1.0 file, its XML checked by the published schemas.
+    """Write a system as an SSP 1.0 file; its XML is checked by the published schemas.
 
     Parameters
     ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
     path : path-like
-        Where to write, with the suffix .ssp.
+        The file to write, with the suffix .ssp.
     parameter_names : mapping of Endpoint to str, optional
         The names of parameters in the parameter set; by default `component.variable`.
     stop_time : float, optional
@@ -102,12 +100,9 @@ def write_ssp(
 
 
 def _connected_variables(wiring: Wiring) -> dict[Endpoint, VariableInfo]:
-    """Return the variables of components that connections join, which need connectors.
+    """Return the connected variables of components, which need connectors in the file.
 
-    Raises
-    ------
-    SspError
-        If SSP 1.0 has no connector for the causality of one.
+    An `SspError` is raised for a causality that SSP 1.0 has no connector for.
     """
     variables = {}
     for connection in wiring.structure.connections:
@@ -135,12 +130,10 @@ def _name_in_archive(component: str) -> str:
 
 
 def _writable_units(wiring: Wiring) -> dict[str, dict[str, float]]:
-    """Return the units that can be written: with exponents, and with one definition in all FMUs.
+    """Return the units that can be written: with exponents, and defined alike in all FMUs.
 
-    Returns
-    -------
-    dict of str to dict of str to float
-        Exponents of base units, factor and offset of each unit; those of 0, 1 and 0 are left out.
+    For each unit there are the exponents of base units, the factor and the offset, as far as they
+    differ from 0, 1 and 0.
     """
     units = list(wiring.structure.units)
     for description in wiring.declared.values():
@@ -166,20 +159,20 @@ def _writable_units(wiring: Wiring) -> dict[str, dict[str, float]]:
 
 
 class _WrittenParameter(NamedTuple):
-    """A parameter in a parameter set: its name there, the variable that it sets, and its value.
+    """A parameter of a parameter set.
 
     Attributes
     ----------
     name : str
         The name in the parameter set.
     end : Endpoint
-        The component and its variable.
+        The component and variable that it sets.
     type : str
-        The type in the words of SSP 1.0.
+        The type as SSP 1.0 calls it.
     value : str
-        The text of the value.
+        The value as text.
     unit : str or None
-        The unit; None if it has none that can be written.
+        None if it has no unit that can be written.
     """
 
     name: str
@@ -192,21 +185,10 @@ class _WrittenParameter(NamedTuple):
 def _written_parameters(
     wiring: Wiring, names: Mapping[Endpoint, str], units: Mapping[str, object]
 ) -> list[_WrittenParameter]:
-    """Return the parameters to be written, in the FMUs' own units: reading converts nothing.
+    """Return the parameters to write, in the FMUs' own units, so that reading converts nothing.
 
-    Parameters
-    ----------
-    wiring : Wiring
-        The components of the system, and the connections between them.
-    names : mapping of Endpoint to str
-        Names of parameters in the parameter set, where they are not `component.variable`.
-    units : mapping of str
-        The units that can be written.
-
-    Raises
-    ------
-    SspError
-        If two parameters have one name, or a value is not an item of its enumeration.
+    An `SspError` is raised if two parameters have one name, or a value is not an item of its
+    enumeration.
     """
     parameters: dict[str, _WrittenParameter] = {}
     for component, settings in wiring.settings.items():
@@ -231,7 +213,7 @@ def _written_parameters(
 
 
 def _number_text(end: Endpoint, variable: VariableInfo, value: float) -> str:
-    """Return the text of a number in a parameter set; for an enumeration, the name of its item."""
+    """Return a number as text for a parameter set, or the name of its item in an enumeration."""
     if variable.base_type == "Real":
         return repr(value)
     if variable.base_type == "Boolean":

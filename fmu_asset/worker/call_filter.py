@@ -1,8 +1,8 @@
-"""A filter of system calls (seccomp(2)) against those that Landlock leaves open to an FMU.
+"""A filter of system calls (seccomp(2)) for those that Landlock leaves open to an FMU.
 
-These are sockets of other kinds, through which a service of the user would do what the FMU may not,
-memory and messages that the user's processes share, changes of other processes, and changes of the
-rights of files. The filter is a program of the kernel's classic BPF machine.
+These are other kinds of sockets, through which a service of the user could do what the FMU may not;
+memory and messages that the user's processes share; changes of other processes; and changes of file
+permissions. The filter is a program for the kernel's classic BPF machine.
 """
 
 import ctypes
@@ -46,7 +46,7 @@ _ALL_BITS = 0xFFFFFFFF
 
 
 class _ProcessorCalls(NamedTuple):
-    """Numbers of the system calls that the filter treats, on one kind of processor.
+    """Numbers of the filtered system calls on one kind of processor, from <asm/unistd.h>.
 
     The numbers are those of <asm/unistd.h>.
 
@@ -63,7 +63,7 @@ class _ProcessorCalls(NamedTuple):
         messages and keys of the user's processes, notices of changes to files, and io_uring, which
         could make sockets without the call `socket`.
     ignored : tuple of int
-        Calls that do nothing and report success. They change the rights, owners, times and
+        Calls that do nothing and report success. They change permissions, owners, times and
         attributes of files. Programs that copy files make such calls, and would fail if the calls
         were refused.
     """
@@ -196,19 +196,10 @@ def filter_calls(*, tcp: bool, truncates: bool) -> None:
 
 
 def _program(calls: _ProcessorCalls, refused_calls: tuple[int, ...], *, tcp: bool) -> bytes:
-    """Return the BPF program of the filter.
+    """Return the BPF program of the filter; `tcp` allows internet sockets.
 
     The kernel runs the program from its first instruction at every system call, until an
-    instruction returns grant, deny, or "do nothing and report success".
-
-    Parameters
-    ----------
-    calls : _ProcessorCalls
-        The numbers of the calls on this processor.
-    refused_calls : tuple of int
-        The calls that are refused whatever their arguments are.
-    tcp : bool
-        Whether the process may open internet sockets.
+    instruction returns "grant", "deny", or "do nothing and report success".
     """
     # Each `_require` either denies the call or continues with the next instruction, so a sum of
     # two means "both must hold".
@@ -281,19 +272,10 @@ def _unless_equal(value: int, instructions: bytes) -> bytes:
 
 
 def _require(argument: int, values: tuple[int, ...], bits: int = _ALL_BITS) -> bytes:
-    """Return code that denies a call unless one argument has an allowed value.
+    """Return code that denies a call unless an argument, counted from 0, has an allowed value.
 
-    If the value is allowed, the program continues behind this code. Only the lower 32 bits of the
-    argument are compared: the upper half has no meaning for the calls that are filtered here.
-
-    Parameters
-    ----------
-    argument : int
-        The number of the argument, from 0.
-    values : tuple of int
-        The allowed values.
-    bits : int
-        The mask of the bits that are compared.
+    If the value is allowed, the program continues after this code. Only the given bits of the lower
+    32 bits are compared: the upper half has no meaning for the calls that are filtered here.
     """
     code = _load(_FIRST_ARGUMENT + _ARGUMENT_SIZE * argument)
     code += _INSTRUCTION.pack(_AND, 0, 0, bits)
@@ -311,13 +293,7 @@ def libc() -> ctypes.CDLL:
 
 
 def checked(result: int) -> int:
-    """Return the result of a call of the C library.
-
-    Raises
-    ------
-    OSError
-        If it is negative.
-    """
+    """Return the result of a call of the C library; raise an `OSError` if it is negative."""
     if result < 0:
         error = ctypes.get_errno()
         raise OSError(error, f"the sandbox: {os.strerror(error)}")

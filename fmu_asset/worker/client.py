@@ -1,4 +1,4 @@
-"""The twin's side of a worker: an instance whose calls are answered by a worker process."""
+"""The twin's side of a worker: an instance whose methods are called in a worker process."""
 
 import contextlib
 import os
@@ -37,14 +37,14 @@ _MEMORY_CHECK_PERIOD = 0.05
 
 
 class _CallKind(NamedTuple):
-    """A call of a worker.
+    """The time limit of a call, and its name in messages.
 
     Attributes
     ----------
     limit : str
-        Attribute of `WorkerLimits` with its limit of time.
+        Attribute of `WorkerLimits`.
     action : str
-        The name of the action in a sentence.
+        What the call does, as part of a sentence.
     """
 
     limit: Literal["load_time", "step_time"]
@@ -109,24 +109,21 @@ class _AnswerHeader(NamedTuple):
 
 
 class WorkerInstance(Instance):
-    """An instance in a worker process, with the calls of `FmuInstance`.
+    """An instance in a worker process, with the methods of `FmuInstance`.
 
     Parameters
     ----------
-    plan : Plan
-        The variables that each call exchanges with the FMU.
     scratch : Path
-        Folder of the worker alone; it is removed when the worker ends.
-    limits : WorkerLimits
-        Limits and grants of the worker.
+        Folder of this worker alone; it is removed when the worker ends.
 
     Attributes
     ----------
     process_id : int
         Process number of the worker.
     lost : bool
-        Whether it cannot be used any more. It is also True from a question until its answer: after
-        an exception between the two, such as an interruption, they no longer belong together.
+        Whether it cannot be used any more. It is also True from a question until its answer has
+        been read: if an exception such as an interruption comes between the two, the next answer
+        would not belong to the next question.
 
     Raises
     ------
@@ -163,11 +160,11 @@ class WorkerInstance(Instance):
             raise
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
-        """Set parameters and inputs and initialise."""
+        """Set parameters and inputs, and initialise the FMU."""
         self._call("initialise", start_time, parameters, with_inputs)
 
     def step(self) -> None:
-        """Make the step that the request block describes, and fill the reply block."""
+        """Make the step in the request, and fill the reply."""
         self._ask(Question.STEP, "step", self._request)
         header = self._wait_for_answer(len(self._reply))
         if header.length != len(self._reply):
@@ -176,18 +173,18 @@ class WorkerInstance(Instance):
         self.lost = False
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make N steps of the FMU in one call of its worker process.
+        """Make N steps in one call of the worker.
 
-        The worker sends the replies in parts of one or more whole steps each. So progress can be
-        reported between two parts, and the time limit of a step applies to the wait for each part,
-        not to the whole call.
+        The worker sends the replies in parts of one or more whole steps. So progress can be
+        reported between two parts, and the time limit of a step applies to each part, not to the
+        whole call.
 
         Parameters
         ----------
         requests : (N, 2 + n_inputs) array
-            The request block of each step.
+            The request of each step.
         replies : (N, n_outputs) array
-            The reply block of each step; filled in place.
+            Filled with the reply of each step.
         report : callable
             Called with the number of finished steps whenever a part has arrived.
         """
@@ -214,7 +211,7 @@ class WorkerInstance(Instance):
             report(filled_bytes // bytes_per_step)
 
     def read(self) -> None:
-        """Read the outputs of this moment."""
+        """Read the present outputs into the reply."""
         answer = self._call("read")
         if len(answer) != len(self._reply):
             raise self._death_error()
@@ -237,9 +234,9 @@ class WorkerInstance(Instance):
         self._call("open", self._plan)
 
     def take_log(self) -> list[tuple[int, str]]:
-        """Return the messages that the FMU has logged since the last call: status and text.
+        """Return status and text of the messages that the FMU has logged since the last call.
 
-        The worker is asked only if the header of an answer has said that there are messages.
+        The worker is asked only if the header of an answer has announced messages.
         """
         if not self._has_log or self.lost:
             return []
@@ -258,12 +255,12 @@ class WorkerInstance(Instance):
 
     @property
     def memory(self) -> int:
-        """Resident memory of the worker [bytes]; 0 if it is gone, or if the system does not say.
+        """Resident memory of the worker [bytes]; 0 if it is gone or the system does not say.
 
-        The twin itself limits the resident memory: it looks at the worker while it waits for a long
-        call, and now and then between short ones. `RLIMIT_AS` would refuse FMUs that reserve
+        The twin itself limits the resident memory: it checks the worker while it waits for a long
+        call, and from time to time between short ones. `RLIMIT_AS` would refuse FMUs that reserve
         address space and never use it (Java, .NET, CUDA, the stacks of threads). Under a resource
-        limit an allocation fails inside the FMU, which then crashes, and nobody could say why.
+        limit an allocation fails inside the FMU, which then crashes without a recognisable cause.
         """
         try:
             with open(f"/proc/{self.process_id}/statm", "rb") as file:  # noqa: PTH123 - half the time
@@ -273,7 +270,7 @@ class WorkerInstance(Instance):
         return resident_pages * os.sysconf("SC_PAGE_SIZE")
 
     def close(self) -> None:
-        """Ask the worker to end, end it if it does not, and remove its folder."""
+        """Ask the worker to end, kill it if it does not, and remove its folder."""
         if self._process.closed:
             return
         can_be_asked = not self.lost
@@ -287,25 +284,13 @@ class WorkerInstance(Instance):
     # ------------------------------------------------------------------ questions and answers
 
     def _pickled(self, name: str, *arguments: object) -> bytes:
-        """Return a question as bytes: name of the call, request block and arguments."""
+        """Return a call as bytes: its name, the request and the arguments."""
         return pickle.dumps((name, bytes(self._request), arguments))
 
     def _ask(self, kind: Question, name: str, content: bytes | memoryview) -> None:
-        """Send a question to the worker.
+        """Send a question to the worker; `name` is that of the call in `_CALL_KINDS`.
 
-        Parameters
-        ----------
-        kind : Question
-            The kind of the message.
-        name : str
-            The name of the call in `_CALL_KINDS`, which has its time limit.
-        content : bytes-like
-            The payload.
-
-        Raises
-        ------
-        FmuWorkerError
-            If the worker is gone, or if an earlier question was not answered.
+        An `FmuWorkerError` is raised if the worker is gone, or did not answer the last question.
         """
         if self.lost:
             raise FmuWorkerError(
@@ -341,24 +326,11 @@ class WorkerInstance(Instance):
         return bytes(answer)
 
     def _wait_for_answer(self, longest_result: int, *, may_be_part: bool = False) -> _AnswerHeader:
-        """Wait for the answer of the worker to the last question, and return its header.
+        """Wait for the answer to the last question, and return its header.
 
-        The payload, which follows the header, is left for the caller to read.
-
-        Parameters
-        ----------
-        longest_result : int
-            The longest payload that a result, or a part of it, can have [bytes].
-        may_be_part : bool
-            Whether the worker may answer in parts. The last one is marked as a result.
-
-        Raises
-        ------
-        FmuError
-            If the call failed in the worker; the error is the one that the worker reports.
-        FmuWorkerError
-            If the worker is dead, or if the header is not valid: the FMU has then overwritten the
-            memory or the pipe of the worker.
+        The caller reads the payload, which may have at most `longest_result` bytes. If the call
+        failed, the error that the worker reports is raised. An invalid header means that the FMU
+        has overwritten the memory or the pipe of the worker, which then counts as dead.
         """
         poll_for_message(self._poll)
         # A worker that answers in parts collects steps for a report period before it sends a part.
@@ -374,7 +346,7 @@ class WorkerInstance(Instance):
         return _AnswerHeader(kind, length)
 
     def _raise_failure(self, length: int) -> None:
-        """Read the payload of a failure, which has a length [bytes], and raise the error in it."""
+        """Read the payload of a failure, `length` bytes, and raise the error in it."""
         content = bytearray(length)
         self._read_into(memoryview(content))
         try:
@@ -390,14 +362,9 @@ class WorkerInstance(Instance):
         raise error_class(sentence, messages, time_of_end)
 
     def _read_into(self, target: memoryview, grace: float = 0.0) -> None:
-        """Fill a buffer with bytes from the worker, within the time limit of the present call.
+        """Fill a buffer with bytes from the worker, within the time limit of the call.
 
-        Parameters
-        ----------
-        target : memoryview of bytes
-            The buffer; it is filled to its end.
-        grace : float
-            The time that is added to the limit of the call [s].
+        `grace` is added to the limit [s].
         """
         filled = 0
         deadline = 0.0
@@ -424,23 +391,11 @@ class WorkerInstance(Instance):
         return limit
 
     def _wait_until(self, deadline: float) -> None:
-        """Wait at most a moment for bytes from the worker; kill it if the deadline has passed.
+        """Wait briefly for bytes from the worker; kill it if the deadline has passed.
 
-        The wait ends after `_MEMORY_CHECK_PERIOD` at the latest, so that the memory of the worker
-        is checked meanwhile. The caller tries to read again, and calls this method until it
-        succeeds.
-
-        Parameters
-        ----------
-        deadline : float
-            The latest time of the answer, on the monotonic clock [s].
-
-        Raises
-        ------
-        FmuTimeoutError
-            If the deadline has passed.
-        FmuMemoryError
-            If the worker uses more memory than its limit.
+        The deadline is on the monotonic clock [s]. The wait ends after `_MEMORY_CHECK_PERIOD` at
+        the latest, so that the memory of the worker is checked meanwhile; the caller then tries to
+        read again.
         """
         remaining = deadline - time.monotonic()
         timeout_in_milliseconds = 1000.0 * max(min(remaining, _MEMORY_CHECK_PERIOD), 0.0)
@@ -457,13 +412,7 @@ class WorkerInstance(Instance):
             )
 
     def _check_memory(self) -> None:
-        """Kill the worker if it uses more memory than its limit.
-
-        Raises
-        ------
-        FmuMemoryError
-            If it does.
-        """
+        """Kill the worker and raise an error if it uses more memory than its limit."""
         self._next_memory_check = time.monotonic() + 5.0 * _MEMORY_CHECK_PERIOD
         used_memory = self.memory
         if used_memory > self._limits.memory * _MEBIBYTE:

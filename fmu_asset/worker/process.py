@@ -1,4 +1,4 @@
-"""The worker process of an FMU, as the twin starts, watches and ends it."""
+"""The worker process of an FMU: the twin starts it, monitors it and ends it."""
 
 import contextlib
 import json
@@ -42,14 +42,12 @@ _PROGRAM = (
 
 
 class WorkerProcess:
-    """The twin's handle of a worker process: its supervisor, and the two pipes to the worker.
+    """A worker process as the twin handles it, by its supervisor and two pipes.
 
     Parameters
     ----------
     folder : Path
         The scratch folder: the worker's working directory, which also has its log.
-    shared : str
-        The folder of the extracted FMU.
     grants : Grants or None
         The rights that the sandbox grants in addition to those of every FMU; None for no sandbox.
 
@@ -85,7 +83,7 @@ class WorkerProcess:
         self.number: int = number
 
     def _start(self, fmu_folder: str, grants: Grants | None) -> "subprocess.Popen[bytes]":
-        """Start the supervisor and return its process; arguments as for the class."""
+        """Start the supervisor and return its process."""
         root = str(Path(__file__).parents[2])
         environment = {
             **os.environ,
@@ -117,7 +115,7 @@ class WorkerProcess:
             raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
 
     def kill(self) -> None:
-        """End the worker, and all processes that the FMU has started, at once."""
+        """Kill the worker and all processes that the FMU has started."""
         if self._process.returncode is not None:
             return
         self._process.terminate()
@@ -132,13 +130,7 @@ class WorkerProcess:
             end_processes(self._folder)
 
     def end(self, limit: float) -> None:
-        """Close the pipes, so that the worker ends; kill it if it still runs after a time.
-
-        Parameters
-        ----------
-        limit : float
-            The time that the worker has to end by itself [s].
-        """
+        """Close the pipes, so that the worker ends; kill it if it still runs after a limit [s]."""
         for pipe in self._pipes:
             pipe.close()
         self._wait_for_end(limit)
@@ -155,7 +147,7 @@ class WorkerProcess:
         Parameters
         ----------
         action : str
-            The action of the worker at that time, such as "a step".
+            What the worker was doing, such as "a step".
         """
         is_alive = not self._wait_for_end(CLOSE_LIMIT)
         self.kill()
@@ -167,14 +159,9 @@ class WorkerProcess:
 
     @staticmethod
     def _cause_of_death(is_alive: bool, code: int) -> str:
-        """Return the end of a sentence that says how the worker died.
+        """Return how the worker died, as the end of a sentence.
 
-        Parameters
-        ----------
-        is_alive : bool
-            Whether the worker still ran, and was killed.
-        code : int
-            The exit code of its process; negative for a signal.
+        `is_alive` says that it was still running; the exit code is negative for a signal.
         """
         if is_alive:
             return "closed its pipe, or wrote something else into it"
@@ -190,7 +177,7 @@ class WorkerProcess:
         return f"ended with exit status {code}: the FMU's code ended its own process"
 
     def _wait_for_end(self, limit: float) -> bool:
-        """Return whether the process ends within a time [s]. It is not reaped yet."""
+        """Return whether the process ends within a limit [s]; it is not reaped yet."""
         return self._process.returncode is not None or has_ended(self._end_event, limit)
 
     def _last_words(self) -> list[str]:

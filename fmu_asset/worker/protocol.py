@@ -47,7 +47,7 @@ class Exit(IntEnum):
 
     OWN_FAILURE = 70
     PIPES_GONE = 71
-    DESERTED = 72
+    ORPHANED = 72
 
 
 _POLLING_TIME = 2.5e-4
@@ -79,15 +79,7 @@ def separated(message: bytes | bytearray) -> list[str]:
 
 
 def receive(descriptor: int, target: memoryview) -> bool:
-    """Fill a buffer from a pipe; return False if the other side is gone.
-
-    Parameters
-    ----------
-    descriptor : int
-        File descriptor of the pipe.
-    target : memoryview of bytes
-        The buffer.
-    """
+    """Fill a buffer from a pipe, given by its file descriptor; return False if it is closed."""
     filled = 0
     while filled < len(target):
         count = os.readv(descriptor, [target[filled:]])
@@ -98,14 +90,7 @@ def receive(descriptor: int, target: memoryview) -> bool:
 
 
 def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
-    """Write a message of several parts to a pipe.
-
-    Parameters
-    ----------
-    descriptor : int
-        File descriptor of the pipe.
-    *parts : bytes-like
-        The parts, one after the other.
+    """Write a message of several parts to a pipe, given by its file descriptor.
 
     Raises
     ------
@@ -122,22 +107,14 @@ def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
 
 
 def has_ended(process: int, limit: float) -> bool:
-    """Return whether a process has ended, or ends within a limit.
-
-    Parameters
-    ----------
-    process : int
-        File descriptor of the process (`os.pidfd_open`).
-    limit : float
-        Longest wait [s].
-    """
+    """Return whether a process ends within a limit [s]; it is given by `os.pidfd_open`."""
     poll = select.poll()
     poll.register(process, select.POLLIN)
     return bool(poll.poll(1000.0 * limit))
 
 
 def poll_for_message(poll: "select.poll") -> None:
-    """Return as soon as there is something to read, or after a moment; see `_POLLING_TIME`."""
+    """Return once there is something to read, or after `_POLLING_TIME`."""
     if _PROCESSOR_COUNT > 1:
         end = time.monotonic() + _POLLING_TIME
         while not poll.poll(0) and time.monotonic() < end:

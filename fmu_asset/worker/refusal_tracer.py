@@ -1,4 +1,4 @@
-"""The tracer with which a supervisor counts the calls that the sandbox refuses (ptrace(2))."""
+"""The tracer by which a supervisor counts the calls that the sandbox refuses (ptrace(2))."""
 
 import ctypes
 import json
@@ -55,12 +55,12 @@ _WORKING_FOLDER = -100  # AT_FDCWD
 
 
 class RefusalTracer:
-    """The supervisor's tracer of one worker and its descendants.
+    """Traces a worker and its descendants, and counts their refused system calls.
 
     Parameters
     ----------
     report : int
-        File descriptor of the report, which holds the refusals of earlier workers.
+        File descriptor of the report, which may hold the refusals of earlier workers.
     """
 
     def __init__(self, report: int) -> None:
@@ -81,13 +81,7 @@ class RefusalTracer:
         self._buffer = ctypes.create_string_buffer(_CALL_HEAD.size + 8 * 8)
 
     def begin(self, worker: int) -> None:
-        """Trace a process from now on. If the system does not allow it, the report says so.
-
-        Parameters
-        ----------
-        worker : int
-            The number of the process.
-        """
+        """Trace a process from now on; if the system does not allow it, the report says so."""
         try:
             if not self._calls:
                 raise OSError(0, f"the system calls of {os.uname().machine} are not known")
@@ -101,12 +95,12 @@ class RefusalTracer:
         self._save()
 
     def resume(self, thread: int, status: int) -> None:
-        """Resume a thread that has stopped, after looking at the system call it stopped at.
+        """Resume a stopped thread, after inspecting the system call at which it stopped.
 
         Parameters
         ----------
         thread, status : int
-            The number and the status of the thread from waitpid(2).
+            Number and status of the thread from waitpid(2).
         """
         stop_signal = os.WSTOPSIG(status)
         event = status >> 16
@@ -115,7 +109,7 @@ class RefusalTracer:
         # ptrace(2): a thread stops for a system call, for a stop of its whole group (it must then
         # stay stopped: LISTEN), for another event, or for a signal, which it has to get.
         if stop_signal == _CALL_STOP:
-            self._look_at_call(thread)
+            self._inspect_call(thread)
         elif event == _STOP_EVENT and stop_signal in _HALTING:
             request = _LISTEN
         elif not event:
@@ -129,10 +123,10 @@ class RefusalTracer:
         if self._libc.ptrace(request, thread, address, data) < 0:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
-    def _look_at_call(self, thread: int) -> None:
-        """Remember the system call that a thread enters; at its return, count it if it was refused.
+    def _inspect_call(self, thread: int) -> None:
+        """Record the system call that a thread enters; at its return, count it if it was refused.
 
-        Arguments are known only at the entry, and the result only at the exit.
+        The arguments are known only at the entry, and the result only at the exit.
         """
         try:
             self._ptrace(_GET_CALL, thread, len(self._buffer), ctypes.addressof(self._buffer))
@@ -149,24 +143,14 @@ class RefusalTracer:
                 self._count(thread, call, arguments)
 
     def _count(self, thread: int, call: SystemCall, arguments: list[int]) -> None:
-        """Count a refused call, and describe the first one of its kind.
-
-        Parameters
-        ----------
-        thread : int
-            The number of the thread that made the call.
-        call : SystemCall
-            The system call that was refused.
-        arguments : list of int
-            The arguments of the call.
-        """
+        """Count a refused call, and describe the first one of its kind."""
         count, first_description = self._refused.get(call.kind, (0, ""))
         description = first_description or self._description(thread, call, arguments)
         self._refused[call.kind] = (count + 1, description)
         self._save()
 
     def _description(self, thread: int, call: SystemCall, arguments: list[int]) -> str:
-        """Return a text with the target of a call and its name; arguments as for `_count`."""
+        """Return the target and the name of a call with these arguments, for users."""
         target = arguments[call.argument]
         if call.kind == "others":
             return call.name
@@ -184,16 +168,9 @@ class RefusalTracer:
         return f"process {ctypes.c_int(target).value} by {call.name}"
 
     def _path(self, thread: int, folder: int, address: int) -> str:
-        """Return the absolute path that a thread has passed to a system call.
+        """Return the absolute path at an address in a thread's memory.
 
-        Parameters
-        ----------
-        thread : int
-            The number of the thread.
-        folder : int
-            The file descriptor of the folder in which a relative path begins, or `_WORKING_FOLDER`.
-        address : int
-            The address of the path in the thread's memory.
+        A relative path begins in the folder of a file descriptor, or in `_WORKING_FOLDER`.
         """
         text, *_ = self._memory(thread, address, _LONGEST_PATH).split(b"\0")
         path = os.fsdecode(text)
@@ -204,15 +181,7 @@ class RefusalTracer:
         return path.encode("utf-8", "replace").decode()
 
     def _memory(self, thread: int, address: int, length: int) -> bytes:
-        """Return bytes of a thread's memory, or fewer if they cannot be read.
-
-        Parameters
-        ----------
-        thread : int
-            The number of the thread.
-        address, length : int
-            The address of the bytes and their number.
-        """
+        """Return bytes at an address of a thread's memory, or fewer if they cannot be read."""
         try:
             memory = os.open(f"/proc/{thread}/mem", os.O_RDONLY | os.O_CLOEXEC)
         except OSError:

@@ -1,9 +1,9 @@
-"""What the sandbox refuses an FMU while it runs: which files, sockets, processes and other things.
+"""Counts what the sandbox refuses an FMU: files, sockets, processes and other things.
 
-The supervisor traces the worker and everything that the FMU starts, reads what each system call
-returns, and counts those that the sandbox lets fail. So the system itself says what is refused, and
-no rule of the sandbox is written down twice. Tracing makes every system call slower: `fmu check`
-does so in one run, missions never. This module is the twin's side of it.
+The supervisor traces the worker and everything that the FMU starts, inspects the result of each
+system call, and counts those that the sandbox made fail. The kernel itself reports what it refuses,
+so no rule of the sandbox is repeated here. Tracing makes every system call slower: `fmu check` does
+so in one run, missions never. This module is the twin's side of it.
 """
 
 import json
@@ -27,7 +27,7 @@ _report: ContextVar[IO[bytes] | None] = ContextVar("report", default=None)
 
 
 class RefusalRecord(TypedDict, total=False):
-    """What the supervisor of a worker writes; both keys are missing if no worker was started.
+    """The supervisor's record; both keys are missing if no worker was started.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class RefusalReport:
     Parameters
     ----------
     file : binary file
-        File to which the supervisors of the workers write them.
+        File to which the supervisors write their records.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -99,7 +99,7 @@ class RefusalReport:
 
 @contextmanager
 def watch_for_refusals() -> Iterator[RefusalReport]:
-    """Return a context that counts refusals of the workers that are started in it, one by one.
+    """Count the refusals of the workers that are started in this context, one after the other.
 
     The report is complete when the workers have ended.
     """

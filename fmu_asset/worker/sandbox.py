@@ -1,8 +1,8 @@
-"""The sandbox of an FMU: its own folder, Python and the system's libraries, and no socket.
+"""The sandbox of an FMU: it sees its own folder, Python and the system's libraries, no socket.
 
-FMUs are native code with the rights of their user. Two restrictions that any process may put on
-itself, and that all its children inherit, take rights away: Landlock (landlock(7)) those to files,
-programs, TCP ports and signals, and a filter of system calls those that Landlock leaves.
+FMUs are native code with the permissions of their user. Two restrictions, which any process may
+impose on itself and all its children inherit, take permissions away: Landlock (landlock(7)) those
+for files, programs, TCP ports and signals; a filter of system calls those that Landlock leaves.
 """
 
 import os
@@ -127,12 +127,10 @@ def landlock_version() -> int:
 
 
 def confine(grants: Grants, scratch_folder: str, fmu_folder: str) -> bool:
-    """Take from this process, irrevocably, all rights that an FMU does not need.
+    """Irrevocably take from this process all rights that an FMU does not need.
 
     Parameters
     ----------
-    grants : Grants
-        The rights that this FMU keeps in addition to those of every FMU.
     scratch_folder : str
         The only folder in which the FMU may always write: the worker's scratch folder.
     fmu_folder : str
@@ -141,7 +139,7 @@ def confine(grants: Grants, scratch_folder: str, fmu_folder: str) -> bool:
     Returns
     -------
     bool
-        Whether the process is confined. It is not if the kernel has no Landlock.
+        False if the kernel has no Landlock, so that nothing was changed.
 
     Raises
     ------
@@ -175,15 +173,9 @@ def confine(grants: Grants, scratch_folder: str, fmu_folder: str) -> bool:
 
 
 def _ruleset(version: int, all_rights: int) -> int:
-    """Return the file descriptor of a set of rules that so far grants nothing.
+    """Return the file descriptor of a set of rules that withdraws all rights and grants none.
 
-    Parameters
-    ----------
-    version : int
-        The version of the kernel's Landlock.
-    all_rights : int
-        The mask of all rights to files that this version knows; all of them are withdrawn unless a
-        later rule grants them for a path.
+    `all_rights` is the mask of all rights to files that this version of Landlock knows.
     """
     # TCP ports are controlled from version 4; abstract sockets and signals from version 6
     network = _BIND_TCP | _CONNECT_TCP if version > 3 else 0
@@ -195,17 +187,7 @@ def _ruleset(version: int, all_rights: int) -> int:
 def _grant_paths(
     rules: int, grants: Grants, scratch_folder: str, fmu_folder: str, all_rights: int
 ) -> None:
-    """Add rules that grant rights to files and folders.
-
-    Parameters
-    ----------
-    rules : int
-        The file descriptor of the set of rules.
-    grants, scratch_folder, fmu_folder
-        As in `confine`.
-    all_rights : int
-        The mask of all rights to files that the kernel's Landlock knows.
-    """
+    """Add rules that grant an FMU its rights to files and folders; arguments as for `confine`."""
     programs = _EXECUTE if grants.programs else 0
     read_rights = (_READ | programs) & all_rights
     write_rights = (all_rights & ~_EXECUTE | programs) & all_rights
@@ -216,16 +198,10 @@ def _grant_paths(
 
 
 def _allow(rules: int, paths: Iterable[str], rights: int) -> None:
-    """Add rules that grant rights to the paths that exist.
+    """Add rules that grant a mask of rights to the paths that exist.
 
-    Parameters
-    ----------
-    rules : int
-        The file descriptor of the set of rules.
-    paths : iterable of str
-        Files and folders; a folder stands for everything in it.
-    rights : int
-        The mask of rights. Those that only folders can have are left out for a file.
+    A folder stands for everything in it. For a file, rights that only folders can have are left
+    out.
     """
     for path in filter(os.path.exists, paths):
         descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
@@ -236,14 +212,9 @@ def _allow(rules: int, paths: Iterable[str], rights: int) -> None:
 
 
 def missing_path(grants: Grants, fmu_folder: str) -> str:
-    """Return the first granted path that does not exist, or an empty text if all exist.
+    """Return the first granted path that does not exist; an empty text if all exist.
 
-    Parameters
-    ----------
-    grants : Grants
-        The grants of the binding.
-    fmu_folder : str
-        The folder of the FMU, to which relative paths refer.
+    Relative paths start at the FMU's folder.
     """
     for path in _located(grants.read + grants.write, fmu_folder):
         if not os.path.exists(path):  # noqa: PTH110

@@ -1,4 +1,4 @@
-"""The worker's side: it makes the calls that the twin asks for, and answers.
+"""The worker's side: it executes the calls that the twin sends, and answers them.
 
 Of the project it imports `errors`, `instances` and this package only.
 """
@@ -41,26 +41,26 @@ class _AuditEvent(NamedTuple):
     arguments: tuple[object, ...]
 
 
-_REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
+_ACCESSES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
 """Beginnings of the names of audit events for accesses to files, sockets and other processes."""
-_last_reaches: list[_AuditEvent] = []
+_last_accesses: list[_AuditEvent] = []
 """The last such event since the last question; empty if there was none."""
 
 
-def _record_reach(event: str, arguments: tuple[object, ...]) -> None:
+def _record_access(event: str, arguments: tuple[object, ...]) -> None:
     """Record an audit event if it is an access to files, sockets or other processes.
 
     This is an audit hook, which Python calls at every event.
     """
     # the sandbox does not restrict os.chdir, and our own code calls it
-    if event.startswith(_REACHES) and event != "os.chdir":
-        _last_reaches[:] = [_AuditEvent(event, arguments)]
+    if event.startswith(_ACCESSES) and event != "os.chdir":
+        _last_accesses[:] = [_AuditEvent(event, arguments)]
 
 
 def _sandbox_hint() -> str:
-    """Return a sentence on what the sandbox has refused; it quotes Python's last access."""
+    """Return a sentence on what the sandbox has refused, with Python's last access."""
     attempt = ""
-    for event in _last_reaches:
+    for event in _last_accesses:
         argument_texts = []
         for argument in event.arguments:
             if isinstance(argument, str | bytes | list | tuple):
@@ -78,14 +78,14 @@ def _sandbox_hint() -> str:
 
 
 def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
-    """Answer the twin's questions until it asks for the end or closes its pipe; end this process.
+    """Answer the twin's questions until it asks for the end or closes its pipe; then exit.
 
     Parameters
     ----------
     incoming, outgoing : int
         File descriptors of the pipes.
     confined : bool
-        Whether this process is in a sandbox, so that the sandbox may cause a failure.
+        Whether this process is in a sandbox, which may then be the cause of a failure.
     """
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -106,11 +106,11 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
         sys.stderr.flush()
         os._exit(Exit.OWN_FAILURE)
     # Without the interpreter's shutdown, which some libraries do not survive.
-    os._exit(0 if was_asked_to_end else Exit.DESERTED)
+    os._exit(0 if was_asked_to_end else Exit.ORPHANED)
 
 
 def _limit_file_size() -> None:
-    """Limit the size of files, so that the system ends an FMU that fills the disk."""
+    """Limit the size of files, so that the system kills an FMU that fills the disk."""
     import resource
 
     _, hard_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -123,14 +123,10 @@ def _limit_file_size() -> None:
 
 
 class _Call(NamedTuple):
-    """A call that the twin asks for.
+    """A method call from the twin: name, request and arguments.
 
     Attributes
     ----------
-    name : str
-        Name of the method.
-    request : bytes
-        The request block.
     arguments : tuple
         Arguments of the method.
     """
@@ -141,19 +137,12 @@ class _Call(NamedTuple):
 
 
 class _Server:
-    """Answers the questions of the twin.
-
-    Parameters
-    ----------
-    incoming, outgoing : int
-        File descriptors of the pipes.
-    confined : bool
-        Whether this process is in a sandbox.
+    """Answers the questions of the twin; file descriptors of the pipes as for `serve`.
 
     Attributes
     ----------
     instance : FmuInstance or None
-        The instance, once it has been opened.
+        None until it has been opened.
     """
 
     def __init__(self, incoming: int, outgoing: int, *, confined: bool) -> None:
@@ -161,7 +150,7 @@ class _Server:
         self._outgoing = outgoing
         self._confined = confined
         if confined:
-            sys.addaudithook(_record_reach)
+            sys.addaudithook(_record_access)
         self.instance: FmuInstance | None = None
         self._request = memoryview(b"")
         self._reply = memoryview(b"")
@@ -172,12 +161,9 @@ class _Server:
         self._errno = ctypes.c_int.from_address(_locate_errno())
 
     def answer_questions(self) -> bool:
-        """Answer questions until the last one.
+        """Answer questions until the last one; return whether the twin asked for the end.
 
-        Returns
-        -------
-        bool
-            Whether the twin asked for the end; otherwise its pipe was closed.
+        If it did not, its pipe was closed.
         """
         header = memoryview(bytearray(HEADER.size))
         poll = select.poll()
@@ -204,15 +190,7 @@ class _Server:
         return False
 
     def _answer(self, kind: Answer, payload: bytes | memoryview) -> None:
-        """Send an answer to the present question.
-
-        Parameters
-        ----------
-        kind : Answer
-            The kind of the answer.
-        payload : bytes-like
-            The content of the answer.
-        """
+        """Send an answer to the present question."""
         if os.getpid() != self._process:
             os._exit(0)  # this is a copy of the worker that the FMU has made
         has_log = False
@@ -222,7 +200,7 @@ class _Server:
         send(self._outgoing, self._answer_header, payload)
 
     def _answer_failure(self, error: FmuError) -> None:
-        """Send an error as the answer; if the sandbox may have caused it, the message says so."""
+        """Send an error as the answer, with a hint if the sandbox may have caused it."""
         sentence = error.sentence
         is_refused = self._errno.value == errno.EACCES or "ermission denied" in str(error)
         if self._confined and is_refused:
@@ -238,9 +216,9 @@ class _Server:
         self._answer(Answer.FAILURE, payload)
 
     def _result_of(self, call: _Call) -> bytes | memoryview:
-        """Make a call that the twin asks for, and return its result as bytes."""
+        """Execute a call, and return its result as bytes."""
         self._errno.value = 0
-        _last_reaches.clear()
+        _last_accesses.clear()
         if call.name == "open":
             self._open(*call.arguments)
         instance = self.instance
@@ -270,15 +248,7 @@ class _Server:
         self._reply = memoryview(self.instance.reply).cast("B")
 
     def _run(self, instance: FmuInstance, requests: Float) -> None:
-        """Make many steps, and send their replies in parts while they are made.
-
-        Parameters
-        ----------
-        instance : FmuInstance
-            The instance.
-        requests : (N, 2 + n_inputs) array
-            The request block of each step.
-        """
+        """Make many steps, one for each request, and send their replies in parts meanwhile."""
         replies = np.empty((len(requests), len(instance.reply)))
         sent = 0
 

@@ -1,12 +1,12 @@
-"""The supervisor: a process between twin and worker that clears up when one of them is gone.
+"""The supervisor: a process between twin and worker that cleans up when one of them ends.
 
-The worker is a fork of the supervisor, made before any library is loaded, and nothing of the FMU
-ever runs in the supervisor: neither an endless loop nor an FMU in Python that holds the interpreter
-can stop it. The system hands it all orphans of the worker (`PR_SET_CHILD_SUBREAPER`), so that
-processes that the FMU has started are ended in whatever process group or session they hide.
+The worker is a fork of the supervisor, made before any library is loaded. Nothing of the FMU ever
+runs in the supervisor, so neither an endless loop nor an FMU in Python that holds the interpreter
+can stop it. The kernel makes it the parent of all orphans of the worker (`PR_SET_CHILD_SUBREAPER`),
+so that processes that the FMU has started are ended whatever their process group or session.
 
-`PR_SET_PDEATHSIG` alone would leave folders and orphans behind, and seen from the twin it goes off
-when the thread that started the worker ends, not the process.
+`PR_SET_PDEATHSIG` alone would leave folders and orphans behind. Set by a child of the twin, it
+would also act when the thread that started the worker ends, and not the process.
 """
 
 import ctypes
@@ -37,14 +37,14 @@ _HANDLED_SIGNALS = (signal.SIGTERM, signal.SIGCHLD)
 
 
 class _Twin(NamedTuple):
-    """The twin as its supervisor sees it.
+    """The twin as its supervisor sees it, by file descriptors.
 
     Attributes
     ----------
     process : int
-        File descriptor of its process.
+        Its process.
     incoming, outgoing : int
-        File descriptors of the two pipes.
+        The two pipes.
     """
 
     process: int
@@ -68,7 +68,7 @@ class _Worker(NamedTuple):
 
 
 def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoReturn:
-    """Start the worker, wait until it or the twin ends, clean up, and end as the worker did.
+    """Start the worker, wait until it or the twin ends, clean up, and exit as the worker did.
 
     At the start, the pipes to the twin are the standard input and output. They are moved to other
     descriptors for the worker, so that what an FMU prints goes to the log.
@@ -77,7 +77,7 @@ def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoRetu
     ----------
     scratch, fmu_folder : str
         The folder of the worker, and that of the extracted FMU. They are removed here only if the
-        twin is dead, which otherwise removes them.
+        twin is dead; otherwise the twin removes them.
     grants : str
         The `Grants` of the sandbox as JSON; empty for no sandbox.
     report : str
@@ -106,7 +106,7 @@ def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoRetu
     os.write(twin.outgoing, WORKER_NUMBER.pack(worker.number))
     os.close(twin.outgoing)
     # wait for its end
-    is_deserted = _wait_for_end(worker, twin, tracer, statuses)
+    twin_has_left = _wait_for_end(worker, twin, tracer, statuses)
     # From here on children are reaped only by the calls below, so that the number of an ended
     # process is not given to another one unnoticed.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -117,14 +117,19 @@ def supervise(scratch: str, fmu_folder: str, grants: str, report: str) -> NoRetu
     # clear up
     _end_descendants()
     # the pipes of a twin are closed a moment before it is dead
-    if is_deserted and not was_asked_to_end and worker_status != 0 and has_ended(twin.process, 1.0):
+    if (
+        twin_has_left
+        and not was_asked_to_end
+        and worker_status != 0
+        and has_ended(twin.process, 1.0)
+    ):
         remove_folder(scratch)
         remove_folder(fmu_folder)
     _end_as(worker_status)
 
 
 def _move_pipes_of_twin() -> _Twin:
-    """Move the twin's pipes away from the standard input and output; return twin and pipes."""
+    """Move the twin's pipes away from the standard input and output."""
     parent = os.getppid()
     # The end of the twin is seen at its process. A pipe does not show it for certain, since an FMU
     # can keep the other side of the pipe open.
@@ -138,7 +143,7 @@ def _move_pipes_of_twin() -> _Twin:
 
 
 def _limit_this_process() -> None:
-    """Write no core files, and become the parent of all orphans among the descendants."""
+    """Disable core files, and become the parent of all orphaned descendants."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -184,14 +189,10 @@ def _work(twin: _Twin, scratch: str, fmu_folder: str, grants: str) -> NoReturn:
 
 
 def _end_as(status: int) -> NoReturn:
-    """End this process as the worker ended: by the same signal or with the same exit status.
+    """Exit as the worker did: by the same signal or with the same exit status.
 
-    The twin sees only this process, and reports how the worker died.
-
-    Parameters
-    ----------
-    status : int
-        The status of the worker from waitpid(2).
+    The twin sees only this process, and reports how the worker died. `status` is that of
+    waitpid(2).
     """
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
@@ -202,15 +203,7 @@ def _end_as(status: int) -> NoReturn:
 
 
 def _tracer_of(worker: int, report: str) -> "RefusalTracer | None":
-    """Return the tracer that counts the refusals of a worker; None if they are not counted.
-
-    Parameters
-    ----------
-    worker : int
-        Process number of the worker.
-    report : str
-        Number of the file descriptor for the counts, or an empty text.
-    """
+    """Return the tracer that counts the refused calls of a worker; None without a report."""
     if not report:
         return None
     from .refusal_tracer import RefusalTracer
@@ -227,11 +220,11 @@ def _kill(process: int) -> None:
 
 
 def _do_nothing(*_: object) -> None:
-    """Handle a signal by doing nothing: the wakeup descriptor shows that it came."""
+    """Ignore a signal; the wakeup descriptor shows that it was received."""
 
 
 def _reap_children(statuses: dict[int, int]) -> None:
-    """Reap all children that have ended, and keep their exit statuses by process number."""
+    """Reap all children that have ended, and record their statuses by process number."""
     with suppress(ChildProcessError):
         while True:
             process, status = os.waitpid(-1, os.WNOHANG)
@@ -243,17 +236,7 @@ def _reap_children(statuses: dict[int, int]) -> None:
 def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
     """Resume threads that have stopped at a system call, and reap ended processes.
 
-    Parameters
-    ----------
-    tracer : RefusalTracer
-        The tracer, which inspects the calls.
-    statuses : dict of int to int
-        Exit statuses by process number; extended in place.
-
-    Returns
-    -------
-    bool
-        Whether more of them may be waiting, since the limit of stops was reached.
+    Return whether more of them may be waiting, because the limit of stops was reached.
     """
     with suppress(ChildProcessError):
         for _ in range(_MOST_STOPS):
@@ -271,22 +254,12 @@ def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
 def _wait_for_end(
     worker: _Worker, twin: _Twin, tracer: "RefusalTracer | None", statuses: dict[int, int]
 ) -> bool:
-    """Wait for the end of the worker; return whether the twin had ended before the worker.
+    """Wait for the end of the worker; return whether the twin had left before.
 
-    The twin has left it if it has ended or closed its pipe. The worker is then killed unless it
-    ends soon. A traced worker stops at each of its system calls until it is resumed here. The
-    handler of SIGCHLD must not do so, since handlers can interrupt each other.
-
-    Parameters
-    ----------
-    worker : _Worker
-        The worker.
-    twin : _Twin
-        The process of the twin, which started this one.
-    tracer : RefusalTracer or None
-        Counts the refusals of the worker.
-    statuses : dict of int to int
-        Exit statuses by process number; extended in place.
+    The twin has left if it has ended or closed its pipe. The worker is then killed unless it ends
+    soon. A traced worker stops at each of its system calls until it is resumed here; the handler of
+    SIGCHLD must not do so, since handlers can interrupt each other. The statuses of reaped
+    processes are added to `statuses`.
     """
     wakeup_read_end, wakeup_write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wakeup_write_end, warn_on_full_buffer=False)

@@ -14,12 +14,10 @@ class SystemCall(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        Name of the call, as of its manual page.
     kind : RefusalKind
-        Kind of thing that it reaches for.
+        Kind of its target.
     argument : int
-        Number of the argument that names the thing: the address of a path or of a socket address,
+        Number of the argument that names its target: the address of a path or of a socket address,
         or a number.
     """
 

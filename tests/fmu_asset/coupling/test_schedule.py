@@ -92,7 +92,7 @@ def assert_held(plan: Schedule, connections: list[Connection]) -> None:
     assert {*plan.held} == against_order
     if orders_that_keep(pairs_of(connections)):
         assert not plan.held
-        assert not plan.circles
+        assert not plan.cycles
 
 
 def test_a_long_chain_is_put_in_order_and_what_was_in_order_stays():

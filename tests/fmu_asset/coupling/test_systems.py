@@ -88,7 +88,7 @@ def test_a_delay_of_an_end_without_a_connection_is_refused(foreign_fmu):
         coupled("loop", foreign_fmu).delayed(["left.u2"])
 
 
-def test_a_circle_without_an_algebraic_loop_holds_one_connection(foreign_fmu):
+def test_a_cycle_without_an_algebraic_loop_holds_one_connection(foreign_fmu):
     structure = coupled("circle", foreign_fmu)
 
     with CoupledAsset(structure, watch("left.y2"), isolated=False) as asset:
@@ -212,11 +212,11 @@ def test_a_state_of_a_system_with_other_connections_is_refused(ours):
 # ---------------------------------------------------------------------- inputs in straight lines
 
 END = 2.0
-# x1' = -x1 - 2 x2, x2' = 1.5 x1 - x2: a circle.
+# x1' = -x1 - 2 x2, x2' = 1.5 x1 - x2: a cycle.
 EXACT = expm(np.array([[-1.0, -2.0], [1.5, -1.0]]) * END) @ [1.0, 0.0]
 
 
-def circle(
+def cycle(
     fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps: int = 1
 ) -> SystemStructure:
     """Return two followers x' = u - x that feed each other."""
@@ -228,12 +228,12 @@ def circle(
         Connection(Endpoint("first", "x"), Endpoint("second", "u"), factor=1.5),
         Connection(Endpoint("second", "x"), Endpoint("first", "u"), factor=-2.0, delayed=delayed),
     )
-    return SystemStructure("circle", (first, second), (), connections)
+    return SystemStructure("cycle", (first, second), (), connections)
 
 
 @dataclass(frozen=True)
-class CircleErrors:
-    """Errors of a circle in 20 and in 40 steps, with held inputs and with linear ones."""
+class CycleErrors:
+    """Errors of a cycle in 20 and in 40 steps, with held inputs and with linear ones."""
 
     held_20: float
     held_40: float
@@ -241,7 +241,7 @@ class CircleErrors:
     linear_40: float
 
 
-CIRCLES = {
+CYCLES = {
     "plain": ({}, {}),
     "model exchange": ({"exchange": True}, {}),
     "substeps": ({"substeps": 3}, {}),
@@ -250,13 +250,13 @@ CIRCLES = {
     "Jacobi with substeps of model exchange": ({"exchange": True, "substeps": 3}, JACOBI),
     "iterations": ({}, {"iterations": 50}),
 }
-"""Options of the circle and of its asset."""
+"""Options of the cycle and of its asset."""
 
 
-@pytest.fixture(scope="module", params=CIRCLES)
-def circle_errors(request, foreign_fmu):
-    circle_options, asset_options = CIRCLES[request.param]
-    structure = circle(foreign_fmu("follow2"), **circle_options)
+@pytest.fixture(scope="module", params=CYCLES)
+def cycle_errors(request, foreign_fmu):
+    cycle_options, asset_options = CYCLES[request.param]
+    structure = cycle(foreign_fmu("follow2"), **cycle_options)
 
     def error_of(interpolation: str, steps: int) -> float:
         binding = watch(
@@ -270,7 +270,7 @@ def circle_errors(request, foreign_fmu):
             last = asset.simulate(steps=steps).values[-1]
         return float(np.abs(last - EXACT).max())
 
-    return CircleErrors(
+    return CycleErrors(
         held_20=error_of("zero-order", 20),
         held_40=error_of("zero-order", 40),
         linear_20=error_of("linear", 20),
@@ -278,13 +278,13 @@ def circle_errors(request, foreign_fmu):
     )
 
 
-def test_the_error_of_held_inputs_falls_with_the_step(circle_errors):
-    assert 1.7 < circle_errors.held_20 / circle_errors.held_40 < 2.4
+def test_the_error_of_held_inputs_falls_with_the_step(cycle_errors):
+    assert 1.7 < cycle_errors.held_20 / cycle_errors.held_40 < 2.4
 
 
-def test_the_error_of_linear_inputs_falls_with_the_square_of_the_step(circle_errors):
-    assert 3.3 < circle_errors.linear_20 / circle_errors.linear_40 < 4.8
-    assert circle_errors.linear_40 < 0.3 * circle_errors.held_40
+def test_the_error_of_linear_inputs_falls_with_the_square_of_the_step(cycle_errors):
+    assert 3.3 < cycle_errors.linear_20 / cycle_errors.linear_40 < 4.8
+    assert cycle_errors.linear_40 < 0.3 * cycle_errors.held_40
 
 
 # ---------------------------------------------------------------------- wiring
