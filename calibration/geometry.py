@@ -201,8 +201,6 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     ----------
     design : WingDesign
         The design before the measurement.
-    lengths : Lengths
-        The measured lengths.
 
     Raises
     ------

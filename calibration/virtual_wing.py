@@ -113,8 +113,6 @@ class VirtualWing:
 
     Attributes
     ----------
-    model : ReducedModel
-        The reduced model of the wing.
     truth : DigitalState
         The true state of the wing; the geometry is that of the model.
     frequency_error : (float, float)
@@ -221,13 +219,6 @@ def measure_load_test(bench: TestBench, seed: Seed) -> LoadDisplacementData:
     """Return the readings of a load test as in the paper: two runs of 250 to 1000 g near the tip.
 
     The true load is the nominal one; load and displacement are both read with the paper's errors.
-
-    Parameters
-    ----------
-    bench : TestBench
-        The wing on the test bench, with its true parameters.
-    seed : int or SeedSequence
-        The seed of the reading errors.
     """
     paper = published_measurements()
     generator = np.random.default_rng(child_seed(seed, _LOAD_TEST))
@@ -252,10 +243,6 @@ def measure_ring_down(
 
     Parameters
     ----------
-    bench : TestBench
-        The wing on the test bench, with its true parameters.
-    seed : int or SeedSequence
-        The seed of noise and releases.
     trials : int
         The number of records.
     initial_tip_displacement : float
@@ -308,8 +295,6 @@ def measure_lengths(
     ----------
     geometry : Geometry
         The true lengths [m].
-    seed : int or SeedSequence
-        The seed of the reading errors.
     designed : Geometry, optional
         The designed lengths [m]; the published ones by default.
     """
@@ -331,8 +316,6 @@ def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) 
     ----------
     truth : DigitalState
         The true masses.
-    seed : int or SeedSequence
-        The seed of the reading error.
     standard_deviation : float
         The standard deviation of the weighing [kg].
     """

@@ -435,8 +435,6 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
 
     Parameters
     ----------
-    fit : DampedCosineFit
-        The fitted waves of the record.
     number : int
         The number of the damped cosine.
 

@@ -132,8 +132,6 @@ def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name
 
     Parameters
     ----------
-    record : RingDownRecord
-        The times and signals of one recording.
     signal : (N,) array
         The signal, or its lowest or highest values.
     extreme : float
@@ -233,8 +231,6 @@ class _Layout(NamedTuple):
 
     Attributes
     ----------
-    header : sequence of str
-        The names of the columns.
     separator : str or None
         The character between cells; None for blanks.
     rows : str

@@ -77,8 +77,6 @@ def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord
 
     Parameters
     ----------
-    record : RingDownRecord
-        The times and signals of one recording.
     start : float
         The instant after which the record begins [s].
 
@@ -202,8 +200,6 @@ def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
 
     Parameters
     ----------
-    record : RingDownRecord
-        The times and signals of one recording.
     decay : float
         The decay rate lambda of the factor exp(-lambda t) on the record [1/s].
     """
@@ -346,8 +342,6 @@ def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
 
     Parameters
     ----------
-    trials : Fits
-        The ring-down trials with their fitted modes.
     name : {"frequency", "damping_ratio"}
         The natural frequency [Hz] or the damping ratio [1].
     mode : {0, 1}

@@ -208,8 +208,6 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
 
     Parameters
     ----------
-    trials : Fits
-        The ring-down trials with their fitted modes.
     frequency, ratio : float
         The mean frequency [Hz] and damping ratio [1] of the second mode in these fits.
     """
@@ -250,8 +248,6 @@ def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
 
     Parameters
     ----------
-    fit : RingDownFit
-        The record with its two fitted modes.
     delay : float
         The delay of the start [s].
 

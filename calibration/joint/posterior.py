@@ -80,8 +80,6 @@ def infer(
         Compares all readings with the model at states (N, P) within their ranges.
     seed : int or SeedSequence
         The same seed gives the same samples.
-    count : int
-        The number of samples.
 
     Returns
     -------
@@ -200,8 +198,6 @@ class _WhitenedPosterior:
             The shape matrix of the proposal.
         size : int
             The number of draws N.
-        generator : Generator
-            The source of random numbers.
         """
         proposal = multivariate_t(mean, covariance, _DEGREES_OF_FREEDOM)
         points = proposal.rvs(size, generator).reshape(size, -1)
@@ -237,8 +233,6 @@ def joint_posterior(
     ----------
     wing : WingTable
         The wing, by `tabulate_wing`.
-    static : LoadDisplacementData
-        The load test.
     readings : sequence of FigureReading
         The weighed mass and the readings of both modes; others are ignored.
     priors : tuple of ParameterPrior, optional
@@ -247,8 +241,6 @@ def joint_posterior(
         The relative standard deviations tau_1, tau_2 of the model's frequencies about the wing's.
     seed : int
         The same seed gives the same samples.
-    count : int
-        The number of samples.
 
     Returns
     -------
@@ -301,8 +293,6 @@ def _comparison_with_wing(
     ----------
     wing : WingTable
         The outputs of the wing at each state.
-    static : LoadDisplacementData
-        The pairs of load and displacement of the load test.
     readings : sequence of FigureReading
         The weighed mass, and the frequencies and damping ratios of the modes.
     model_error : (float, float)

@@ -156,8 +156,6 @@ class WingTable:
     coefficients : (I, J, K, 2) array
         The coefficients of products of Chebyshev polynomials in e, servo mass and pitot mass, each
         scaled to [-1, 1]; I, J and K are the numbers of polynomials in each of them.
-    stiffness : StiffnessCurve
-        The tip stiffness k(e).
     error : float
         The largest relative error of a frequency at points between the nodes [1].
     """
@@ -336,8 +334,6 @@ def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced model of the wing.
     limits : (3, 2) array
         The ranges of e [1], servo mass and pitot mass [kg].
     unit_points : (N, 3) array

@@ -156,8 +156,6 @@ def table_1(
 
     Parameters
     ----------
-    result : Calibration
-        The calibration that tailors the twin.
     procedure : Calibration
         The calibration of the same model by the paper's procedure, to compare with.
     particle : ParticlePosterior
@@ -330,8 +328,6 @@ def _draw_densities(
 
     Parameters
     ----------
-    axes : Axes
-        The panel to draw in.
     prior, exact, particle : ScalarPosterior
         The densities [SI].
     scale : float

@@ -149,10 +149,6 @@ def particle_filter(
 
     Parameters
     ----------
-    data : LoadDisplacementData
-        The measured pairs of load and displacement.
-    seed : int or SeedSequence
-        The seed of all draws.
     curve : StiffnessCurve
         The tip stiffness k(e) [N/m] as a function of the factor e.
     prior : GaussianPrior, optional
@@ -236,18 +232,12 @@ def _pair_density(
 
     Parameters
     ----------
-    data : LoadDisplacementData
-        The measured pairs of load and displacement.
     pair : int
         The number of the pair.
     curve : StiffnessCurve
         The tip stiffness k(e) [N/m] as a function of the factor e.
     window : (float, float)
         The range of e in which the density is needed.
-    generator : Generator
-        The source of random numbers.
-    count : int
-        The number of samples.
     """
     load_error = data.load_standard_deviation * generator.standard_normal(count)
     displacement_error = data.displacement_standard_deviation * generator.standard_normal(count)
@@ -278,8 +268,6 @@ class StaticCalibration:
 
     Attributes
     ----------
-    data : LoadDisplacementData
-        The measured pairs of load and displacement.
     curve : StiffnessCurve
         The tip stiffness k(e) [N/m] as a function of the factor e.
     prior : GaussianPrior

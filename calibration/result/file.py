@@ -124,10 +124,6 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
 
     Parameters
     ----------
-    folder : Path
-        The folder of the new calibration.
-    asset : str
-        The name of the asset.
     wing : bool
         Whether the new calibration is that of a wing from its laboratory.
 
@@ -212,8 +208,6 @@ def _tree(path: Path, content: bytes) -> xr.DataTree:
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
     content : bytes
         The hash of its content; a changed file is read again.
     """

@@ -43,8 +43,6 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
 
     Parameters
     ----------
-    result : Calibration
-        The calibration with its samples and readings.
     folder : Path
         The folder that gets the files; it is made if it is missing.
 
@@ -75,8 +73,6 @@ def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
 
     Parameters
     ----------
-    folder : Path
-        The folder of the calibration.
     new_files : sequence of Path
         The paths of the new files, relative to the folder.
     """
@@ -93,10 +89,6 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
 
     Parameters
     ----------
-    result : Calibration
-        The calibration with its samples and readings.
-    folder : Path
-        The path of the folder.
     report : bool
         Whether to write a page with its figures, too.
 
@@ -123,8 +115,6 @@ def begun_page(result: Calibration, folder: Path) -> Page:
 
     Parameters
     ----------
-    result : Calibration
-        The calibration with its samples and readings.
     folder : Path
         The folder of the page, in which the figures are written.
     """

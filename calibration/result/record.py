@@ -127,10 +127,6 @@ class FigureReading:
 
     Attributes
     ----------
-    name : str
-        The name of the figure.
-    experiment : str
-        The name of the experiment.
     value, deviation : float
         The measured value and its standard deviation [unit of the figure].
     """
@@ -147,8 +143,6 @@ class Calibration:
 
     Attributes
     ----------
-    asset : str
-        The name of the asset that was measured.
     model, model_hash : str
         The name of the model, and the SHA-256 of all its files.
     procedure : Procedure
@@ -166,8 +160,6 @@ class Calibration:
         The residuals before and after the calibration.
     source : str
         The name of the campaign, or the origin of the measurements.
-    seed : int
-        The seed of all samples.
     provenance : mapping
         The versions and hashes.
     design_hash : str
@@ -356,8 +348,6 @@ class Calibration:
 
         Parameters
         ----------
-        experiment : str
-            The experiment of the readings.
         prior : bool
             Whether the model has the prior means, instead of the posterior means.
         """
@@ -376,8 +366,6 @@ class Calibration:
 
         Parameters
         ----------
-        name : str
-            The name of the figure.
         count : int
             The number of draws, and of strata.
         seed : int or SeedSequence
@@ -465,10 +453,6 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
     ----------
     priors : tuple of ParameterPrior
         The priors of P parameters.
-    count : int
-        The number of samples.
-    seed : int
-        The seed of the random numbers.
 
     Returns
     -------

@@ -18,8 +18,6 @@ class SensorFit:
 
     Attributes
     ----------
-    channel : str
-        The name of the channel.
     kind : str
         "gain" or "zero". A gain is given by its relative error.
     trial : str

@@ -83,8 +83,6 @@ def pair_log_likelihoods(
     ----------
     curve : StiffnessCurve
         The tip stiffness k(e) [N/m] as a function of the factor e.
-    data : LoadDisplacementData
-        The measured pairs of load and displacement.
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}
@@ -279,8 +277,6 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
 
     Parameters
     ----------
-    data : LoadDisplacementData
-        The measured pairs of load and displacement.
     stiffness : float
         The tip stiffness [N/m].
     """

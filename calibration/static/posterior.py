@@ -23,8 +23,6 @@ def stratified(generator: np.random.Generator, count: int) -> Float:
 
     Parameters
     ----------
-    generator : Generator
-        The source of random numbers.
     count : int
         The number of intervals.
 
@@ -45,8 +43,6 @@ def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
 
     Parameters
     ----------
-    seed : int or SeedSequence
-        The common seed.
     purpose : int
         The number of the purpose.
     """
@@ -147,8 +143,6 @@ class ScalarPosterior:
         ----------
         seed : int or SeedSequence
             The same seed gives the same samples, bit for bit.
-        count : int
-            The number of samples.
 
         Returns
         -------

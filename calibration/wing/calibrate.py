@@ -60,8 +60,6 @@ class WingCalibration:
         The calibration by the joint posterior, and by the paper's procedure, step after step.
     procedure : {"joint", "paper"}
         The procedure that is kept.
-    lab : LabData
-        The measurements of the laboratory.
     model : ReducedModel
         The model of the tailored design.
     static, static_published : StaticCalibration
@@ -124,10 +122,6 @@ def calibrate(
         The name of the wing; that of the design by default.
     procedure : {"joint", "paper"}
         The samples to keep: of the joint posterior, or of the paper's steps one after another.
-    seed : int
-        The seed of all samples.
-    progress : Progress, optional
-        Receives reports of the steps.
 
     Raises
     ------
@@ -182,18 +176,12 @@ class _RecordMaker:
 
     Parameters
     ----------
-    asset : str
-        The name of the wing.
     drawn, tailored : WingDesign
         The design as drawn, and with the measured planform.
-    lab : LabData
-        The measurements of the laboratory.
     table : WingTable
         The outputs of the tailored model.
     static : StaticCalibration
         The result of step 2.
-    seed : int
-        The seed of all samples.
     """
 
     def __init__(
@@ -270,8 +258,6 @@ def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[
 
     Parameters
     ----------
-    static : StaticCalibration
-        The load test and the stiffness curve.
     calibrated_factor : float
         The calibrated value of e [1].
     """
@@ -297,15 +283,6 @@ def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[
 
 def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
     """Return samples of the posterior of the three lengths.
-
-    Parameters
-    ----------
-    lengths : Lengths
-        The measured lengths.
-    count : int
-        The number of samples.
-    seed : int
-        The seed of the random numbers.
 
     Returns
     -------

@@ -39,10 +39,6 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
 
     Parameters
     ----------
-    result : Calibration
-        The calibration with its samples and readings.
-    lab : LabData
-        The measurements of the laboratory.
     quality : FitQuality
         The residuals of the load test.
     """

@@ -314,8 +314,6 @@ def _with_ring_downs(
     ----------
     lab : LabData
         The lab data so far. Its first reading is the mass, which is kept; the others are replaced.
-    path : Path
-        The lab folder.
     record_files : sequence of Path
         The files of the ring-downs.
     frequencies_fitted : bool

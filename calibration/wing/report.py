@@ -52,10 +52,6 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
 
     Parameters
     ----------
-    calibration : WingCalibration
-        The calibration of the wing, with its samples.
-    folder : Path
-        The folder of the files.
     report : bool
         Whether to write the report.
 
@@ -96,12 +92,6 @@ def _add_sections(
     ----------
     page : Page
         The page, with the sections that every calibration has.
-    calibration : WingCalibration
-        The calibration of the wing, with its samples.
-    fields : WingFields
-        The displacement fields of the wing on its mesh.
-    folder : Path
-        The folder of the page.
     """
     _add_origins(page, calibration.lab.origins)
     page.add_section("Beside the paper")
@@ -203,10 +193,6 @@ def modes_figure(fields: WingFields, modes: ReducedModes, titles: Sequence[str])
 
     Parameters
     ----------
-    fields : WingFields
-        The bases on the mesh.
-    modes : Modes
-        The modes of the calibrated wing.
     titles : sequence of str
         The title of each mode.
     """
@@ -263,16 +249,12 @@ def _draw_surface(
 
     Parameters
     ----------
-    axes : Axes
-        The panel to draw in.
     points : (N, 3) array
         The positions of the nodes: x aft, y along the span, z upward [m].
     triangles : (T, 3) array
         The nodes of each triangle.
     shade : (N,) array
         The value at each node that its colour shows, from 0 to `largest`.
-    colours : str
-        The name of the colour map.
     largest : float
         The value that the last colour of the map stands for.
     """

@@ -445,8 +445,6 @@ def lowest_eigenpairs(
         The stiffness, or its factors.
     mass : sparse (n, n)
         The mass.
-    count : int
-        The number of modes.
 
     Returns
     -------

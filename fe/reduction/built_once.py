@@ -40,8 +40,6 @@ def built_once(
     load : callable
         Reads the file. It raises `OSError` or `ReducedModelFileError` if the file is missing or
         not usable.
-    build : callable
-        Builds the result.
     keep : callable
         Writes the result to the file. If it raises `FileNotWrittenError`, a warning is logged and
         the result is returned all the same.

@@ -387,8 +387,6 @@ class _Columns:
 
         Parameters
         ----------
-        model : ChangeableModel
-            The reduced model.
         number : int
             Number of the motion of the support.
         gain : float

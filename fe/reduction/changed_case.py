@@ -46,10 +46,6 @@ def case_error(
 
     Parameters
     ----------
-    case : ChangedCase
-        The structure with its change.
-    model : ChangeableModel
-        The reduced model.
     terms, held_terms : ReductionTerms
         Terms of the structure whose supports yield, and of that whose supports are held.
     shapes : (n', M) array

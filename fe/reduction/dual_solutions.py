@@ -117,8 +117,6 @@ def _project_duals(
 
     Parameters
     ----------
-    terms : ReductionTerms
-        The terms of the full model, and its loads and outputs.
     outputs : (n, O) array
         The outputs, whitened.
     directions : (O, n, M) array
@@ -141,8 +139,6 @@ def _project_batch(
 
     Parameters
     ----------
-    terms : ReductionTerms
-        The terms of the full model, and its loads and outputs.
     outputs : (n, b) array
         The outputs, whitened.
     displacements : (n, b, M) array

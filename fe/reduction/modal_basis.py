@@ -50,8 +50,6 @@ def projected_modes(
         The projected mass terms.
     state : ModalState
         The coefficients of both.
-    count : int
-        The number of modes.
 
     Returns
     -------
@@ -71,10 +69,6 @@ def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalRed
 
     Parameters
     ----------
-    terms : ReductionTerms
-        The terms of the full model, and its loads and outputs.
-    count : int
-        The number of modes.
     stage : Stage
         Advances after each sampled state.
 

@@ -63,8 +63,6 @@ def cache_file(kind: str, design_hash: str, settings: object) -> Path:
     ----------
     kind : str
         The kind of record, such as "wing".
-    design_hash : str
-        The hash of the design.
     settings : object
         The settings of the build; their `repr` says all of them.
     """
@@ -283,8 +281,6 @@ def changeable_model(file: Path | str, progress: Progress | None = None) -> Chan
 
     Parameters
     ----------
-    file : Path or str
-        The path of the structure file.
     progress : Progress, optional
         The display of the progress, if the model must be built.
 
@@ -336,8 +332,6 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFie
 
     Parameters
     ----------
-    operators : AffineOperators
-        The full model of the wing.
     reduction : Reduction
         The reduced model of the structure, and the bases.
     """
@@ -377,8 +371,6 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     ----------
     path : str or Path
         The file; an existing one is replaced.
-    wing : WingFields
-        The wing, from `wing_fields`.
     vector : (V,) array
         Values of all that can be chosen, from `ReducedModel.vector`.
 
@@ -420,8 +412,6 @@ def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> N
     ----------
     path : str or Path
         The file; an existing one is replaced.
-    wing : WingFields
-        The wing, from `wing_fields`.
     vector : (V,) array
         Values of all that can be chosen, from `ReducedModel.vector`.
 

@@ -44,8 +44,6 @@ class ModalReduction(NamedTuple):
     ----------
     basis : (n, Nm) array
         The basis vectors on the free unknowns of the full model.
-    fields : ModalFields
-        The modal fields of the reduced model.
     """
 
     basis: FloatArray

@@ -90,13 +90,6 @@ PROBABILITIES = _ChangeProbabilities()
 def reduce_patches(operators: AffineOperators, progress: Progress | None = None) -> PatchArrays:
     """Make the arrays of a wing that can be patched.
 
-    Parameters
-    ----------
-    operators : AffineOperators
-        The finite element operators of the full wing.
-    progress : Progress, optional
-        The display of the progress.
-
     Raises
     ------
     SolutionError
@@ -368,8 +361,6 @@ def _patched_state(
 
     Parameters
     ----------
-    wing : PatchedWing
-        The wing in the working basis.
     fractions : (F,) array
         Numbers from 0 to 1. The first decide which changes the wing has, by `PROBABILITIES`. The
         next are fractions of the ranges of these changes (`_ChangeFractions`), and the last are

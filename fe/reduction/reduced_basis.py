@@ -61,12 +61,8 @@ def reduce_structure(
 
     Parameters
     ----------
-    structure : AffineStructure
-        The full finite element model.
     settings : StructureSettings, optional
         The accuracy that is asked for; by default that of the structure's design.
-    progress : Progress, optional
-        The display of the progress.
 
     Returns
     -------
@@ -199,10 +195,6 @@ def measured_errors(
 
     Parameters
     ----------
-    structure : AffineStructure
-        The full finite element model.
-    model : ReducedModel
-        The reduced model of the structure.
     states : int
         The number of states, uniform in the ranges; each costs a factorisation.
     seed : int

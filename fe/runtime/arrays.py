@@ -91,8 +91,6 @@ def arrays_from_bytes(
 
     Parameters
     ----------
-    content : bytes
-        The archive.
     where : str
         The name of the source, for the error message.
     required : collection of str
@@ -148,8 +146,6 @@ class StoredArrays:
 
     Attributes
     ----------
-    design_hash : str
-        Hash of the design.
     regions : tuple of str
         Names of the K damage regions, 1 to 8, in the order of their stiffness terms.
 
@@ -199,8 +195,6 @@ class StoredArrays:
 
         Parameters
         ----------
-        field : Field
-            The field of the array.
         axes : tuple of str or int
             Names or lengths of the array's axes.
         lengths : dict of str to int

@@ -221,8 +221,6 @@ class ChangeableModel(ReducedModel):
         ----------
         load : (n,) array
             The load per unit of the control.
-        control : str
-            The control.
         patch : iterable of Primitive
             The patch, whose `LoadOffset` and `LoadTilt` of this control act.
         """
@@ -424,12 +422,8 @@ class ChangedStructure:
 
     Parameters
     ----------
-    model : ChangeableModel
-        The structure.
     vector : (V,) array
         Values of its inputs.
-    patch : ModelPatch
-        The primitives that change the structure.
 
     Attributes
     ----------
@@ -437,8 +431,6 @@ class ChangedStructure:
         The coordinates of the model from those of this structure: `Subspace.basis`.
     mass, stiffness : (k, k) array
         The matrices.
-    mode_count : int
-        The number of modes.
 
     Raises
     ------

@@ -95,8 +95,6 @@ class Expression:
 
     Attributes
     ----------
-    text : str
-        The expression as written.
     names : collection of str
         The names that it may use.
     where : str

@@ -153,8 +153,6 @@ def integrate_motion(
         The steps, from `loaded_steps`.
     begin : InitialMotion
         The state at the first boundary.
-    kernel : Kernel
-        The loops, plain or compiled.
     """
     mode_count = len(begin.q)
     memory_is_known = begin.memory is not None

@@ -281,8 +281,6 @@ class PatchedWing(WingRows):
         vector : (V,) array
             Values of all inputs, in the order of `fe.runtime.state.wing_input_names`; those of the
             controls do not matter.
-        patch : ModelPatch
-            The primitive changes of the model.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
@@ -309,12 +307,8 @@ class PatchedStructure:
 
     Parameters
     ----------
-    wing : PatchedWing
-        The wing in its basis for patches.
     stiffness, mass : (n, n) array
         The matrices of the wing in this state and under this patch.
-    patch : ModelPatch
-        The primitive changes of the model.
 
     Attributes
     ----------
@@ -387,8 +381,6 @@ class PatchedStructure:
 
         Parameters
         ----------
-        count : int
-            Number of modes.
         static_shape_rows : (s, n) array, optional
             Loads as rows, whose static shapes the basis of the modes holds as well.
         """

@@ -35,8 +35,6 @@ class ReducedStructure:
 
     Parameters
     ----------
-    model : ReducedModel
-        The reduced model.
     vector : (V,) array
         Values of its inputs.
     """

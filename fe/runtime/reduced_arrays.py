@@ -33,8 +33,6 @@ class ReducedArrays(StoredArrays):
 
     Attributes
     ----------
-    name : str
-        Name of the structure.
     parameters, masses, controls : tuple of str
         Names of these inputs.
     control_units : tuple of str
@@ -254,11 +252,6 @@ class CertifiedSolver:
     """The static solver of a reduced model, on arrays that are laid out for few operations.
 
     There are T stiffness terms, L loads and O outputs in N basis vectors.
-
-    Parameters
-    ----------
-    arrays : ReducedArrays
-        The arrays of the reduced model.
 
     Attributes
     ----------

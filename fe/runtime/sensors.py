@@ -112,8 +112,6 @@ def apply_sensors(
     ----------
     patch : ModelPatch
         The patch; only its sensors act, without clocks.
-    record : SensorRecord
-        The times and signals of one recording.
     values : (N, C) array
         Readings of perfect sensors, in the units of the channels.
     rates : (N, C) array, optional

@@ -47,8 +47,6 @@ def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin 
 
     Parameters
     ----------
-    patch : ModelPatch
-        The patch with the losses.
     strip_lines : (S + 1,) array
         Edges of the strips [m from the root].
 

@@ -79,8 +79,6 @@ def step_boundaries(
     ----------
     system : ModalSystem
         The modes of the structure, without the forces of laws.
-    laws : PortLaws
-        The laws at the ports of the structure.
     time : (N,) array
         The time stamps [s].
     refinement : int

@@ -76,8 +76,6 @@ class ModalIntegrator:
     ----------
     structure : StructureInMotion
         The structure whose motion is integrated.
-    modes : ModeSet
-        The modes of the structure.
     damping_ratio : (M,) array
         Damping ratios of the modes, eq. (18).
 

@@ -346,11 +346,6 @@ class WingRows:
         strain over the gauge with the local losses, divided by the mean with averaged losses. It is
         one if losses end at the edges of strips.
 
-        Parameters
-        ----------
-        patch : ModelPatch
-            The patch with the losses.
-
         Returns
         -------
         (G,) array or None

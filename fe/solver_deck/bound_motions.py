@@ -65,8 +65,6 @@ def read_tied_motions(
     ----------
     jobs : CalculixJobs
         CalculiX at work on the deck.
-    blocks : sequence of KeywordBlock
-        The blocks of the model.
     matrices : StoredMatrices
         The matrices of these blocks.
     places : sequence of Place

@@ -46,10 +46,6 @@ class CalculixJobs:
 
     Attributes
     ----------
-    model : LinearModel
-        The model of the deck.
-    folder : Path
-        Where CalculiX writes its files.
     time_limit : float
         Time that one run may take [s].
     """
@@ -71,10 +67,6 @@ class CalculixJobs:
 
         Parameters
         ----------
-        name : str
-            Name of the job.
-        blocks : sequence of KeywordBlock
-            The blocks of the model.
         free, preloaded : bool
             As in `LinearModel.text`.
         step_lines : sequence of str
@@ -113,10 +105,6 @@ class CalculixJobs:
 
         Parameters
         ----------
-        loads : sequence of DeckLoad
-            The loads.
-        blocks : sequence of KeywordBlock
-            The blocks of the model.
         preloaded : bool
             Whether they follow the preload, if the model has one.
         quantity : "U" or "RF"

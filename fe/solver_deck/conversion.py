@@ -61,8 +61,6 @@ class DeckOptions:
 
     Attributes
     ----------
-    length_unit : str
-        Unit of length of the deck.
     regions, outputs : sequence of str
         Sets of elements that may lose stiffness, and of nodes whose displacement is an output; if
         empty, they are chosen.
@@ -90,14 +88,10 @@ def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> D
 
     Parameters
     ----------
-    deck : Path
-        The deck.
     folder : Path
         An existing empty folder for the structure. CalculiX works in its folder `calculix`.
     name : str
         Name of the structure and of its file.
-    options : DeckOptions
-        What the user chooses.
 
     Raises
     ------
@@ -207,8 +201,6 @@ def _stable_weight(
 
     Parameters
     ----------
-    model : LinearModel
-        The model of the deck.
     stiffness : sparse (n, n) array
         The stiffness with the preload.
     regions : sequence of sparse (n, n) array
@@ -268,8 +260,6 @@ class _ChosenLoads(NamedTuple):
 
     Attributes
     ----------
-    loads : list of DeckLoad
-        The loads.
     vectors : dict of str to (n,) array
         The forces of those that nodes and directions alone do not describe.
     remarks : list of str

@@ -131,14 +131,10 @@ class LinearModel:
 
     Attributes
     ----------
-    path : Path
-        The deck.
     blocks : list of KeywordBlock
         The blocks of the model, without supports and steps.
     steps : list of list of KeywordBlock
         The blocks of each step.
-    mesh : DeckMesh
-        Nodes, elements and sets.
     held : list of HeldMotion
         The motions that *BOUNDARY holds.
     remarks : list of str
@@ -237,8 +233,6 @@ def read_linear_model(
 
     Parameters
     ----------
-    path : Path
-        The deck.
     contact : "tied" or "open"
         What becomes of contact pairs.
     preload : "tangent" or "none"

@@ -67,8 +67,6 @@ def choose_regions(model: LinearModel, set_names: Sequence[str]) -> list[Region]
 
     Parameters
     ----------
-    model : LinearModel
-        The model of the deck.
     set_names : sequence of str
         Names of sets of elements; if it is empty, the sets of all sections whose material is
         elastic.

@@ -122,8 +122,6 @@ class MotionRows:
 
         Parameters
         ----------
-        load : DeckLoad
-            The load.
         bound : bool
             Whether bound motions count as having rows.
         """

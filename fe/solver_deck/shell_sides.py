@@ -55,13 +55,6 @@ class ShellGeometry:
 
     CalculiX expands a shell along the normal at each node, which is the mean of the normals of the
     shells that meet there, and applies pressure on the expanded side.
-
-    Attributes
-    ----------
-    mesh : DeckMesh
-        The mesh of the deck.
-    blocks : sequence of KeywordBlock
-        The blocks of the model, with the sections.
     """
 
     mesh: DeckMesh

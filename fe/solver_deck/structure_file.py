@@ -57,22 +57,16 @@ class DeckStructure:
 
     Attributes
     ----------
-    model : LinearModel
-        The model of the deck.
     matrices : StoredMatrices
         Stiffness and mass of the whole.
     region_stiffness : dict of Region to sparse (n, n) array
         The stiffness of each region.
-    loads : list of DeckLoad
-        The loads.
     load_vectors : dict of str to (n,) array
         Forces of each load that nodes and directions alone do not describe, such as gravity.
     output_sets : list of OutputSet
         The sets of nodes whose displacement is an output.
     motion_rows : MotionRows
         How the motions of their nodes follow from the rows.
-    length_unit : str
-        Unit of length of the deck.
     """
 
     model: LinearModel
@@ -102,8 +96,6 @@ def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputS
 
     Parameters
     ----------
-    model : LinearModel
-        The model of the deck.
     names : sequence of str
         Names of sets of nodes, each alone or with axes, as `TIP` or `TIP:z`; if it is empty, all
         sets that hold at most half of the nodes.
@@ -138,8 +130,6 @@ def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> O
 
     Parameters
     ----------
-    output : OutputSet
-        The set.
     rows : MotionRows
         How motions of nodes follow from the rows of the matrices.
     option : str or None

@@ -108,8 +108,6 @@ class AffineStructure:
 
     Attributes
     ----------
-    design : StructureDesign
-        The design, as read from its file.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
     control_units : dict of str to str
@@ -238,8 +236,6 @@ class AffineStructure:
 
         Parameters
         ----------
-        name : str
-            Name of the load.
         value : float, optional
             Value of its control; nominal by default, and one for a constant load.
         masses : mapping of str to float, optional
@@ -389,11 +385,6 @@ class AffineResponse:
 def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
     """Solve for each load alone, the structure undamaged, with the value of `control_value_alone`.
 
-    Parameters
-    ----------
-    structure : AffineStructure
-        The affine operators of the structure.
-
     Returns
     -------
     dict of str to AffineResponse
@@ -422,8 +413,6 @@ def static_response(structure: AffineStructure, values: Mapping[str, float]) -> 
 
     Parameters
     ----------
-    structure : AffineStructure
-        The affine operators of the structure.
     values : mapping of str to float
         Parameters, losses, free masses and controls; the others are nominal, and healthy.
 
@@ -472,10 +461,6 @@ def natural_frequencies(
 
     Parameters
     ----------
-    structure : AffineStructure
-        The affine operators of the structure.
-    count : int
-        The number of modes.
     values : mapping of str to float, optional
         Parameters, losses and free masses; the others are nominal, and healthy.
     factors : Factorisation, optional

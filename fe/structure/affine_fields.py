@@ -68,8 +68,6 @@ def affine_fields(
 
     Parameters
     ----------
-    design : StructureDesign
-        The design, as read from its file.
     expansion : csr (full, n)
         Free unknowns to all unknowns.
     mass : csr (full, full)

@@ -118,8 +118,6 @@ class Body(Generic[Mesh]):
 
         Parameters
         ----------
-        design : StructureDesign
-            The design of the structure.
         loads : iterable of (full,) array
             Its loads, as in `fe.structure.affine_fields.affine_fields`.
         outputs : OutputRows

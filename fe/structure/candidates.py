@@ -323,8 +323,6 @@ class GaugeShift(NamedTuple):
 
     Attributes
     ----------
-    gauge : str
-        Name of the gauge.
     axis : str
         "along" the gauge or "across" it.
     rows : csr (2, n)

@@ -38,8 +38,6 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
 
     Parameters
     ----------
-    file : Path
-        The structure file.
     patch : ModelPatch
         The patch: supports that yield, masses that are added, loads that are moved or turned.
     folder : Path

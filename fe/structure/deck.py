@@ -56,8 +56,6 @@ class Deck:
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
     words : DeckWords, optional
         The words of the dialect of a deck, in which the case of a name does not count.
 
@@ -354,10 +352,6 @@ class Deck:
 
         Parameters
         ----------
-        rows : list of SurfaceRow
-            The rows of the surface.
-        kind : ElementKind
-            The kind of the solid elements.
         solids : dict of int to list of int
             The nodes of the solid elements by number.
         """

@@ -328,8 +328,6 @@ def parse_structure(
 
     Parameters
     ----------
-    content : dict
-        The content of the TOML file.
     source : str
         The name of the file in messages.
 
@@ -369,10 +367,6 @@ def structure_hash(
 
     Parameters
     ----------
-    design : StructureDesign
-        The design of the structure, as read from its file.
-    folder : Path
-        Folder of its files.
     with_ports : bool
         Whether its ports count. They change no answer of the structure, but an effect is found at
         one.

@@ -32,8 +32,6 @@ class _GaugeStrain(NamedTuple):
         Number of the gauge.
     weight : float
         Weight of the strain in the mean of the gauge.
-    cell : int
-        The cell.
     local : (3,) array
         The local position in the cell.
     direction : (3,) array
@@ -61,10 +59,6 @@ def gauge_rows(
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-    gauges : tuple of Gauge
-        The strain gauges, with point, direction, length and width.
     turn : float
         Angle in the surface from the direction of each gauge to that of the strain, about the
         outward normal [rad].
@@ -132,10 +126,6 @@ def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArra
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-    gauge : Gauge
-        The strain gauge.
     where : str
         The name of the gauge in sentences.
 
@@ -162,10 +152,6 @@ def _averaging_points(
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-    gauge : Gauge
-        The strain gauge, with its length and width.
     point, direction, normal : (3,) array
         The middle of the gauge [m], and unit vectors along it and normal to the surface.
     where : str
@@ -233,8 +219,6 @@ def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     count : int
         The largest number of rosettes; there are fewer if several would lie on one face.
 

@@ -91,8 +91,6 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     point : (3,) array
         The position of the point [m].
     where : str
@@ -148,8 +146,6 @@ def _nearest_points(
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     point : (3,) array
         The position of the point [m].
     parametrisation : _Parametrisation
@@ -188,8 +184,6 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     point : (3,) array
         The position of the point [m].
     where : str
@@ -241,8 +235,6 @@ def _nearest_on_faces(
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     point : (3,) array
         The position of the point [m].
     cells, face_numbers : (n,) array of int

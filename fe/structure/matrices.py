@@ -49,8 +49,6 @@ class MatrixStructure(AffineStructure):
 
     Attributes
     ----------
-    design : MatrixDesign
-        The design, as read from its file.
     nodes : tuple of int
         Numbers of the nodes whose displacements `expansion` gives, in their order.
     """
@@ -66,10 +64,6 @@ def assemble_matrices(
 
     Parameters
     ----------
-    design : MatrixDesign
-        The design, as read from its file.
-    folder : Path
-        The folder of its files.
     design_hash : str
         The hash of the design and its files.
     yielding : bool
@@ -180,8 +174,6 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 
     Parameters
     ----------
-    design : MatrixDesign
-        The design, as read from its file.
     files : MatrixFiles
         The matrix files of the design, with R rows.
     can_move : (R,) array of bool
@@ -291,8 +283,6 @@ def _stiffness_terms(
 
     Parameters
     ----------
-    design : MatrixDesign
-        The design, as read from its file.
     files : MatrixFiles
         The matrix files of the design, with R rows.
     whole_stiffness : sparse (R, R) array

@@ -46,8 +46,6 @@ class MatrixFiles:
 
     Attributes
     ----------
-    folder : Path
-        The folder of the files.
     places : list of (int, int)
         Node and component of each row.
     unit : float

@@ -72,8 +72,6 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] 
 
     Parameters
     ----------
-    folder : Path
-        The folder of the file.
     name : str
         `FILE` or `FILE:MATRIX`.
 
@@ -164,8 +162,6 @@ def read_vector(
 
     Parameters
     ----------
-    folder : Path
-        The folder of the file.
     name : str
         `FILE` or `FILE:ARRAY`.
     unit_vector : callable
@@ -207,8 +203,6 @@ def _read(path: Path, array_name: str) -> _FileContent:
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
     array_name : str
         The array or matrix in it; empty if it has one only.
     """

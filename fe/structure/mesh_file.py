@@ -150,11 +150,6 @@ _FACTOR_BYTES = 520.0
 def memory_estimate(mesh: StructureMesh) -> float:
     """Return the memory that assembly and factorisation take, from the mesh's order of elimination.
 
-    Parameters
-    ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-
     Returns
     -------
     float
@@ -188,8 +183,6 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     limit : float, optional
         The allowed memory [bytes]; by default what the machine has left.
 

@@ -35,11 +35,6 @@ _LONGEST_REASON = 500
 def read_by_meshio(path: Path) -> Deck:
     """Read the mesh of a file of any format that meshio knows.
 
-    Parameters
-    ----------
-    path : Path
-        The path of the file.
-
     Raises
     ------
     MeshError
@@ -141,8 +136,6 @@ def _add_sets(
 
     Parameters
     ----------
-    deck : Deck
-        The deck that they are added to.
     mesh : meshio.Mesh
         The mesh as meshio read it, in the unit of the file.
     kind : {"NSET", "ELSET"}

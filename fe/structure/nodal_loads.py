@@ -29,15 +29,7 @@ class FaceAreas(NamedTuple):
 
 
 def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
-    """Return the integrals of each node's shape function over faces.
-
-    Parameters
-    ----------
-    mesh : CellMesh
-        The mesh, with its nodes in metres.
-    surface : Surface
-        The faces.
-    """
+    """Return the integrals of each node's shape function over faces."""
     kind = mesh.kind
     frames = kind.face_frames
     vectors = np.zeros((len(mesh.points), 3))
@@ -76,10 +68,6 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-    load : MeshLoad
-        The load: an acceleration, a pressure on faces, or a force.
     where : str
         The name of the load in sentences.
 
@@ -112,10 +100,6 @@ def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
-    port : MeshPort
-        The port, with its point or nodes and its direction.
     where : str
         The name of the port in sentences.
 
@@ -161,8 +145,6 @@ def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where:
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     point : (float, float, float)
         The point, in the unit of length of the mesh.
     where : str

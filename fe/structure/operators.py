@@ -40,10 +40,6 @@ class Structure(AffineStructure):
 
     Attributes
     ----------
-    design : MeshDesign
-        The design, as read from its file.
-    body : Body
-        The mesh of the structure, with materials and supports.
     material_of : (nc,) array of int
         Number of the material of each cell.
     region_of : (nc,) array of int
@@ -69,8 +65,6 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
 
     Parameters
     ----------
-    design : MeshDesign
-        The design, as read from its file.
     file : Path
         The path of the design's file; the design may name the mesh relative to it.
 
@@ -104,8 +98,6 @@ def _part_of_cells(
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh, with its nodes in metres.
     labelled : list of (str, Material or Damage)
         The parts, each with its key in the file.
     kind : str
@@ -175,8 +167,6 @@ def load_and_assemble(
 
     Parameters
     ----------
-    file : Path or str
-        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
     mass_as_stiffness : bool
@@ -281,8 +271,6 @@ def assemble_structure(
 
     Parameters
     ----------
-    file : Path or str
-        The path of the structure file.
     memory_limit : float, optional
         Bytes that assembly and factorisation may take; by default what the machine has free.
     yielding : bool
@@ -344,10 +332,6 @@ def write_structure_vtu(
 
     Parameters
     ----------
-    path : Path or str
-        The file to write.
-    structure : Structure
-        The mesh, matrices and loads of the structure.
     values : mapping of str to float, optional
         Parameters, losses, free masses and controls by name; the others are nominal, and healthy.
 

@@ -81,8 +81,6 @@ def supports(
         Whether each displacement is held.
     springs : (nodes, 3) array
         Springs to the ground of nodes that belong to no rigid set [N/m].
-    bodies : iterable of RigidSet
-        The sets of nodes that move as rigid bodies.
     """
     is_free = ~is_held
     body_expansions = []
@@ -140,10 +138,6 @@ def supports_of_design(
 
     Parameters
     ----------
-    design : MeshDesign
-        The design, as read from its file.
-    mesh : StructureMesh
-        The mesh of the structure, with its nodes in metres.
     yielding : bool
         Whether the motions that the supports hold are unknowns, behind all others. What a set of
         nodes holds then moves as a rigid body does, by six motions about the centre of the set.

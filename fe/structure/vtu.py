@@ -50,8 +50,6 @@ def write_vtu(
 
     Parameters
     ----------
-    path : Path or str
-        The path of the file.
     points : (nn, 3) array
         Positions of the nodes [m].
     cells : (str, (nc, k) array of int)

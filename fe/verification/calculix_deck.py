@@ -144,8 +144,6 @@ class CalculixDeck:
     ----------
     title : str
         The title of the job.
-    structure : AffineStructure
-        The model.
     body : Body
         Its mesh with materials and supports; the n free unknowns are in the order of its supports.
     values : mapping of str to float
@@ -329,11 +327,6 @@ def number_line(values: ArrayLike) -> str:
 def structure_deck(structure: Structure) -> CalculixDeck:
     """Return the deck of a structure, undamaged, with nominal parameters and masses.
 
-    Parameters
-    ----------
-    structure : Structure
-        The mesh, matrices and loads of the structure.
-
     Raises
     ------
     CalculixError
@@ -369,15 +362,7 @@ def _load_step(structure: Structure, load: MeshLoad) -> Step:
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
-    """Return the deck of the wing in one state.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
-    state : DigitalState
-        The state of the wing.
-    """
+    """Return the deck of the wing in one state."""
     mesh = operators.wing_mesh
     design = mesh.design
     skin = design.skin

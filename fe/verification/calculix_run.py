@@ -43,11 +43,6 @@ def required_calculix() -> str:
 def read_tables(text: str) -> dict[str, list[FloatArray]]:
     """Read the tables of nodes and integration points in a `.dat` file of CalculiX.
 
-    Parameters
-    ----------
-    text : str
-        The content of the file.
-
     Returns
     -------
     dict of str to list of (n, ...) array
@@ -75,11 +70,6 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
 def read_frequencies(text: str) -> FloatArray:
     """Read the frequencies (m,) [Hz] of the table of eigenvalues in a `.dat` file.
 
-    Parameters
-    ----------
-    text : str
-        The content of the file.
-
     Raises
     ------
     CalculixError
@@ -100,12 +90,8 @@ def run_calculix(text: str, folder: Path, name: str, time_limit: float = _TIME_L
 
     Parameters
     ----------
-    text : str
-        The content of the input file.
     folder : Path
         Where input, results and messages (`NAME.log`) are written; it is made if it is missing.
-    name : str
-        Name of the job.
     time_limit : float
         Time that CalculiX may take [s]; an hour by default.
 

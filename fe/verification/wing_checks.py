@@ -88,8 +88,6 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
 
     Parameters
     ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
     load_factor : float
         The load factor of the turn.
 
@@ -159,8 +157,6 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
 
     Parameters
     ----------
-    design : WingDesign
-        The design of the wing.
     refinements : sequence of float
         The refinements of the meshes.
 
@@ -252,8 +248,6 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
 
     Parameters
     ----------
-    design : WingDesign
-        The design of the wing.
     jobs : Path
         The folder in which CalculiX writes its files.
     quick : bool
@@ -286,11 +280,6 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     relative to the largest entry of |K| |r|. That is the size of the terms that cancel, and so of
     their rounding errors. Then come the balances of `wing_balance` at the load factor of the lift
     that the design states, each as the relative difference of two sums.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()
@@ -321,8 +310,6 @@ def convergence_checks(
 
     Parameters
     ----------
-    design : WingDesign
-        The design of the wing.
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
     limited : bool
@@ -367,8 +354,6 @@ def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
 
     Parameters
     ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
     jobs : Path
         The folder in which CalculiX writes its files.
     """

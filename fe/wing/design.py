@@ -326,8 +326,6 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
 
     Parameters
     ----------
-    content : dict
-        The content of the file.
     source : str
         The name of the design in sentences.
 
@@ -344,11 +342,6 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
 
 def load_design(path: Path | str | None = None) -> WingDesign:
     """Read a design file; without a path, the shipped design of the UAV wing.
-
-    Parameters
-    ----------
-    path : Path or str, optional
-        The path of the file.
 
     Raises
     ------

@@ -86,8 +86,6 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
 
     Parameters
     ----------
-    mesh : WingMesh
-        The mesh, with its nodes in metres.
     angle : float
         Direction of the gauges in the plane of the skin: the angle [rad] from the spanwise
         direction, positive towards the trailing edge.
@@ -151,8 +149,6 @@ def _directions_in_skin(
 
     Parameters
     ----------
-    mesh : WingMesh
-        The mesh, with its nodes in metres.
     cells : (p,) array of int
         Cells.
     local_positions : (p, 3) array

@@ -270,8 +270,6 @@ def _grid_points(
 
     Parameters
     ----------
-    design : WingDesign
-        The design, as read from its file.
     across : (ny + 1,) array
         Mesh lines across the span [m].
     along : tuple of MeshLine
@@ -371,11 +369,6 @@ def _grid_cells(
 
 def build_mesh(design: WingDesign) -> WingMesh:
     """Return the mesh of a wing design.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The design, as read from its file.
 
     Raises
     ------

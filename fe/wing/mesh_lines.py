@@ -164,11 +164,6 @@ def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLin
 def span_lines(design: WingDesign) -> FloatArray:
     """Return the mesh lines across the span: rib faces, edges of defects, ends of bands, others.
 
-    Parameters
-    ----------
-    design : WingDesign
-        The design, as read from its file.
-
     Returns
     -------
     (ny + 1,) array
@@ -237,11 +232,6 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
     """Return the nx + 1 mesh lines along the span.
 
     These are web faces, edges of defects, the leading-edge wall, and lines between.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The design, as read from its file.
 
     Raises
     ------

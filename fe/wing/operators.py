@@ -155,8 +155,6 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
 
     Parameters
     ----------
-    mesh : WingMesh
-        The mesh, with its nodes in metres.
     distance : float
         Distance from the root [m].
     chord_fraction : float
@@ -312,11 +310,6 @@ def assemble(source: WingDesign | Path | str, memory_limit: float | None = None)
 def _assemble_wing(design: WingDesign) -> AffineOperators:
     """Mesh a wing design and assemble its matrices as sums of terms, one for each parameter.
 
-    Parameters
-    ----------
-    design : WingDesign
-        The design, as read from its file.
-
     Raises
     ------
     MeshError
@@ -352,8 +345,6 @@ def wing_values(
 
     Parameters
     ----------
-    wing : AffineWing
-        The affine operators of the wing.
     young_modulus_factor, stiffness_loss
         As in `fe.runtime.state.DigitalState`.
     **others : float
@@ -371,8 +362,6 @@ def flapwise_bending_modes(wing: AffineWing, modes: NaturalModes) -> IntArray:
 
     Parameters
     ----------
-    wing : AffineWing
-        The affine operators of the wing.
     modes : NaturalModes
         At least three modes, from `natural_frequencies`.
 

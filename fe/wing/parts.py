@@ -357,8 +357,6 @@ def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
 
     Parameters
     ----------
-    planform : Planform
-        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
 
@@ -384,8 +382,6 @@ def lifting_line(planform: Planform, station: ArrayLike, terms: int = 40) -> Flo
 
     Parameters
     ----------
-    planform : Planform
-        The planform of the half-wing.
     station : array_like (...,)
         Fractions of the semi-span.
     terms : int

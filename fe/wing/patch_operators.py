@@ -89,8 +89,6 @@ class PatchOperators:
 
     Attributes
     ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
     layout : WingLayout
         The places and lengths of a wing, which no unknown changes.
     line_rows : LineRows
@@ -179,13 +177,7 @@ def section_lines(design: WingDesign) -> tuple[float, ...]:
 
 
 def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
-    """Assemble the operators of the primitives of patches for a wing.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The finite element operators of the wing.
-    """
+    """Assemble the operators of the primitives of patches for a wing."""
     mesh = operators.wing_mesh
     design = mesh.design
     planform = design.planform
