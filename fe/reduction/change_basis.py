@@ -24,8 +24,8 @@ from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, Support
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, SupportMotion
 from fe.structure.candidates import (
-    LossPlace,
-    MassPlace,
+    LossCandidate,
+    MassCandidate,
     gauge_shifts,
     load_changes,
     loss_places,
@@ -300,7 +300,7 @@ class _Columns:
             change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
         )
 
-    def add_mass(self, place: MassPlace) -> None:
+    def add_mass(self, place: MassCandidate) -> None:
         """Add the columns of a mass at a place: the static responses to forces there."""
         number = self._first_mass + self.mass_places.index(place)
         forces = place.rows[:, : self.free].toarray().T
@@ -309,7 +309,7 @@ class _Columns:
         block = block[:, lengths > SAME_DIRECTION * lengths.max()]
         self._add_remainders(number, block / np.linalg.norm(block, axis=0))
 
-    def add_loss(self, patch: LossPlace) -> None:
+    def add_loss(self, patch: LossCandidate) -> None:
         """Add the columns of a loss of stiffness: what it changes of solutions and modes."""
         number = self._first_loss + self.loss_places.index(patch)
         forces = self._forces_of_snapshots

@@ -276,7 +276,7 @@ def changeable_model(file: Path | str, progress: Progress | None = None) -> Chan
     """Return the model of a structure file that a campaign is compared with, from the cache.
 
     It has the force and the displacement at each port of the file, see
-    `AffineStructure.pushed_at_ports`, and the columns that changes of the structure need. Its
+    `AffineStructure.with_port_forces`, and the columns that changes of the structure need. Its
     `design_hash` is that of the model without ports.
 
     Parameters
@@ -297,8 +297,8 @@ def changeable_model(file: Path | str, progress: Progress | None = None) -> Chan
         from .reduced_basis import reduce_structure
 
         with reporter(progress).stage("Reading the mesh and assembling"):
-            yielding = assemble_structure(file, yielding=True).pushed_at_ports()
-        reduction = reduce_structure(yielding.held(), progress=progress)
+            yielding = assemble_structure(file, yielding=True).with_port_forces()
+        reduction = reduce_structure(yielding.with_held_supports(), progress=progress)
         with reporter(progress).stage("Reducing the changes of the structure"):
             return with_changes(yielding, reduction)
 

@@ -19,7 +19,7 @@ from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import CalculixError
 from fe.structure.abaqus import DataLine, KeywordBlock
-from fe.structure.matrix_tables import Place
+from fe.structure.matrix_tables import Dof
 
 from .calculix_jobs import CalculixJobs, StoredMatrices
 from .linear_model import ROTATIONS, TRANSLATIONS, real_text
@@ -40,7 +40,7 @@ class _Probe(NamedTuple):
 
     Attributes
     ----------
-    motion : Place
+    motion : NodeComponent
         Node and direction of the motion.
     added_node : int
         The added node at the other end, which has a row in this direction.
@@ -48,7 +48,7 @@ class _Probe(NamedTuple):
         Its direction along an axis.
     """
 
-    motion: Place
+    motion: Dof
     added_node: int
     direction: int
 
@@ -57,8 +57,8 @@ def read_tied_motions(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    places: Sequence[Place],
-) -> dict[Place, WeightedRows]:
+    dofs: Sequence[Dof],
+) -> dict[Dof, WeightedRows]:
     """Return how motions along axes that have no rows follow from the rows.
 
     Parameters
@@ -67,12 +67,12 @@ def read_tied_motions(
         CalculiX at work on the deck.
     matrices : StoredMatrices
         The matrices of these blocks.
-    places : sequence of Place
+    dofs : sequence of NodeComponent
         Nodes and directions without rows.
 
     Returns
     -------
-    dict of Place to WeightedRows
+    dict of NodeComponent to WeightedRows
         The weights of each motion; without those that CalculiX would not show.
 
     Raises
@@ -80,12 +80,12 @@ def read_tied_motions(
     CalculixError
         If CalculiX fails.
     """
-    if not places:
+    if not dofs:
         return {}
     first = _free_number(jobs)
-    nodes = list(dict.fromkeys(node for node, _ in places))
+    nodes = list(dict.fromkeys(node for node, _ in dofs))
     added_node = {node: first + number for number, node in enumerate(nodes)}
-    probes = [_Probe((node, axis), added_node[node], axis) for node, axis in places]
+    probes = [_Probe((node, axis), added_node[node], axis) for node, axis in dofs]
     added_blocks = _added_nodes(jobs, {added_node[node]: node for node in nodes})
     added_blocks += _supports_of(probes)
     for probe in probes:
@@ -98,8 +98,8 @@ def read_rotations(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    places: Sequence[Place],
-) -> dict[Place, WeightedRows]:
+    dofs: Sequence[Dof],
+) -> dict[Dof, WeightedRows]:
     """Return how rotations of nodes of shells and beams follow from the rows.
 
     The parameters are those of `read_tied_motions`, with the directions 4, 5 and 6.
@@ -113,12 +113,12 @@ def read_rotations(
     """
     mean_rotations = {}
     rigid_sections = []
-    for place in places:
-        weights = _mean_rotation(jobs, blocks, matrices, place)
+    for dof in dofs:
+        weights = _mean_rotation(jobs, blocks, matrices, dof)
         if weights is None:
-            rigid_sections.append(place)
+            rigid_sections.append(dof)
         else:
-            mean_rotations[place] = weights
+            mean_rotations[dof] = weights
     signed = _with_signs(jobs, blocks, matrices, mean_rotations)
     return signed | _rotations_of_rigid_sections(jobs, blocks, matrices, rigid_sections)
 
@@ -127,7 +127,7 @@ def _mean_rotation(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    place: Place,
+    dof: Dof,
 ) -> WeightedRows | None:
     """Return the weights of the mean rotation of a node's section, up to their common sign.
 
@@ -140,21 +140,21 @@ def _mean_rotation(
     WeightedRows or None
         The weights; None if the moment makes no new unknown.
     """
-    node, direction = place
+    node, direction = dof
     loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
-    new_places = Counter(loaded.places) - Counter(matrices.places)
-    lost_places = Counter(matrices.places) - Counter(loaded.places)
-    if new_places.total() != 1 or lost_places.total() != 1:
+    new_dofs = Counter(loaded.dofs) - Counter(matrices.dofs)
+    lost_dofs = Counter(matrices.dofs) - Counter(loaded.dofs)
+    if new_dofs.total() != 1 or lost_dofs.total() != 1:
         return None
-    rotation = loaded.places.index(next(iter(new_places)))
-    eliminated = _eliminated_row(matrices, loaded, rotation, next(iter(lost_places)))
+    rotation = loaded.dofs.index(next(iter(new_dofs)))
+    eliminated = _eliminated_row(matrices, loaded, rotation, next(iter(lost_dofs)))
     if eliminated is None:
         return None
-    kept = np.delete(np.arange(len(matrices.places)), eliminated)
-    kept_in_loaded = np.delete(np.arange(len(loaded.places)), rotation)
+    kept = np.delete(np.arange(len(matrices.dofs)), eliminated)
+    kept_in_loaded = np.delete(np.arange(len(loaded.dofs)), rotation)
     old_row = matrices.stiffness[[eliminated]].toarray().ravel()
     new_row = loaded.stiffness[[rotation]].toarray().ravel()
-    weights = np.empty(len(matrices.places))
+    weights = np.empty(len(matrices.dofs))
     weights[eliminated] = np.sqrt(old_row[eliminated] / new_row[rotation])
     difference = old_row[kept] - weights[eliminated] * new_row[kept_in_loaded]
     weights[kept] = difference * weights[eliminated] / old_row[eliminated]
@@ -162,7 +162,7 @@ def _mean_rotation(
 
 
 def _eliminated_row(
-    matrices: StoredMatrices, loaded: StoredMatrices, rotation: int, lost_place: Place
+    matrices: StoredMatrices, loaded: StoredMatrices, rotation: int, lost_dof: Dof
 ) -> int | None:
     """Return the row that a rotation replaces; None if the other rows do not stand in order.
 
@@ -170,14 +170,14 @@ def _eliminated_row(
     diagonals of both matrices have the most entries in common.
     """
     remaining = np.delete(loaded.stiffness.diagonal(), rotation)
-    remaining_places = [*loaded.places[:rotation], *loaded.places[rotation + 1 :]]
+    remaining_dofs = [*loaded.dofs[:rotation], *loaded.dofs[rotation + 1 :]]
     diagonal = matrices.stiffness.diagonal()
     best_row = None
     fewest_changes = len(diagonal)
-    for row, place in enumerate(matrices.places):
-        if place != lost_place:
+    for row, dof in enumerate(matrices.dofs):
+        if dof != lost_dof:
             continue
-        if [*matrices.places[:row], *matrices.places[row + 1 :]] != remaining_places:
+        if [*matrices.dofs[:row], *matrices.dofs[row + 1 :]] != remaining_dofs:
             continue
         changes = int(np.sum(~np.isclose(np.delete(diagonal, row), remaining, rtol=1e-10)))
         if changes < fewest_changes:
@@ -190,8 +190,8 @@ def _with_signs(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    rotations: Mapping[Place, WeightedRows],
-) -> dict[Place, WeightedRows]:
+    rotations: Mapping[Dof, WeightedRows],
+) -> dict[Dof, WeightedRows]:
     """Return the weights with the sign with which CalculiX moves the nodes under a moment.
 
     Torsion of a straight beam moves no node of the deck. The sign then follows from the places of
@@ -200,10 +200,10 @@ def _with_signs(
     if not rotations:
         return {}
     known = _signs_by_displacements(jobs, blocks, matrices, rotations)
-    for place, sign in list(known.items()):
+    for dof, sign in list(known.items()):
         if sign != 0.0:
             continue
-        node, direction = place
+        node, direction = dof
         others = {}
         for other in ROTATIONS:
             weights = _mean_rotation(jobs, blocks, matrices, (node, other))
@@ -211,22 +211,20 @@ def _with_signs(
                 others[node, other] = weights
         signs = _signs_by_displacements(jobs, blocks, matrices, others)
         signed = {key: weights.times(signs[key]) for key, weights in others.items()}
-        known[place] = _sign_by_section(matrices.places, place, rotations[place], signed)
-    return {
-        place: weights.times(known[place]) for place, weights in rotations.items() if known[place]
-    }
+        known[dof] = _sign_by_section(matrices.dofs, dof, rotations[dof], signed)
+    return {dof: weights.times(known[dof]) for dof, weights in rotations.items() if known[dof]}
 
 
 def _signs_by_displacements(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    rotations: Mapping[Place, WeightedRows],
-) -> dict[Place, float]:
+    rotations: Mapping[Dof, WeightedRows],
+) -> dict[Dof, float]:
     """Return 1, -1, or 0 if the moment moves no node, for each rotation of unknown sign."""
     if not rotations:
         return {}
-    count = len(matrices.places)
+    count = len(matrices.dofs)
     moments = np.column_stack([weights.vector(count) for weights in rotations.values()])
     solutions = Factorisation(matrices.stiffness).solve(moments)
     loads = [
@@ -234,9 +232,9 @@ def _signs_by_displacements(
         for node, direction in rotations
     ]
     printed = jobs.displacements(loads, blocks, preloaded=False)
-    reader = MotionReader(matrices.places)
+    reader = MotionReader(matrices.dofs)
     signs = {}
-    for place, solution, displacements in zip(rotations, solutions.T, printed, strict=True):
+    for dof, solution, displacements in zip(rotations, solutions.T, printed, strict=True):
         ours = []
         theirs = []
         for node, displacement in displacements.items():
@@ -247,15 +245,15 @@ def _signs_by_displacements(
                     theirs.append(displacement[axis - 1])
         largest = max(map(abs, ours), default=0.0)
         moves = largest > _SMALLEST_MOTION * np.abs(solution).max()
-        signs[place] = float(np.sign(np.dot(ours, theirs))) if moves else 0.0
+        signs[dof] = float(np.sign(np.dot(ours, theirs))) if moves else 0.0
     return signs
 
 
 def _sign_by_section(
-    places: Sequence[Place],
-    place: Place,
+    dofs: Sequence[Dof],
+    dof: Dof,
     weights: WeightedRows,
-    others: Mapping[Place, WeightedRows],
+    others: Mapping[Dof, WeightedRows],
 ) -> float:
     """Return the sign of a rotation about an axis from those about the two other axes.
 
@@ -268,12 +266,12 @@ def _sign_by_section(
     float
         1 or -1; 0 if the other rotations do not tell the places.
     """
-    node, direction = place
+    node, direction = dof
     axis = np.eye(3)[direction - 4]
     section = np.zeros((0, 3))
     for (_, other), other_weights in others.items():
         other_axis = np.eye(3)[other - 4]
-        vectors = _vectors_of_section(places, node, other_weights)
+        vectors = _vectors_of_section(dofs, node, other_weights)
         squares = np.sum(vectors**2, axis=1, keepdims=True)
         offsets = np.divide(
             -np.cross(other_axis, vectors), squares, out=np.zeros_like(vectors), where=squares > 0.0
@@ -283,16 +281,16 @@ def _sign_by_section(
         section = section + offsets if len(section) else offsets
     if not len(section):
         return 0.0
-    vectors = _vectors_of_section(places, node, weights)
+    vectors = _vectors_of_section(dofs, node, weights)
     return float(np.sign(np.sum(vectors * np.cross(axis, section))))
 
 
-def _vectors_of_section(places: Sequence[Place], node: int, weights: WeightedRows) -> FloatArray:
+def _vectors_of_section(dofs: Sequence[Dof], node: int, weights: WeightedRows) -> FloatArray:
     """Return the weights (m, 3) of the expanded nodes of a node, which stand in order."""
-    dense = weights.vector(len(places))
+    dense = weights.vector(len(dofs))
     vectors: list[FloatArray] = []
     previous_axis = 4
-    for row, (row_node, axis) in enumerate(places):
+    for row, (row_node, axis) in enumerate(dofs):
         if row_node != node:
             continue
         if axis <= previous_axis:
@@ -306,20 +304,20 @@ def _rotations_of_rigid_sections(
     jobs: CalculixJobs,
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
-    places: Sequence[Place],
-) -> dict[Place, WeightedRows]:
+    dofs: Sequence[Dof],
+) -> dict[Dof, WeightedRows]:
     """Return the weights of rotations that are unknowns already, as where beams meet shells.
 
     CalculiX makes such a section rigid. An equation lets an added node follow the rotation, and a
     spring between it and a second added node shows the weights.
     """
-    if not places:
+    if not dofs:
         return {}
     first = _free_number(jobs)
     probes: list[_Probe] = []
     positions: dict[int, int] = {}
     added_blocks: list[KeywordBlock] = []
-    for number, (node, direction) in enumerate(places):
+    for number, (node, direction) in enumerate(dofs):
         follower = first + 2 * number
         probe = _Probe((node, direction), follower + 1, 1)
         positions |= {follower: node, probe.added_node: node}
@@ -364,7 +362,7 @@ def _supports_of(probes: Sequence[_Probe]) -> list[KeywordBlock]:
     return [KeywordBlock("", "BOUNDARY", {}, lines)] if lines else []
 
 
-def _spring(jobs: CalculixJobs, number: int, first: Place, second: Place) -> list[KeywordBlock]:
+def _spring(jobs: CalculixJobs, number: int, first: Dof, second: Dof) -> list[KeywordBlock]:
     """Return the blocks of a spring between two motions."""
     element = 3 * number + first[1]
     name = f"UAVPROBE{element}"
@@ -388,30 +386,30 @@ def _weights_of(
     blocks: Sequence[KeywordBlock],
     matrices: StoredMatrices,
     probes: Sequence[_Probe],
-) -> dict[Place, WeightedRows]:
+) -> dict[Dof, WeightedRows]:
     """Return the weights that springs show; none if they change the other rows."""
     try:
         probed = jobs.matrices("probes", blocks)
     except CalculixError:
         return {}
     added_nodes = {probe.added_node for probe in probes}
-    rows = [row for row, (node, _) in enumerate(probed.places) if node not in added_nodes]
-    if not _are_same_rows(jobs, [probed.places[row] for row in rows], matrices.places):
+    rows = [row for row, (node, _) in enumerate(probed.dofs) if node not in added_nodes]
+    if not _are_same_rows(jobs, [probed.dofs[row] for row in rows], matrices.dofs):
         return {}
     result = {}
     for probe in probes:
-        place = (probe.added_node, probe.direction)
-        column = probed.stiffness[[probed.places.index(place)]].toarray().ravel()
+        dof = (probe.added_node, probe.direction)
+        column = probed.stiffness[[probed.dofs.index(dof)]].toarray().ravel()
         weights = -column[rows] / _PROBE_STIFFNESS
         if weights.any():
             result[probe.motion] = _significant(weights)
     return result
 
 
-def _are_same_rows(jobs: CalculixJobs, places: Sequence[Place], expected: Sequence[Place]) -> bool:
+def _are_same_rows(jobs: CalculixJobs, dofs: Sequence[Dof], expected: Sequence[Dof]) -> bool:
     """Return whether rows have the same names, but for the numbers of nodes CalculiX adds."""
     known = jobs.model.mesh.points
-    names = [(node if node in known else None, axis) for node, axis in places]
+    names = [(node if node in known else None, axis) for node, axis in dofs]
     expected_names = [(node if node in known else None, axis) for node, axis in expected]
     return names == expected_names
 

@@ -11,7 +11,7 @@ from scipy import sparse
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.structure.abaqus import DataLine, KeywordBlock
-from fe.structure.matrix_tables import Place, read_matrix, read_unknowns
+from fe.structure.matrix_tables import Dof, read_matrix, read_unknowns
 from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
 
 from .linear_model import LinearModel, block_lines
@@ -31,13 +31,13 @@ class StoredMatrices:
     ----------
     stiffness, mass : sparse (n, n) array
         The matrices.
-    places : list of Place
+    dofs : list of NodeComponent
         Node and direction of each row. Nodes that CalculiX made have numbers beyond the deck's.
     """
 
     stiffness: sparse.csr_array
     mass: sparse.csr_array
-    places: list[Place]
+    dofs: list[Dof]
 
 
 @dataclass(frozen=True)
@@ -85,13 +85,13 @@ class CalculixJobs:
                 f"{self.model.path}: CalculiX has stored no stiffness matrix; the deck needs "
                 "elements that deform."
             )
-        places = read_unknowns(self.folder / f"{name}.dof")
+        dofs = read_unknowns(self.folder / f"{name}.dof")
         stiffness, _ = read_matrix(self.folder, f"{name}.sti")
         mass, _ = read_matrix(self.folder, f"{name}.mas")
-        size = len(places)
+        size = len(dofs)
         stiffness.resize((size, size))
         mass.resize((size, size))
-        return StoredMatrices(stiffness, mass, places)
+        return StoredMatrices(stiffness, mass, dofs)
 
     def displacements(
         self,

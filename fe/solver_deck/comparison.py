@@ -136,7 +136,7 @@ def _largest_deviation(
     """
     counts = structure.row_counts()
     held = set(structure.model.held)
-    nodes = sorted({node for node, _ in structure.matrices.places})
+    nodes = sorted({node for node, _ in structure.matrices.dofs})
     differences = [0.0]
     largest_of_nodes = max(float(np.abs(row).max()) for row in theirs.values())
     largest = max(largest_of_rows, largest_of_nodes)

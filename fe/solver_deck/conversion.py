@@ -154,7 +154,7 @@ def _structure_of_deck(
         changed = jobs.matrices(
             f"region{number}", with_scaled_modulus(blocks, number, _CHANGED_MODULUS)
         )
-        if changed.places != unloaded.places:
+        if changed.dofs != unloaded.dofs:
             raise CalculixError(
                 f"{model.path}: the matrices of one run have other rows when the modulus of "
                 f"{region.set_name} changes; name other regions by --region."
@@ -246,7 +246,7 @@ def _preloaded_matrices(
     if not jobs.model.preload:
         return unloaded
     preloaded = jobs.matrices("preloaded", blocks, preloaded=True)
-    if preloaded.places != unloaded.places:
+    if preloaded.dofs != unloaded.dofs:
         raise CalculixError(
             f"{jobs.model.path}: the matrices after the preload have other rows than those before "
             "it, as where the preload has forces on nodes of shells or beams; leave it out by "
@@ -317,15 +317,15 @@ def _choose_outputs(
         If a name is no set of nodes, or if the displacement of its nodes is not known.
     """
     candidates = choose_output_sets(jobs.model, names)
-    rows = MotionRows(matrices.places, set(jobs.model.held))
+    rows = MotionRows(matrices.dofs, set(jobs.model.held))
     of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
     eliminated = dict.fromkeys(
-        place
+        dof
         for output in candidates
-        for place in output.places()
-        if place[0] in of_elements and not rows.is_held(place)
+        for dof in output.dofs()
+        if dof[0] in of_elements and not rows.is_held(dof)
     )
-    tied = list(eliminated.keys() - set(matrices.places))
+    tied = list(eliminated.keys() - set(matrices.dofs))
     rows = replace(rows, bound=read_tied_motions(jobs, blocks, matrices, sorted(tied)))
     outputs = [
         movable_output(output, rows, option)
@@ -342,14 +342,14 @@ def _load_rows(
     loads: list[DeckLoad],
 ) -> MotionRows:
     """Return how the loads act on the rows, also where CalculiX has eliminated what they move."""
-    load_rows = MotionRows(matrices.places, set(jobs.model.held))
+    load_rows = MotionRows(matrices.dofs, set(jobs.model.held))
     of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
-    with_rows = set(matrices.places)
+    with_rows = set(matrices.dofs)
     tied = [
-        place
+        dof
         for load in loads
-        for place in load_rows.missing(load)
-        if place[0] in of_elements and place not in with_rows
+        for dof in load_rows.missing(load)
+        if dof[0] in of_elements and dof not in with_rows
     ]
     with_rotations = {
         node
@@ -358,14 +358,14 @@ def _load_rows(
         for node in element.nodes
     }
     rotations = [
-        place
+        dof
         for load in loads
-        for place in load_rows.missing_rotations(load)
-        if place[0] in with_rotations
+        for dof in load_rows.missing_rotations(load)
+        if dof[0] in with_rotations
     ]
     bound = read_tied_motions(jobs, blocks, matrices, list(dict.fromkeys(tied)))
     bound |= read_rotations(jobs, blocks, matrices, list(dict.fromkeys(rotations))[:MOST_MOMENTS])
-    return MotionRows(matrices.places, load_rows.held, bound)
+    return MotionRows(matrices.dofs, load_rows.held, bound)
 
 
 def _gravity_forces(
@@ -390,7 +390,7 @@ def _gravity_forces(
     for name, acceleration in accelerations.items():
         field = [
             acceleration[axis - 1] if node in jobs.model.mesh.points else 0.0
-            for node, axis in free.places
+            for node, axis in free.dofs
         ]
         free_forces = free.mass @ np.array(field)
         forces[name] = _matched_rows(free_forces, free, matrices)
@@ -402,15 +402,15 @@ def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatr
 
     Names with other numbers of rows belong to held nodes; their values are zero.
     """
-    source_counts = row_counts(source.places)
-    target_counts = row_counts(target.places)
-    values_of_place: dict[tuple[int, int], list[float]] = {}
-    for place, value in zip(source.places, values.tolist(), strict=True):
-        values_of_place.setdefault(place, []).append(value)
+    source_counts = row_counts(source.dofs)
+    target_counts = row_counts(target.dofs)
+    values_of_dof: dict[tuple[int, int], list[float]] = {}
+    for dof, value in zip(source.dofs, values.tolist(), strict=True):
+        values_of_dof.setdefault(dof, []).append(value)
     matched = []
-    for place in target.places:
-        if source_counts.get(place) == target_counts[place]:
-            matched.append(values_of_place[place].pop(0))
+    for dof in target.dofs:
+        if source_counts.get(dof) == target_counts[dof]:
+            matched.append(values_of_dof[dof].pop(0))
         else:
             matched.append(0.0)
     return np.array(matched)

@@ -12,7 +12,7 @@ import numpy as np
 from fe.runtime.errors import CalculixError
 from fe.structure.abaqus import KeywordBlock
 from fe.structure.deck_text import whole
-from fe.structure.matrix_tables import Place
+from fe.structure.matrix_tables import Dof
 
 from .calculix_jobs import CalculixJobs
 from .linear_model import TRANSLATIONS, HeldMotion, LinearModel
@@ -42,20 +42,20 @@ def share_over_couplings(
     shared = []
     for load in loads:
         on_references = {
-            place: value
-            for place, value in (*load.forces.items(), *load.moments.items())
-            if value and place[0] in nodes_of_reference
+            dof: value
+            for dof, value in (*load.forces.items(), *load.moments.items())
+            if value and dof[0] in nodes_of_reference
         }
         forces = dict(load.forces)
         moments = dict(load.moments)
-        for place, value in on_references.items():
-            unit_forces = _forces_of_unit(jobs, blocks, place, nodes_of_reference[place[0]])
+        for dof, value in on_references.items():
+            unit_forces = _forces_of_unit(jobs, blocks, dof, nodes_of_reference[dof[0]])
             if not unit_forces:
                 continue
-            forces.pop(place, None)
-            moments.pop(place, None)
-            for coupled_place, force in unit_forces.items():
-                forces[coupled_place] = forces.get(coupled_place, 0.0) + value * force
+            forces.pop(dof, None)
+            moments.pop(dof, None)
+            for coupled_dof, force in unit_forces.items():
+                forces[coupled_dof] = forces.get(coupled_dof, 0.0) + value * force
         shared.append(replace(load, forces=forces, moments=moments))
     return shared
 
@@ -83,11 +83,11 @@ def _distributing_couplings(model: LinearModel) -> Iterator[tuple[int, list[int]
 
 
 def _forces_of_unit(
-    jobs: CalculixJobs, blocks: Sequence[KeywordBlock], place: Place, nodes: Sequence[int]
+    jobs: CalculixJobs, blocks: Sequence[KeywordBlock], dof: Dof, nodes: Sequence[int]
 ) -> NodalForces:
     """Return the forces at coupled nodes under a unit force or moment; empty if none is printed."""
     model = jobs.model
-    reference, direction = place
+    reference, direction = dof
     free_nodes = {reference, *nodes}
     held = [
         HeldMotion(node, axis)

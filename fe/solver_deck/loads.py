@@ -146,8 +146,8 @@ def _pressure(forces: FaceForces) -> DeckLoad:
 
 def _add_forces(forces: NodalForces, added: Mapping[tuple[int, int], float]) -> None:
     """Add forces to those that act at the same nodes."""
-    for place, force in added.items():
-        forces[place] = forces.get(place, 0.0) + force
+    for dof, force in added.items():
+        forces[dof] = forces.get(dof, 0.0) + force
 
 
 def _entry(values: Sequence[str], number: int) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, RowWeights
-from fe.structure.matrix_tables import Place
+from fe.structure.matrix_tables import Dof
 
 from .linear_model import HeldMotion
 from .loads import DeckLoad
@@ -49,25 +49,25 @@ class MotionReader:
 
     Parameters
     ----------
-    places : sequence of Place
+    dofs : sequence of NodeComponent
         Node and direction of each row.
     """
 
-    def __init__(self, places: Sequence[Place]) -> None:
-        self.rows: dict[Place, list[int]] = {}
-        for row, place in enumerate(places):
-            self.rows.setdefault(place, []).append(row)
+    def __init__(self, dofs: Sequence[Dof]) -> None:
+        self.rows: dict[Dof, list[int]] = {}
+        for row, dof in enumerate(dofs):
+            self.rows.setdefault(dof, []).append(row)
 
-    def weighted(self, place: Place, table: RowWeights) -> WeightedRows | None:
+    def weighted(self, dof: Dof, table: RowWeights) -> WeightedRows | None:
         """Return a motion as weighted rows; None if there are none of known weights."""
-        rows = self.rows.get(place, [])
+        rows = self.rows.get(dof, [])
         if len(rows) not in table:
             return None
         return WeightedRows(np.array(rows), np.array(table[len(rows)]))
 
-    def displacement(self, solution: FloatArray, place: Place) -> float | None:
+    def displacement(self, solution: FloatArray, dof: Dof) -> float | None:
         """Return the displacement of a node in a solution (n,) as CalculiX prints it."""
-        weighted = self.weighted(place, READ_WEIGHTS)
+        weighted = self.weighted(dof, READ_WEIGHTS)
         return None if weighted is None else float(solution[weighted.rows] @ weighted.weights)
 
 
@@ -77,38 +77,38 @@ class MotionRows:
 
     Attributes
     ----------
-    places : list of Place
+    dofs : list of NodeComponent
         Node and direction of each row.
     held : set of HeldMotion
         Motions that are held, and take up what acts on them.
-    bound : dict of Place to WeightedRows
+    bound : dict of NodeComponent to WeightedRows
         Motions without a row of their own: those of tied nodes, and rotations.
     """
 
-    places: list[Place]
+    dofs: list[Dof]
     held: set[HeldMotion]
-    bound: Mapping[Place, WeightedRows] = field(default_factory=dict)
+    bound: Mapping[Dof, WeightedRows] = field(default_factory=dict)
 
     @cached_property
     def _reader(self) -> MotionReader:
         """The rows of each motion."""
-        return MotionReader(self.places)
+        return MotionReader(self.dofs)
 
-    def is_held(self, place: Place) -> bool:
+    def is_held(self, dof: Dof) -> bool:
         """Return whether a motion is held."""
-        node, direction = place
+        node, direction = dof
         return HeldMotion(node, direction) in self.held
 
-    def displacement(self, place: Place) -> WeightedRows | None:
+    def displacement(self, dof: Dof) -> WeightedRows | None:
         """Return the displacement of a node along an axis; None if it is not known.
 
         A held displacement follows from no row.
         """
-        if self.is_held(place):
+        if self.is_held(dof):
             return WeightedRows(np.empty(0, dtype=np.intp), np.empty(0))
-        if place in self.bound:
-            return self.bound[place]
-        return self._reader.weighted(place, READ_WEIGHTS)
+        if dof in self.bound:
+            return self.bound[dof]
+        return self._reader.weighted(dof, READ_WEIGHTS)
 
     def names_all(self, load: DeckLoad) -> bool:
         """Return whether all forces of a load act on rows that their names tell, or on supports."""
@@ -117,7 +117,7 @@ class MotionRows:
         )
         return not has_others and not self.missing(load, bound=False)
 
-    def missing(self, load: DeckLoad, *, bound: bool = True) -> list[Place]:
+    def missing(self, load: DeckLoad, *, bound: bool = True) -> list[Dof]:
         """Return the motions of a load's forces along axes that have no rows and are not held.
 
         Parameters
@@ -126,54 +126,54 @@ class MotionRows:
             Whether bound motions count as having rows.
         """
         tables = [load.forces, *load.side_forces.values()]
-        places = [place for table in tables for place, force in table.items() if force]
+        dofs = [dof for table in tables for dof, force in table.items() if force]
         return [
-            place
-            for place in dict.fromkeys(places)
-            if not self.is_held(place)
-            and self._reader.weighted(place, FORCE_WEIGHTS) is None
-            and not (bound and place in self.bound)
+            dof
+            for dof in dict.fromkeys(dofs)
+            if not self.is_held(dof)
+            and self._reader.weighted(dof, FORCE_WEIGHTS) is None
+            and not (bound and dof in self.bound)
         ]
 
-    def missing_rotations(self, load: DeckLoad) -> list[Place]:
+    def missing_rotations(self, load: DeckLoad) -> list[Dof]:
         """Return the motions of a load's moments that have no rows and are not held."""
         return [
-            place
-            for place, moment in load.moments.items()
-            if moment and place not in self.bound and not self.is_held(place)
+            dof
+            for dof, moment in load.moments.items()
+            if moment and dof not in self.bound and not self.is_held(dof)
         ]
 
     def vector(self, load: DeckLoad) -> FloatArray:
         """Return the forces (n,) of a load on the rows, without its acceleration."""
-        vector = np.zeros(len(self.places))
-        for place, force in (*load.forces.items(), *load.moments.items()):
-            self._add(vector, self._rows_of(place), force, place)
+        vector = np.zeros(len(self.dofs))
+        for dof, force in (*load.forces.items(), *load.moments.items()):
+            self._add(vector, self._rows_of(dof), force, dof)
         for side, forces in load.side_forces.items():
-            for place, force in forces.items():
-                self._add(vector, self._rows_of_side(place, side), force, place)
+            for dof, force in forces.items():
+                self._add(vector, self._rows_of_side(dof, side), force, dof)
         return vector
 
     def _add(
-        self, vector: FloatArray, weighted: WeightedRows | None, force: float, place: Place
+        self, vector: FloatArray, weighted: WeightedRows | None, force: float, dof: Dof
     ) -> None:
         """Add a force on a motion to a vector (n,)."""
-        if weighted is not None and not self.is_held(place):
+        if weighted is not None and not self.is_held(dof):
             np.add.at(vector, weighted.rows, force * weighted.weights)
 
-    def _rows_of(self, place: Place) -> WeightedRows | None:
+    def _rows_of(self, dof: Dof) -> WeightedRows | None:
         """Return the rows on which a force at a node acts."""
-        if place in self.bound:
-            return self.bound[place]
-        return self._reader.weighted(place, FORCE_WEIGHTS)
+        if dof in self.bound:
+            return self.bound[dof]
+        return self._reader.weighted(dof, FORCE_WEIGHTS)
 
-    def _rows_of_side(self, place: Place, side: ShellSide) -> WeightedRows | None:
+    def _rows_of_side(self, dof: Dof, side: ShellSide) -> WeightedRows | None:
         """Return the row on which a force on one side of a shell acts.
 
         CalculiX expands a node of a shell from the bottom to the top, and stores the rows in this
         order.
         """
-        rows = self._reader.rows.get(place, [])
+        rows = self._reader.rows.get(dof, [])
         if len(rows) not in _LAYERS:
-            return self._rows_of(place)
+            return self._rows_of(dof)
         row = rows[0] if side is ShellSide.BOTTOM else rows[-1]
         return WeightedRows(np.array([row]), np.ones(1))

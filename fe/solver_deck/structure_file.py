@@ -11,7 +11,7 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
-from fe.structure.matrix_tables import Place
+from fe.structure.matrix_tables import Dof
 
 from .calculix_jobs import StoredMatrices
 from .linear_model import TRANSLATIONS, HeldMotion, LinearModel
@@ -46,7 +46,7 @@ class OutputSet(NamedTuple):
     nodes: list[int]
     axes: str
 
-    def places(self) -> list[Place]:
+    def dofs(self) -> list[Dof]:
         """Return node and direction of all displacements that the outputs need."""
         return [(node, "xyz".index(letter) + 1) for letter in self.axes for node in self.nodes]
 
@@ -78,16 +78,16 @@ class DeckStructure:
     motion_rows: MotionRows
     length_unit: str
 
-    def row_counts(self) -> dict[Place, int]:
+    def row_counts(self) -> dict[Dof, int]:
         """Return how many rows of the matrices each direction of a node has."""
-        return row_counts(self.matrices.places)
+        return row_counts(self.matrices.dofs)
 
 
-def row_counts(places: Sequence[Place]) -> dict[Place, int]:
+def row_counts(dofs: Sequence[Dof]) -> dict[Dof, int]:
     """Return how many rows have each name."""
-    counts: dict[Place, int] = {}
-    for place in places:
-        counts[place] = counts.get(place, 0) + 1
+    counts: dict[Dof, int] = {}
+    for dof in dofs:
+        counts[dof] = counts.get(dof, 0) + 1
     return counts
 
 
@@ -144,7 +144,7 @@ def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> O
     unknown_nodes = []
     known_axes = ""
     for letter in output.axes:
-        motions = output._replace(axes=letter).places()
+        motions = output._replace(axes=letter).dofs()
         unknown = [node for node, axis in motions if rows.displacement((node, axis)) is None]
         unknown_nodes += unknown
         if not unknown and not all(map(rows.is_held, motions)):
@@ -173,7 +173,7 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
     """
     sparse.save_npz(folder / "stiffness.npz", structure.matrices.stiffness)
     sparse.save_npz(folder / MASS_FILE, structure.matrices.mass)
-    unknowns = "".join(f"{node}.{axis}\n" for node, axis in structure.matrices.places)
+    unknowns = "".join(f"{node}.{axis}\n" for node, axis in structure.matrices.dofs)
     (folder / "unknowns.dof").write_text(unknowns, encoding="ascii")
     lines = [
         f"name = {json.dumps(name)}",
@@ -244,15 +244,15 @@ def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: 
     """
     rows = structure.motion_rows
     weight = 1.0 / len(output.nodes)
-    places = [place for place in output.places() if not rows.is_held(place)]
-    if any(place in rows.bound for place in places):
-        mean = np.zeros(len(rows.places))
-        for place in places:
-            motion = rows.displacement(place)
+    dofs = [dof for dof in output.dofs() if not rows.is_held(dof)]
+    if any(dof in rows.bound for dof in dofs):
+        mean = np.zeros(len(rows.dofs))
+        for dof in dofs:
+            motion = rows.displacement(dof)
             assert motion is not None  # checked when the output was chosen
             mean += weight * motion.vector(len(mean))
         np.save(folder / f"{name}.npy", mean)
         return f"{name}.npy"
-    lines = [f"{node} {axis} {weight!r}" for node, axis in places]
+    lines = [f"{node} {axis} {weight!r}" for node, axis in dofs]
     (folder / f"{name}.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
     return f"{name}.txt"

@@ -22,9 +22,9 @@ from .deck_text import FLAT, fail, lines_of, real, whole, words_of
 _COMMENT = re.compile(r"^\s*\*\*.*")
 _INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _TYPES_OF_MESHIO = {"C3D8RH": "C3D8", "C3D10MH": "C3D10", "C3D20RH": "C3D20"}
-"""Types under which meshio writes plain hexahedra and tetrahedra, and their plain types.
+"""Types under which meshio writes plain hexahedra and tetrahedra, with the plain types.
 
-They have these types only in files of meshio. In others they are what they say.
+In files of other programs these types mean what they say.
 """
 _HEADING_OF_MESHIO = "written by meshio"
 
@@ -44,14 +44,14 @@ _OTHER_STIFFNESS = {
 
 
 class _ElementType(NamedTuple):
-    """A type of elements: its name in meshio, and the number of its nodes."""
+    """The name of an element type in meshio, and its number of nodes."""
 
     meshio_name: str
     node_count: int
 
 
 def _element_types() -> dict[str, _ElementType]:
-    """Return the types of elements that are read, by their names in a deck."""
+    """Return the element types that can be read, by their names in a deck."""
     types = {}
     for meshio_name, kind in DECK_KINDS.items():
         types[kind.calculix] = _ElementType(meshio_name, kind.node_count)
@@ -64,7 +64,7 @@ _ELEMENT_TYPES = _element_types()
 
 
 class DataLine(NamedTuple):
-    """A line of data: its file and line, and its values."""
+    """The values of a data line, with its file and line number."""
 
     where: str
     values: list[str]
@@ -75,13 +75,13 @@ class DataLine(NamedTuple):
         return [value for value in self.values if value]
 
     def node(self) -> tuple[int, list[float]]:
-        """Return the number and the three coordinates of a node; those left out are 0."""
+        """Return the number and three coordinates of a node; missing ones are 0."""
         number_text, *coordinate_texts = self.values
         three_texts = (*coordinate_texts, "", "", "")[:3]
         return whole(self.where, number_text), [real(self.where, text) for text in three_texts]
 
     def generated_members(self) -> range:
-        """Return the numbers that first, last and step generate; the step is 1 if left out."""
+        """Return the range given by first, last and step; a missing step is 1."""
         numbers = [whole(self.where, text) for text in self.texts]
         first, last, step = [*numbers, 1, 0, 0][:3]
         if len(numbers) not in (2, 3) or first < 1 or step < 1:
@@ -91,18 +91,16 @@ class DataLine(NamedTuple):
 
 
 class KeywordBlock(NamedTuple):
-    """A keyword with its parameters, and the lines of data below it.
+    """A keyword with its parameters, and the data lines below it.
 
     Attributes
     ----------
     where : str
         File and line of the keyword.
     keyword : str
-        The keyword in capital letters.
+        In capital letters.
     parameters : dict of str to str
         Values by name in capital letters; empty for a parameter without value.
-    data : list of DataLine
-        The lines of data.
     """
 
     where: str
@@ -111,17 +109,17 @@ class KeywordBlock(NamedTuple):
     data: list[DataLine]
 
     def required(self, parameter: str) -> str:
-        """Return a parameter that must be there."""
+        """Return the value of a parameter; raise `MeshError` if it is missing."""
         if not self.parameters.get(parameter):
             fail(self.where, f"*{self.keyword} must say {parameter}=a name.")
         return self.parameters[parameter]
 
 
 def read_abaqus(path: Path) -> Deck:
-    """Read the mesh in an input file of Abaqus or CalculiX: nodes, elements, surfaces and sets.
+    """Read nodes, elements, surfaces and sets from an input file of Abaqus or CalculiX.
 
-    The file consists of blocks: a keyword such as `*NODE`, its parameters, and lines of data.
-    Blocks that are not part of the mesh, such as materials, steps and loads, are ignored.
+    The file consists of blocks: a keyword such as `*NODE`, its parameters, and data lines. Blocks
+    that are not part of the mesh, such as materials, steps and loads, are ignored.
 
     Raises
     ------
@@ -165,7 +163,7 @@ def read_abaqus(path: Path) -> Deck:
 
 @dataclass
 class _RawBlock:
-    """A keyword line with the lines that continue it, and the lines of data below it."""
+    """A keyword line with its continuation lines, and the data lines below it."""
 
     where: str
     head: list[str]
@@ -178,7 +176,7 @@ class _RawBlock:
 
 
 def read_blocks(path: Path) -> Iterator[KeywordBlock]:
-    """Yield the keywords of a file with their parameters and data."""
+    """Yield the keyword blocks of a file."""
     raw_blocks: list[_RawBlock] = []
     for where, line in lines_of((path,), _COMMENT, _INCLUDE):
         text = line.strip()
@@ -200,7 +198,7 @@ def read_blocks(path: Path) -> Iterator[KeywordBlock]:
 
 
 def _parameters(texts: list[str]) -> dict[str, str]:
-    """Return the parameters of a keyword by their names in capitals, from texts such as NSET=A."""
+    """Parse keyword parameters such as NSET=A into values by name in capitals."""
     parameters = {}
     for text in texts:
         name, _, value = _with_single_spaces(text).partition("=")
@@ -210,15 +208,16 @@ def _parameters(texts: list[str]) -> dict[str, str]:
 
 
 def _with_single_spaces(text: str) -> str:
-    """Return a text with a single space between its words, and none around them."""
+    """Trim a text and reduce its white space to single spaces."""
     return " ".join(text.split())
 
 
 def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
-    """Return the system of the nodes below a *SYSTEM.
+    """Return the coordinate system that a *SYSTEM defines for the nodes below it.
 
-    It is given by its origin, then a point on x, then one in the plane of x and y. Without the
-    last, z stays and x turns about it; with the origin alone, the axes stay.
+    It gives the origin, a point on x, and a point in the plane of x and y. Without the last point,
+    z
+    stays and x is turned about it; with the origin alone, the axes stay.
     """
     numbers: list[float] = []
     for where, values in block.data:
@@ -242,7 +241,7 @@ def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
 
 
 def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -> None:
-    """Add the nodes of a *NODE; their coordinates are in the system of the last *SYSTEM."""
+    """Add the nodes of a *NODE, converted from the system of the last *SYSTEM."""
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
@@ -259,9 +258,9 @@ def _add_nodes(deck: Deck, block: KeywordBlock, coordinates: CoordinateSystem) -
 
 
 def _add_elements(deck: Deck, block: KeywordBlock, types_of_writer: Mapping[str, str]) -> None:
-    """Add the elements of an *ELEMENT; an element may take several lines.
+    """Add the elements of an *ELEMENT; one may take several lines.
 
-    The program that wrote the deck may mean plain types by others: `types_of_writer` has them.
+    `types_of_writer` maps type names that the writing program uses to the plain types it means.
     """
     type_name = block.required("TYPE").upper()
     plain_type = types_of_writer.get(type_name) or _plain_type(type_name, block.where)
@@ -269,12 +268,12 @@ def _add_elements(deck: Deck, block: KeywordBlock, types_of_writer: Mapping[str,
         deck.remark(f"{block.where}: elements of type {type_name} are built as {plain_type}.")
     element_type = _ELEMENT_TYPES[plain_type]
     numbers: list[int] = []
-    places: list[str] = []  # file and line of each number
+    location_of_number: list[str] = []  # file and line of each number
     for where, values in block.data:
         for text in values:
             if text:
                 numbers.append(whole(where, text))
-                places.append(where)
+                location_of_number.append(where)
     width = element_type.node_count + 1
     if len(numbers) % width:
         fail(
@@ -284,26 +283,16 @@ def _add_elements(deck: Deck, block: KeywordBlock, types_of_writer: Mapping[str,
     added = []
     for start in range(0, len(numbers), width):
         number, *nodes = numbers[start : start + width]
-        deck.add_element(places[start], number, element_type.meshio_name, nodes)
+        deck.add_element(location_of_number[start], number, element_type.meshio_name, nodes)
         added.append(number)
     if "ELSET" in block.parameters:
         deck.members("ELSET", block.required("ELSET")).extend(added)
 
 
 def _plain_type(name: str, where: str) -> str:
-    """Return the plain element type, a key of `_ELEMENT_TYPES`, with the stiffness of a given type.
+    """Return the plain element type, a key of `_ELEMENT_TYPES`, with the same stiffness.
 
-    Parameters
-    ----------
-    name : str
-        The element type in the deck, such as C3D8H.
-    where : str
-        The file and the line that name the type, for messages.
-
-    Raises
-    ------
-    MeshError
-        If elements of this type cannot be read.
+    Raises `MeshError` if elements of this type, such as C3D8I, cannot be read.
     """
     variant = _HYBRID_OR_THERMAL_TYPE.fullmatch(name)
     plain_type = name if variant is None else variant[1]
@@ -313,7 +302,7 @@ def _plain_type(name: str, where: str) -> str:
 
 
 def _refuse_type(name: str, where: str) -> NoReturn:
-    """Raise the error of an element type that cannot be read.
+    """Raise the error for an element type that cannot be read.
 
     For a variant of a known type, the message says how the variant differs.
     """
@@ -336,7 +325,7 @@ def _refuse_type(name: str, where: str) -> NoReturn:
 
 
 def _add_surface(deck: Deck, block: KeywordBlock) -> None:
-    """Add a *SURFACE that names faces of elements; one of nodes is passed over."""
+    """Add the element faces of a *SURFACE; a surface of nodes is ignored."""
     if block.parameters.get("TYPE", "ELEMENT").upper() != "ELEMENT":
         return
     rows = []
@@ -347,7 +336,7 @@ def _add_surface(deck: Deck, block: KeywordBlock) -> None:
 
 
 def _add_members(deck: Deck, block: KeywordBlock) -> None:
-    """Add the members of an *NSET or *ELSET, written out or generated by first, last and step."""
+    """Add the members of an *NSET or *ELSET, listed or generated."""
     members = deck.members(block.keyword, block.required(block.keyword))
     for line in block.data:
         if "GENERATE" in block.parameters:

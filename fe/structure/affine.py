@@ -23,7 +23,7 @@ from .tables import StructureDesign
 
 Values = Mapping[str, float]
 PORT_PREFIX = "port."
-"""Begin of the names of force and displacement at a port; see `AffineStructure.pushed_at_ports`.
+"""Begin of the names of force and displacement at a port; see `AffineStructure.with_port_forces`.
 
 No name in a structure file has a dot.
 """
@@ -47,7 +47,7 @@ class StiffnessTerm(NamedTuple):
 
 
 class LoadTerm(NamedTuple):
-    """Part (n,) of a load [N], or of a load on 1 kg of a free mass [N/kg]."""
+    """A component (n,) of a load [N], or of a load per kilogram of a free mass [N/kg]."""
 
     load: str
     vector: FloatArray
@@ -55,18 +55,18 @@ class LoadTerm(NamedTuple):
 
 
 class SupportMotion(NamedTuple):
-    """A motion of a support that is an unknown of a structure.
+    """A motion of a support that is an unknown of the structure.
 
     Attributes
     ----------
     support : str
-        Name of the support: its set of nodes, or its nodes.
+        The support's set of nodes, or its nodes.
     motion : str
         One of `tables.MOTIONS`.
     unknown : int
-        Number of the unknown [m or rad].
+        Index of the unknown [m or rad].
     spring : float
-        Spring that resists it [N/m or N m/rad]; zero for a motion that is held unless the support
+        Stiffness of its spring [N/m or N m/rad]; zero for a motion that is held unless the support
         yields.
     """
 
@@ -77,7 +77,7 @@ class SupportMotion(NamedTuple):
 
 
 class SystemMatrices(NamedTuple):
-    """A structure at certain values.
+    """The matrices of a structure for one set of parameter values.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class SystemMatrices(NamedTuple):
 
 
 class SplitValues(NamedTuple):
-    """Values by name, split by what they are of."""
+    """Values by name, sorted into parameters, stiffness losses and masses."""
 
     parameters: dict[str, float]
     losses: dict[str, float]
@@ -200,7 +200,7 @@ class AffineStructure:
     def stiffness(
         self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
     ) -> sparse.csr_array:
-        """Return the stiffness (n, n) [N/m]; parameters are those of `theta`."""
+        """Return the stiffness (n, n) [N/m]; the parameters are as in `theta`."""
         terms = tuple(term.matrix for term in self.stiffness_terms)
         return affine_sum(self.theta(parameters, stiffness_loss), terms)
 
@@ -216,16 +216,17 @@ class AffineStructure:
         return affine_sum([*factors.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
-        """Return the value of a load's control for an examination of this load alone.
+        """Return the value of a load's control with which the load is examined alone.
 
-        That is the nominal value, or one if the nominal value is zero, at which there is no load.
-        It is one for a constant load.
+        This is the nominal value. It is one where the nominal value is zero, since there would be
+        no
+        load, and for a constant load.
         """
         nominal_value = self._nominal_control(load)
         return 1.0 if nominal_value == 0.0 else nominal_value
 
     def _nominal_control(self, load: str) -> float:
-        """Return the nominal value of the control of a load, one for a constant load."""
+        """Return the nominal value of a load's control, or one for a constant load."""
         control = self.loads[load]
         return 1.0 if control is None else self.controls[control]
 
@@ -250,12 +251,14 @@ class AffineStructure:
         return total_load
 
     def system_at(self, values: Values) -> SystemMatrices:
-        """Return stiffness, mass and the sum of all loads at values by name.
+        """Return the stiffness, the mass and the sum of all loads for given values.
 
         Parameters
         ----------
         values : mapping of str to float
-            Parameters, losses, free masses and controls; the others are nominal, and healthy.
+            Parameters, losses, free masses and controls by name. All others have their nominal
+            values,
+            and the losses are zero.
         """
         values_by_kind = self.split_values(values)
         total_load: FloatArray = np.zeros(self.unknowns)
@@ -269,18 +272,21 @@ class AffineStructure:
         )
 
     def split_values(self, values: Values) -> SplitValues:
-        """Return the parameters, the losses and the free masses among values by name."""
+        """Sort values by name into parameters, stiffness losses and free masses.
+
+        Controls are left out.
+        """
 
         def among(names: Iterable[str]) -> dict[str, float]:
             return {name: values[name] for name in names if name in values}
 
         return SplitValues(among(self.parameters), among(self.regions), among(self.masses))
 
-    def pushed_at_ports(self) -> "AffineStructure":
-        """Return the structure with a force [N] and a displacement [m], `port.NAME`, at each port.
+    def with_port_forces(self) -> "AffineStructure":
+        """Return the structure with a load and an output `port.NAME` at each port.
 
-        The force is a control whose nominal value is zero: it acts only where something asks for
-        it.
+        The load is a force [N] whose control is zero by default, the output is the displacement
+        [m].
         """
         names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
         unit_forces = self.port_output.toarray()
@@ -298,8 +304,8 @@ class AffineStructure:
             ),
         )
 
-    def held(self) -> "AffineStructure":
-        """Return the structure with all supports held; of one that does not yield, itself."""
+    def with_held_supports(self) -> "AffineStructure":
+        """Return the structure with all supports held; itself if no support yields."""
         released = [motion for motion in self.support_motions if motion.spring == 0.0]
         if not released:
             return self
@@ -329,24 +335,12 @@ class AffineStructure:
 def _values_with_changes(
     nominal_values: dict[str, float], changed_values: Values | None, kind: str
 ) -> dict[str | None, float]:
-    """Return the values of all parameters or masses, of which some differ from their nominal value.
+    """Return all values by name, nominal unless changed, and 1.0 under the name None.
 
-    A term of the stiffness or the mass matrix is multiplied by the value that it names. A term that
-    names none has the name None, so the value of None is 1.0.
-
-    Parameters
-    ----------
-    nominal_values : dict of str to float
-        The nominal values by name.
-    changed_values : mapping of str to float, optional
-        The values that differ from the nominal ones, by name.
-    kind : str
-        The noun of the values in error messages: "parameter" or "free mass".
-
-    Raises
-    ------
-    InvalidStateError
-        If a name in `changed_values` is not a name in `nominal_values`.
+    Terms of the stiffness or mass matrix are multiplied by the value that they name; a term that
+    names none has the name None. Raises `InvalidStateError` for a changed value that is not among
+    the
+    nominal ones; the message calls it by `kind`, "parameter" or "free mass".
     """
     changes = dict(changed_values or {})
     unknown_names = set(changes) - set(nominal_values)
@@ -362,7 +356,7 @@ def _values_with_changes(
 
 @dataclass(frozen=True)
 class AffineResponse:
-    """Static response of a structure.
+    """The static response of a structure.
 
     Attributes
     ----------
@@ -383,12 +377,14 @@ class AffineResponse:
 
 
 def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
-    """Solve for each load alone, the structure undamaged, with the value of `control_value_alone`.
+    """Solve the undamaged structure for each load alone.
+
+    The control of each load has the value `control_value_alone`.
 
     Returns
     -------
     dict of str to AffineResponse
-        The response to each load by the load's name.
+        The response to each load, by the load's name.
 
     Raises
     ------
@@ -409,12 +405,13 @@ def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
 
 
 def static_response(structure: AffineStructure, values: Mapping[str, float]) -> AffineResponse:
-    """Solve for all loads together.
+    """Solve the structure for all loads together.
 
     Parameters
     ----------
     values : mapping of str to float
-        Parameters, losses, free masses and controls; the others are nominal, and healthy.
+        Parameters, losses, free masses and controls by name. All others have their nominal values,
+        and the losses are zero.
 
     Raises
     ------
@@ -426,7 +423,7 @@ def static_response(structure: AffineStructure, values: Mapping[str, float]) -> 
 
 
 def _static_response(structure: AffineStructure, displacement: FloatArray) -> AffineResponse:
-    """Return the response with free unknowns (n,)."""
+    """Return the outputs of a structure whose free unknowns (n,) are known."""
     nodal_displacement = structure.full_displacement(displacement)
     return AffineResponse(
         displacement=displacement,
@@ -437,7 +434,7 @@ def _static_response(structure: AffineStructure, displacement: FloatArray) -> Af
 
 
 class NaturalModes(NamedTuple):
-    """Lowest undamped modes of a structure.
+    """The lowest undamped modes of a structure.
 
     Attributes
     ----------
@@ -457,19 +454,22 @@ def natural_frequencies(
     values: Mapping[str, float] | None = None,
     factors: Factorisation | None = None,
 ) -> NaturalModes:
-    """Return the lowest natural frequencies and mode shapes, undamped.
+    """Compute the lowest undamped natural frequencies and mode shapes.
 
     Parameters
     ----------
+    count : int
+        From 1 to the number of free unknowns minus one.
     values : mapping of str to float, optional
-        Parameters, losses and free masses; the others are nominal, and healthy.
+        Parameters, losses and free masses by name. All others have their nominal values, and the
+        losses are zero.
     factors : Factorisation, optional
         The factorised stiffness at these values, if it is at hand.
 
     Raises
     ------
     SolutionError
-        If there is no mass, there are not so many modes, or the iteration did not converge.
+        If the structure has no mass, has fewer modes, or the iteration did not converge.
     """
     most = structure.unknowns - 1
     if not 1 <= count <= most:

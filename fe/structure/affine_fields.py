@@ -1,4 +1,4 @@
-"""The fields of an affine model that follow from its design and from matrices on all unknowns."""
+"""The part of an affine model that follows from the design and from matrices on all unknowns."""
 
 from collections.abc import Iterable
 from typing import NamedTuple, TypedDict
@@ -32,7 +32,7 @@ class OutputRows(NamedTuple):
 
 
 class AffineFields(TypedDict):
-    """The fields of `AffineStructure` without design, stiffness terms and hash."""
+    """All fields of `AffineStructure` but the design, its hash and the stiffness terms."""
 
     parameters: dict[str, float]
     masses: dict[str, float]
@@ -64,7 +64,9 @@ def affine_fields(
     outputs: OutputRows,
     support_motions: tuple[SupportMotion, ...] = (),
 ) -> AffineFields:
-    """Return the fields of the affine model of a design, without design, stiffness terms and hash.
+    """Project mass, loads and outputs on the free unknowns.
+
+    The result has all fields of `AffineStructure` but the design, its hash and the stiffness terms.
 
     Parameters
     ----------
@@ -77,10 +79,6 @@ def affine_fields(
     loads : iterable of (full,) array
         For each load of the design the forces [N], or the field [m/s^2] of an acceleration, which
         acts on the free masses, too.
-    outputs : OutputRows
-        Rows of the design's gauges, displacements, accelerations and ports.
-    support_motions : tuple of SupportMotion
-        The unknowns that are motions of supports.
 
     Raises
     ------
@@ -126,7 +124,7 @@ def affine_fields(
 
 
 def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
-    """Raise `InvalidDesignError` if the supports hold a port, whose row (n,) is then zero."""
+    """Raise `InvalidDesignError` if the supports hold a port: its row (n,) is zero."""
     for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
         if not row.any():
             raise InvalidDesignError(
@@ -138,7 +136,7 @@ def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array
 def _masses_by_name(
     design: StructureDesign, mass: sparse.csr_array, point_masses: Iterable[sparse.csr_array]
 ) -> dict[str | None, sparse.csr_array]:
-    """Return the mass with fixed point masses under None, and 1 kg of each free mass by name."""
+    """Return 1 kg of each free mass by name, and all other mass under the name None."""
     fixed_mass = mass
     free_masses: dict[str | None, sparse.csr_array] = {}
     for part, matrix in zip(design.mass, point_masses, strict=True):

@@ -1,4 +1,4 @@
-"""The body that a mesh becomes: cells with materials, and what holds them."""
+"""A mesh with materials, supports and point masses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -25,8 +25,6 @@ class MassAtPoints(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        The name of the point mass.
     mass : float
         The mass at each point [kg].
     weights : (k, nodes) array
@@ -75,7 +73,7 @@ class Body(Generic[Mesh]):
     mass_rule: Rule | None = None
 
     def stiffness(self, cells: IntArray) -> sparse.csr_array:
-        """Return the stiffness (n, n) [N/m] of some cells on the free unknowns."""
+        """Return the stiffness (n, n) [N/m] of the given cells on the free unknowns."""
         point_count = len(self.mesh.kind.stiffness_rule.weights)
         shape = (len(self.part), point_count)
         factor = np.broadcast_to(self.variation, shape)
@@ -85,7 +83,10 @@ class Body(Generic[Mesh]):
 
     @property
     def stiffness_terms(self) -> tuple[StiffnessTerm, ...]:
-        """The parts in their order; springs are with the part of no parameter and no region."""
+        """Stiffness of each part, in their order.
+
+        Springs are added to the part without parameter and region, which is made if there is none.
+        """
         terms = {}
         for number, pair in enumerate(self.parts):
             terms[pair] = self.stiffness(np.flatnonzero(self.part == number))
@@ -100,12 +101,12 @@ class Body(Generic[Mesh]):
 
     @cached_property
     def cell_mass(self) -> sparse.csr_array:
-        """Mass (nodes, nodes) [kg] of the cells, of one component."""
+        """Mass (nodes, nodes) [kg] of the cells for one displacement component."""
         return self.mesh.mass(np.arange(len(self.part)), self.density, self.mass_rule)
 
     @property
     def nodal_mass(self) -> FloatArray:
-        """Mass (nodes,) [kg] of cells and nominal point masses that each node carries."""
+        """Mass (nodes,) [kg] at each node: that of the cells, lumped, and nominal point masses."""
         nodal_masses: FloatArray = np.asarray(self.cell_mass.sum(axis=1))
         for point_mass in self.masses:
             nodal_masses = nodal_masses + point_mass.mass * point_mass.weights.sum(axis=0)
@@ -114,14 +115,12 @@ class Body(Generic[Mesh]):
     def affine_fields(
         self, design: StructureDesign, loads: Iterable[FloatArray], outputs: OutputRows
     ) -> AffineFields:
-        """Return the fields of the affine model, without design, stiffness terms and hash.
+        """Return all fields of the affine model but the design, its hash and the stiffness terms.
 
         Parameters
         ----------
         loads : iterable of (full,) array
-            Its loads, as in `fe.structure.affine_fields.affine_fields`.
-        outputs : OutputRows
-            Rows of its gauges, displacements, accelerations and ports.
+            Nodal loads, as in `fe.structure.affine_fields.affine_fields`.
         """
         components = sparse.eye_array(3)  # a mass acts equally along x, y and z
         mass = sparse.kron(self.cell_mass, components, format="csr")

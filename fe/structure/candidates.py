@@ -1,7 +1,7 @@
-"""What may differ from a structure file: masses, stiffness of patches, loads, and gauges.
+"""Changes of a structure that a search may propose: masses, softer patches, loads and gauges.
 
-They are hypotheses, and no part of the structure file. Places are the sets that the mesh names, and
-a grid that is fine enough to say where an engineer has to look.
+None of them is part of the structure file. They are proposed at the named sets of the mesh and on a
+grid that is fine enough to tell an engineer where to look.
 """
 
 from collections.abc import Iterator
@@ -29,36 +29,39 @@ GRID_POINTS = 36
 GRID_PATCHES = 12
 """Largest number of patches of the grid that may lose stiffness."""
 LEAST_DISTANCE = 0.1
-"""Least distance of the middles of patches over the size of the mesh."""
+"""Least distance between the centres of two patches, relative to the size of the mesh."""
 LEAST_DISTANCE_OF_POINTS = 0.07
-"""Least distance of points of the grid of masses over the size of the mesh."""
+"""Least distance between two candidate points of a mass, relative to the size of the mesh."""
 LARGEST_RADIUS = 0.12
-"""Radius of a named set of cells, over the size of the mesh, up to which it is a patch."""
+"""Largest radius of a named set of cells that is a patch, relative to the size of the mesh."""
 LARGEST_NODE_SHARE = 0.5
-"""Share of all nodes from which on a named set is no place of a mass, but the structure itself."""
+"""A named set with this share of all nodes or more is no candidate: it is the structure itself."""
 AXES = ("x", "y", "z")
 """Names of the axes."""
 LEAST_SINE = 0.1
 """Sine of the angle between a force and an axis below which it is not tilted towards the axis."""
 OFFSET_STEP = 0.01
-"""Step of the place of a force over the size of the mesh, for its derivative."""
+"""Step by which a force is moved for a finite difference, relative to the size of the mesh."""
 GAUGE_STEP = 0.03
-"""Step of the place of a gauge over the size of the mesh: about as far as a gauge may be off, and
-larger than a cell of an ordinary mesh, whose strains jump from cell to cell."""
+"""Step by which a gauge is moved for a finite difference, relative to the size of the mesh.
+
+It is about as large as the error of a gauge's position, and larger than an ordinary cell, since
+strains jump from cell to cell.
+"""
 GAUGE_AXES = {"along": (1.0, 0.0), "across": (0.0, 1.0)}
 """Directions in the surface in which a gauge may lie beside its point, as seen from the gauge."""
 SETS_OF_THE_MESHER = "gmsh:"
-"""Begin of the names of sets that a mesher makes, and no engineer."""
+"""Prefix of the names of sets that the mesher makes, and not an engineer."""
 NO_POINTS: IntArray = np.zeros(0, dtype=np.int64)
 
 
-class MassPlace(NamedTuple):
-    """A place where a mass may be.
+class MassCandidate(NamedTuple):
+    """A location where a mass may be added or missing.
 
     Attributes
     ----------
     name : str
-        Its name: a set, a point or a node.
+        The name of a set, a point or a node.
     rows : csr (3, n)
         Rows that give the displacement of the mass along x, y and z.
     """
@@ -67,26 +70,28 @@ class MassPlace(NamedTuple):
     rows: sparse.csr_array
 
 
-class LossPlace(NamedTuple):
-    """A patch that may lose stiffness.
+class LossCandidate(NamedTuple):
+    """A patch of cells that may have lost stiffness.
 
     Attributes
     ----------
     name : str
-        Its name: a set, or where its middle is.
+        The name of a set, or where the centre of the patch is.
     terms : dict of int to csr (n, n)
-        Its part of each stiffness term, by the number of the term.
+        The contribution of the patch to each stiffness term, by the term's index.
     """
 
     name: str
     terms: dict[int, sparse.csr_array]
 
 
-def mass_places(structure: AffineStructure) -> list[MassPlace]:
-    """Return the places where a mass may be added or lost.
+def mass_places(structure: AffineStructure) -> list[MassCandidate]:
+    """List the locations where a mass may be added or missing.
 
-    Of a mesh these are its named sets of nodes, which a mass moves with on average, and points of a
-    grid. Of matrices these are the nodes that the structure file names.
+    For a mesh these are its named sets of nodes, whose mean displacement the mass follows, and
+    points
+    of a grid. For matrices they are the nodes that the structure file names. Locations that the
+    supports hold are left out.
     """
     if isinstance(structure, Structure):
         candidates = list(places_of_mesh(structure.mesh))
@@ -100,12 +105,12 @@ def mass_places(structure: AffineStructure) -> list[MassPlace]:
         free_rows = (rows @ structure.expansion).tocsr()
         held_count = len([motion for motion in structure.support_motions if motion.spring == 0.0])
         if abs(free_rows[:, : structure.unknowns - held_count]).max() > 0.0:
-            places.append(MassPlace(name, free_rows))
+            places.append(MassCandidate(name, free_rows))
     return places
 
 
 def places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
-    """Yield names and weights (nodes,) of sets of nodes, then of points of a grid."""
+    """Yield names and nodal weights (nodes,) of sets of nodes, then of grid points."""
     for name, nodes in mesh.node_sets.items():
         is_place = np.all(nodes >= 0) and len(nodes) < LARGEST_NODE_SHARE * len(mesh.points)
         if is_place and not name.startswith(SETS_OF_THE_MESHER):
@@ -117,11 +122,11 @@ def places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
         node = corners[number]
         weights = np.zeros(len(mesh.points))
         weights[node] = 1.0
-        yield f"the point {mesh.place(np.round(mesh.points[node], 9))}", weights
+        yield f"the point {mesh.describe_point(np.round(mesh.points[node], 9))}", weights
 
 
 def _places_of_nodes(structure: MatrixStructure) -> Iterator[tuple[str, FloatArray]]:
-    """Yield names and weights (nodes,) of the nodes that the design names, each once."""
+    """Yield the name and the nodal weights (nodes,) of each node that the design names."""
     design = structure.design
     named = []
     rows: tuple[MatrixLoad | MatrixMass | NodeOutput, ...] = (
@@ -142,21 +147,11 @@ def _places_of_nodes(structure: MatrixStructure) -> Iterator[tuple[str, FloatArr
 def _spread_points(
     points: FloatArray, count: int, least_distance: float, preferred: IntArray = NO_POINTS
 ) -> IntArray:
-    """Return the numbers of points that are no nearer to each other than a distance, up to a count.
+    """Choose up to `count` points (P, 3) by farthest-point sampling; return their indices.
 
-    Preferred points come first, up to half of the count. Each further one is the point farthest
-    from those before it; without any, the first is the point farthest from the middle.
-
-    Parameters
-    ----------
-    points : (P, 3) array
-        The points.
-    count : int
-        Largest number of points to choose.
-    least_distance : float
-        Least distance of two chosen points.
-    preferred : array of int
-        Numbers of points that are chosen unless they are too near to another.
+    No two chosen points are nearer to each other than `least_distance`. Preferred points come
+    first,
+    up to half of the count; without any, the first is the point farthest from the mean.
     """
     chosen: list[int] = []
     distance = np.full(len(points), np.inf)
@@ -175,54 +170,54 @@ def _spread_points(
     return np.array(chosen, dtype=np.int64)
 
 
-def loss_places(structure: AffineStructure) -> list[LossPlace]:
-    """Return the patches of a mesh that may lose stiffness, outside its damage regions.
+def loss_places(structure: AffineStructure) -> list[LossCandidate]:
+    """List the patches of a mesh that may have lost stiffness, outside its damage regions.
 
-    These are its small named sets of cells, and compact patches of a grid on all other cells,
-    without overlap. Where there are gauges, the grid has patches around them: a loss below a gauge
-    changes its strain most, which a patch with the gauge at its edge could not show. Matrices have
-    no cells.
+    These are its small named sets of cells and, on all other cells, the Voronoi cells of a coarse
+    grid.
+    Gauges are grid points where possible: a loss below a gauge changes its strain most, which would
+    not show if the gauge were at the edge of its patch. A structure from matrices has no patches.
     """
     if not isinstance(structure, Structure):
         return []
     mesh = structure.mesh
-    is_open = structure.region_of < 0
+    is_free_cell = structure.region_of < 0
     patches: dict[str, IntArray] = {}
     for name, cells in mesh.cell_sets.items():
         centres = mesh.centres[cells]
         radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max(initial=0.0)
         is_small = len(cells) > 0 and radius <= LARGEST_RADIUS * mesh.size
-        if is_small and is_open[cells].all() and not name.startswith(SETS_OF_THE_MESHER):
+        if is_small and is_free_cell[cells].all() and not name.startswith(SETS_OF_THE_MESHER):
             patches[name] = cells
-            is_open[cells] = False
-    remaining = np.flatnonzero(is_open)
+            is_free_cell[cells] = False
+    remaining = np.flatnonzero(is_free_cell)
     if len(remaining):
         centres = mesh.centres[remaining]
         cells_at_gauges = _cells_at_gauges(structure)
-        middles = _spread_points(
+        centre_cells = _spread_points(
             centres,
             GRID_PATCHES,
             LEAST_DISTANCE * mesh.size,
-            preferred=np.searchsorted(remaining, cells_at_gauges[is_open[cells_at_gauges]]),
+            preferred=np.searchsorted(remaining, cells_at_gauges[is_free_cell[cells_at_gauges]]),
         )
-        _, patch_of = KDTree(centres[middles]).query(centres)
-        for number, middle in enumerate(middles):
-            name = f"around {mesh.place(np.round(centres[middle], 4))}"
+        _, patch_of = KDTree(centres[centre_cells]).query(centres)
+        for number, centre_cell in enumerate(centre_cells):
+            name = f"around {mesh.describe_point(np.round(centres[centre_cell], 4))}"
             patches[name] = remaining[patch_of == number]
     pairs = [(term.parameter, term.region) for term in structure.stiffness_terms]
     places = []
     for name, cells in patches.items():
         terms = {}
-        for part, pair in enumerate(structure.body.parts):
-            cells_of_part = cells[structure.body.part[cells] == part]
+        for part_number, pair in enumerate(structure.body.parts):
+            cells_of_part = cells[structure.body.part[cells] == part_number]
             if len(cells_of_part):
                 terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
-        places.append(LossPlace(name, terms))
+        places.append(LossCandidate(name, terms))
     return places
 
 
 def _cells_at_gauges(structure: Structure) -> IntArray:
-    """Return the cell (G,) whose middle is nearest to each gauge."""
+    """Return the cell (G,) whose centre is nearest to each gauge."""
     mesh = structure.mesh
     points = [mesh.unit * np.asarray(gauge.point) for gauge in structure.design.gauge]
     if not points:
@@ -232,18 +227,18 @@ def _cells_at_gauges(structure: Structure) -> IntArray:
 
 
 class LoadChange(NamedTuple):
-    """How a force changes with its place or its direction.
+    """The derivative of a force with respect to its position or direction.
 
     Attributes
     ----------
     control : str
         The control of the force.
     change : str
-        "offset" of its place or "tilt" of its direction.
+        "offset" of its position or "tilt" of its direction.
     axis : str
         The axis along which it is offset, or towards which it is tilted.
     vector : (n,) array
-        Change of the load per unit of the control, and per metre or radian.
+        Derivative of the load per unit of the control, and per metre or radian.
     """
 
     control: str
@@ -253,10 +248,10 @@ class LoadChange(NamedTuple):
 
 
 def load_changes(structure: AffineStructure) -> list[LoadChange]:
-    """Return the changes of the forces of a mesh that controls in newtons set.
+    """Return the derivatives of each force whose control is in newtons.
 
-    A force at a point may act beside it, on the surface and inside; each force may have another
-    direction.
+    Every such force may be tilted; one that acts at a point may also be offset on the surface or
+    inside.
     """
     if not isinstance(structure, Structure):
         return []
@@ -284,27 +279,31 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
 def _gradient_of_weights(
     mesh: StructureMesh, load: MeshLoad, direction: FloatArray, label: str
 ) -> FloatArray | None:
-    """Return the change (nodes,) of the weights of a load per metre; None off the structure."""
+    """Return the derivative (nodes,) of the load's nodal weights per metre along a direction.
+
+    It is a central difference, or one-sided where one side lies outside the structure, and None
+    where both do.
+    """
     if load.point is None:
         return None
     step = OFFSET_STEP * mesh.size
-    sides = []
+    weights_by_sign = []
     for sign in (1.0, -1.0):
         point = np.asarray(load.point) + sign * step / mesh.unit * direction
         with suppress(InvalidDesignError):
-            sides.append((sign, point_weights(mesh, tuple(point.tolist()), label)))
-    if not sides:
+            weights_by_sign.append((sign, point_weights(mesh, tuple(point.tolist()), label)))
+    if not weights_by_sign:
         return None
-    if len(sides) == 1:
-        sides.append((0.0, point_weights(mesh, load.point, label)))
-    (first_sign, first), (second_sign, second) = sides
-    return np.asarray((first - second) / (step * (first_sign - second_sign)))
+    if len(weights_by_sign) == 1:
+        weights_by_sign.append((0.0, point_weights(mesh, load.point, label)))
+    (first_sign, first_weights), (second_sign, second_weights) = weights_by_sign
+    return np.asarray((first_weights - second_weights) / (step * (first_sign - second_sign)))
 
 
 def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
-    """Return rows (G, n) of the strains across the gauges of a mesh, and of the shear strains.
+    """Return rows (G, n) of the transverse strains, and of the shear strains, at the gauges.
 
-    With the strain e45 halfway between both directions the shear is 2 e45 - e - e_across.
+    With the strain e45 halfway between both directions the shear strain is 2 e45 - e - e_across.
     """
     if not isinstance(structure, Structure):
         no_rows = sparse.csr_array((0, structure.unknowns))
@@ -319,10 +318,12 @@ def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:
 
 
 class GaugeShift(NamedTuple):
-    """How the strain of a gauge changes with its place.
+    """The derivatives of a gauge's strain with respect to its position.
 
     Attributes
     ----------
+    gauge : str
+        Name of the gauge.
     axis : str
         "along" the gauge or "across" it.
     rows : csr (2, n)
@@ -335,10 +336,11 @@ class GaugeShift(NamedTuple):
 
 
 def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
-    """Return how the strains of the gauges of a mesh change with the places of the gauges.
+    """Return the derivatives of the strain at each gauge with respect to its position.
 
-    The derivatives are those of a parabola through three places. Where a gauge would reach over an
-    edge at one side, it is a straight line through the other two.
+    They are those of a parabola through three positions. Where the gauge would reach over an edge
+    on
+    one side, they are those of the line through the other two; where on both, there are none.
     """
     if not isinstance(structure, Structure):
         return []
@@ -348,16 +350,16 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
     for gauge in structure.design.gauge:
         middle, _ = gauge_rows(mesh, (gauge,))
         for axis, direction in GAUGE_AXES.items():
-            rises = []
+            difference_quotients = []
             for distance in (step, -step):
                 offset = (distance * direction[0], distance * direction[1])
                 with suppress(InvalidDesignError):
                     rows, _ = gauge_rows(mesh, (gauge,), offset=offset)
-                    rises.append((rows - middle) / distance)
-            if not rises:
+                    difference_quotients.append((rows - middle) / distance)
+            if not difference_quotients:
                 continue
-            slope = (rises[0] + rises[-1]) / 2.0
-            curvature = (rises[0] - rises[-1]) / step
+            slope = (difference_quotients[0] + difference_quotients[-1]) / 2.0
+            curvature = (difference_quotients[0] - difference_quotients[-1]) / step
             derivatives = sparse.vstack((slope, curvature)) @ structure.expansion
             shifts.append(GaugeShift(gauge.name, axis, derivatives.tocsr()))
     return shifts

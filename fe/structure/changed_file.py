@@ -1,4 +1,4 @@
-"""The tables of a structure file under a patch: supports, masses and loads as they were found."""
+"""A structure file with the changes of a patch written into its tables."""
 
 import os
 from pathlib import Path
@@ -28,7 +28,7 @@ from .operators import structure_mesh
 from .tables import MOTIONS
 
 WRITTEN = (SupportCompliance, PlaceMass, LoadOffset, LoadTilt, GaugeOffset)
-"""Kinds of primitives that a structure file of a mesh can state."""
+"""Kinds of primitives that the structure file of a mesh can express."""
 
 Tables = dict[str, Any]
 
@@ -38,15 +38,17 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
 
     Parameters
     ----------
+    file : Path
+        The structure file.
     patch : ModelPatch
-        The patch: supports that yield, masses that are added, loads that are moved or turned.
+        Only primitives of the kinds `WRITTEN`.
     folder : Path
-        The folder of the new file, from which its mesh is named.
+        The folder of the new file; the path of the mesh is relative to it.
 
     Raises
     ------
     InvalidPatchError
-        If the file cannot state a change.
+        If the file cannot express a change.
     """
     design = load_structure(file)
     tables: Tables = dict(read_toml(file, InvalidDesignError, what="structure file"))
@@ -81,7 +83,7 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
 
 
 def _not_stated(primitive: Primitive, reason: str) -> InvalidPatchError:
-    """Return the refusal of a primitive that a structure file cannot state."""
+    """Return the error for a primitive that a structure file cannot express."""
     return InvalidPatchError(
         f"A structure file cannot state the primitive {primitive.kind!r}: {reason}; give an --out "
         "that ends in .json, which is accepted wherever a model is expected."
@@ -89,7 +91,12 @@ def _not_stated(primitive: Primitive, reason: str) -> InvalidPatchError:
 
 
 def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompliance) -> None:
-    """Let a support yield along one motion against a spring, as a rigid set about its centre."""
+    """Release one motion of a support and give it a spring.
+
+    The support becomes a rigid set about its centre if it is none yet. The compliance is added to
+    that
+    of a spring that is there already.
+    """
     rows = [row for row in tables["support"] if row["set"] == primitive.support]
     if len(rows) != 1:
         reason = f"{len(rows)} tables hold the set {primitive.support!r}"
@@ -113,7 +120,7 @@ def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompl
 
 
 def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None:
-    """Add a mass at the point of a place; the place of a set is its centre."""
+    """Add a point mass at the centre of a set, or at a point."""
     if primitive.mass <= 0.0:
         raise _not_stated(primitive, f"a mass must be positive, and this one is {primitive.mass:g}")
     weights = dict(places_of_mesh(mesh))[primitive.place]
@@ -133,7 +140,7 @@ def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None
 
 
 def _shift_gauge(tables: Tables, mesh: StructureMesh, primitive: GaugeOffset) -> None:
-    """Move the point of a gauge along itself or across, on the surface."""
+    """Move a gauge along or across its direction, tangentially to the surface."""
     rows = [row for row in tables.get("gauge", ()) if row["name"] == primitive.gauge]
     if not rows:
         raise _not_stated(primitive, f"it has no [[gauge]] {primitive.gauge!r} of its own")
@@ -144,7 +151,7 @@ def _shift_gauge(tables: Tables, mesh: StructureMesh, primitive: GaugeOffset) ->
 
 
 def _load_of(tables: Tables, control: str, key: str) -> Tables:
-    """Return the row of the force of a control, which has a key."""
+    """Return the only load table with this control and this key."""
     rows = [row for row in tables["load"] if row.get("control") == control and key in row]
     if len(rows) != 1:
         raise InvalidPatchError(
@@ -155,11 +162,11 @@ def _load_of(tables: Tables, control: str, key: str) -> Tables:
 
 
 def _tilted(force: FloatArray, primitive: LoadTilt) -> list[float]:
-    """Return a force (3,) that is turned by an angle towards an axis."""
-    size = float(np.linalg.norm(force))
-    along = force / size
+    """Return a force (3,) turned towards an axis by an angle."""
+    magnitude = float(np.linalg.norm(force))
+    along = force / magnitude
     across = np.eye(3)[AXES.index(primitive.axis)]
     across = across - along * (along @ across)
     across = across / np.linalg.norm(across)
-    turned = np.cos(primitive.angle) * along + np.sin(primitive.angle) * across
-    return [float(value) for value in size * turned]
+    direction = np.cos(primitive.angle) * along + np.sin(primitive.angle) * across
+    return [float(value) for value in magnitude * direction]

@@ -1,4 +1,4 @@
-"""The coordinate systems of decks: points by radii and angles, or along other axes."""
+"""The coordinate systems of decks: cylindrical, spherical, or with axes of their own."""
 
 from dataclasses import dataclass
 
@@ -15,17 +15,17 @@ _LEAST_SINE = 1e-9
 
 @dataclass(frozen=True)
 class CoordinateSystem:
-    """A coordinate system.
+    """A Cartesian, cylindrical or spherical coordinate system.
 
     Attributes
     ----------
     origin : (3,) array
-        The origin in space.
+        The origin in global coordinates.
     axes : (3, 3) array
-        The axes x, y, z in space, one in each row.
+        The unit vectors x, y, z in global coordinates, one in each row.
     kind : {"R", "C", "S"}
-        The kind of coordinates: x, y, z; radius, angle about z from x in degrees, z; or radius,
-        angle from z, angle about z from x.
+        Rectangular: x, y, z. Cylindrical: radius, angle about z from x in degrees, z. Spherical:
+        radius, angle from z, angle about z from x in degrees.
     """
 
     origin: FloatArray
@@ -33,7 +33,7 @@ class CoordinateSystem:
     kind: str = "R"
 
     def to_space(self, coordinates: ArrayLike) -> FloatArray:
-        """Return the points in space (..., 3) of coordinates (..., 3)."""
+        """Convert coordinates (..., 3) of this system to global ones (..., 3)."""
         local_points = np.asarray(coordinates, dtype=np.float64)
         if self.kind == "S":
             radius, polar_degrees, azimuth_degrees = np.moveaxis(local_points, -1, 0)
@@ -50,7 +50,7 @@ class CoordinateSystem:
 def _from_cylinder(
     radius: FloatArray, azimuth_degrees: FloatArray, height: FloatArray
 ) -> FloatArray:
-    """Return x, y, z (..., 3) of cylindrical coordinates (...)."""
+    """Convert cylindrical coordinates (...) to x, y, z (..., 3)."""
     azimuth = np.deg2rad(azimuth_degrees)
     return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), height), axis=-1)
 
@@ -61,22 +61,21 @@ GLOBAL = CoordinateSystem(np.zeros(3), np.eye(3))
 def axes_by_points(
     where: str, points: FloatArray, order: tuple[int, int, int] = (0, 1, 2)
 ) -> FloatArray:
-    """Return the axes of a coordinate system that is given by three points.
+    """Return the axes of a coordinate system given by three points.
 
     Parameters
     ----------
     where : str
-        File and line, for the message.
+        File and line, for the error message.
     points : (3, 3) array
         The origin, a point on the first axis, and a point in the plane of the first two axes.
     order : tuple of int
-        Which of the three axes is x, which y and which z: the first axis, the second, which points
-        towards the last point, and the third, at right angles to both.
+        The indices of x, y and z among the three axes; the third axis is normal to the plane.
 
     Returns
     -------
     (3, 3) array
-        The axes x, y, z, one in each row.
+        The unit vectors x, y, z, one in each row.
 
     Raises
     ------

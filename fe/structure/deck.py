@@ -28,7 +28,7 @@ class DeckElement(NamedTuple):
 
 
 class SurfaceRow(NamedTuple):
-    """A row of a surface: file and line, an element or set of elements, and a face such as S1."""
+    """A line of a surface: an element or set of elements, and a face such as S1."""
 
     where: str
     member: str
@@ -36,28 +36,28 @@ class SurfaceRow(NamedTuple):
 
 
 class Face(NamedTuple):
-    """The nodes of a face or a flat element, the corners first, and the number of corners."""
+    """The nodes of a face, corners first."""
 
     nodes: list[int]
     corner_count: int
 
 
 class _NamedSet(NamedTuple):
-    """A set: its name as the file writes it, and the numbers of its members."""
+    """A set's name as the file spells it, and the numbers of its members."""
 
     name: str
     members: list[int]
 
 
 class Deck:
-    """Nodes, elements and sets by their numbers and names, while a mesh file is read.
+    """The nodes, elements and sets of a mesh file that is being read.
 
-    A reader adds what it finds, line by line; `mesh` then checks it and returns the mesh.
+    A reader adds them line by line; `mesh` then checks everything and builds the mesh.
 
     Parameters
     ----------
     words : DeckWords, optional
-        The words of the dialect of a deck, in which the case of a name does not count.
+        The keywords of the dialect. With them, names of sets are not case-sensitive.
 
     Attributes
     ----------
@@ -86,18 +86,15 @@ class Deck:
         self._members_left = _MOST_MEMBERS
 
     def remark(self, sentence: str) -> None:
-        """Add a sentence on how the file was read, once."""
+        """Note a sentence for the user on how the file was read; repetitions are dropped."""
         self._remarks.setdefault(sentence)
 
     def pass_over(self, word: str, where: str) -> None:
-        """Pass over a word that is not part of the mesh; refuse one that the mesh would lose.
+        """Ignore a keyword that the mesh does not need.
 
-        Parameters
-        ----------
-        word : str
-            A word of the dialect; one that is not known gets a remark.
-        where : str
-            The file and the line that name the set.
+        Raises `MeshError` for a keyword without which the mesh would be another one. A keyword that
+        is not
+        known is ignored with a remark.
         """
         assert self.words is not None
         if word in self.words.refused:
@@ -107,71 +104,43 @@ class Deck:
             self._notes_on_unknown.setdefault(word, []).append(note)
 
     def members(self, kind: str, name: str) -> list[int]:
-        """Return the list of a set's members, to be added to.
+        """Return the list of a set's members, to which a reader may append.
 
-        Parameters
-        ----------
-        kind : {"NSET", "ELSET"}
-            A set of nodes, or of elements.
-        name : str
-            The name of the set.
+        `kind` is "NSET" or "ELSET", a set of nodes or of elements. A set that is not there is made.
         """
         key = name.casefold() if self.words else name
         return self._sets[kind].setdefault(key, _NamedSet(name, [])).members
 
     def members_or_number(self, kind: str, where: str, text: str) -> list[int]:
-        """Return a copy of the members of the set with this name, or else the text as one number.
+        """Return the members of the set with this name, or else the name as one number.
 
-        Parameters
-        ----------
-        kind : {"NSET", "ELSET"}
-            A set of nodes, or of elements.
-        where : str
-            File and line of the text.
-        text : str
-            The name of a set, or a number.
+        `kind` is "NSET" or "ELSET"; `where` is the file and line, for the error message.
         """
         named_set = self._sets[kind].get(text.casefold())
         members = [whole(where, text)] if named_set is None else named_set.members
         return self.counted(where, members)
 
     def counted(self, where: str, members: Sequence[int]) -> list[int]:
-        """Return the members of a set as a list; refuse more members than any mesh has."""
+        """Return the members as a list, and count them towards the limit of all sets.
+
+        Raises `MeshError` if all sets together hold more than `_MOST_MEMBERS`.
+        """
         self._members_left -= len(members)
         if self._members_left < 0:
             fail(where, f"the sets hold more than {_MOST_MEMBERS:,} members together.")
         return list(members)
 
     def add_node(self, where: str, number: int, coordinates: Sequence[float]) -> None:
-        """Add a node.
+        """Add a node; coordinates are in the file's unit of length.
 
-        Parameters
-        ----------
-        where : str
-            The file and the line of the node.
-        number : int
-            The number of the node; a node that is there twice must be at one point.
-        coordinates : sequence of float
-            x, y and z [unit of length of the file].
+        Raises `MeshError` if the same number is already at another point.
         """
         point = tuple(float(coordinate) for coordinate in coordinates)
         if self.nodes.setdefault(number, point) != point:
             fail(where, f"node {number} is there twice, at different places; delete one.")
 
     def add_element(self, where: str, number: int, element_type: str, nodes: list[int]) -> None:
-        """Add an element.
-
-        Parameters
-        ----------
-        where : str
-            The file and the line of the element.
-        number : int
-            The number of the element.
-        element_type : str
-            The type of the element in meshio.
-        nodes : list of int
-            The numbers of its nodes.
-        """
+        """Add an element of a type of meshio; raise `MeshError` if its number is taken."""
         if number in self.elements:
             fail(where, f"element {number} is there twice; delete one.")
         self.elements[number] = DeckElement(element_type, nodes)
@@ -181,12 +150,14 @@ class Deck:
     # ------------------------------------------------------------------ mesh
 
     def mesh(self, unit: float, unit_name: str) -> StructureMesh:
-        """Return the mesh of everything that was added, its nodes in metres.
+        """Check everything that was read and build the mesh, in metres.
+
+        Nodes of no solid element are left out. Sets of flat elements become sets of faces.
 
         Parameters
         ----------
         unit : float
-            Metres in the file's unit of length.
+            The file's unit of length [m].
         unit_name : str
             The name of that unit.
 
@@ -271,7 +242,7 @@ class Deck:
         return cells
 
     def _remarks_on_unknown(self) -> Iterator[str]:
-        """Yield a sentence on each word that is not known."""
+        """Yield a sentence on each unknown keyword."""
         for notes in self._notes_on_unknown.values():
             times = f" ({len(notes)} times)" if len(notes) > 1 else ""
             yield (
@@ -280,7 +251,7 @@ class Deck:
             )
 
     def _one_kind(self) -> ElementKind:
-        """Return the kind of the solid elements, which must be one for all."""
+        """Return the kind of the solid elements; raise `MeshError` if there are several."""
         solid_types = [
             element.type for element in self.elements.values() if element.type not in FLAT
         ]
@@ -291,7 +262,7 @@ class Deck:
         return DECK_KINDS[solid_type]
 
     def _refuse_kinds(self, counts: Mapping[str, int]) -> NoReturn:
-        """Refuse solid elements that are not all of one known kind, given their number by type."""
+        """Raise the error for elements that are not all of one known kind."""
         known_names = ", ".join(kind.name for kind in DECK_KINDS.values())
         found_kinds = []
         for solid_type, count in counts.items():
@@ -307,7 +278,7 @@ class Deck:
         )
 
     def _node_indices(self, numbers: Iterable[int], owner: str) -> list[int]:
-        """Return the indices of nodes by number; `owner` says for the message what names them."""
+        """Return node indices by number; `owner` is what names the nodes, for the error message."""
         try:
             return [self._node_index[number] for number in numbers]
         except KeyError as missing:
@@ -318,14 +289,9 @@ class Deck:
         return {number: index for index, number in enumerate(self.nodes)}
 
     def _flat_faces(self, name: str, members: list[int]) -> list[Face]:
-        """Return the flat elements of a set as faces; refuse elements that bear loads.
+        """Return the flat elements of a set as faces.
 
-        Parameters
-        ----------
-        name : str
-            The name of the set.
-        members : list of int
-            The numbers of its elements that are not solid.
+        Raises `MeshError` if the set has a section: its elements then carry loads.
         """
         for number in members:
             if number not in self.elements:
@@ -348,13 +314,7 @@ class Deck:
     def _surface_faces(
         self, rows: list[SurfaceRow], kind: ElementKind, solids: dict[int, list[int]]
     ) -> Iterator[Face]:
-        """Yield the faces of a surface.
-
-        Parameters
-        ----------
-        solids : dict of int to list of int
-            The nodes of the solid elements by number.
-        """
+        """Yield the faces of a surface."""
         face_count = len(kind.faces)
         for row in rows:
             label = row.face.upper()
@@ -376,5 +336,5 @@ class Deck:
 
 
 def _sorted_once(numbers: list[int]) -> IntArray:
-    """Return numbers in rising order, each once."""
+    """Return the distinct numbers in ascending order."""
     return np.unique(np.array(numbers, dtype=np.int64))

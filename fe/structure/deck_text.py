@@ -1,4 +1,4 @@
-"""The lines and numbers of decks of Abaqus, CalculiX and Nastran, and the words in them."""
+"""Lines, numbers and keywords in decks of Abaqus, CalculiX and Nastran."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ _MISSING_EXPONENT = re.compile(r"(?<=[\d.])(?=[+-])")
 
 
 class FlatType(NamedTuple):
-    """A type of elements without volume: the number of its nodes, and of its corners."""
+    """The number of nodes and of corners of an element type without volume."""
 
     node_count: int
     corner_count: int
@@ -34,20 +34,21 @@ FLAT: dict[str, FlatType] = {
 
 
 class DeckWords(NamedTuple):
-    """The words of a dialect of decks, by what the reader does with them; see `deck_words.toml`.
+    """The keywords of a dialect, by what the reader does with them; see `deck_words.toml`.
 
     Attributes
     ----------
     mark : str
-        The character before a word.
+        The character before a keyword.
     harmless : frozenset of str
-        Words that are passed over.
+        Keywords that are ignored.
     refused : dict of str to str
-        Words without which the model would be another, with the end of the message on each.
+        Keywords without which the model would be another one, each with the end of the error
+        message.
     read : dict of str to list of str
-        Words that are read, each with the parameters that are read.
+        Keywords that are read, each with the parameters that are read.
     flat : dict of str to str
-        Types of elements in `FLAT` with which other programs write lines and surfaces.
+        Element types that other programs use for lines and surfaces, with their types in `FLAT`.
     """
 
     mark: str
@@ -58,7 +59,7 @@ class DeckWords(NamedTuple):
 
 
 def words_of(dialect: str) -> DeckWords:
-    """Return the words of "abaqus" or "nastran"."""
+    """Return the keywords of "abaqus" or "nastran"."""
     table = _WORDS_FILE[dialect]
     remedies = {}
     for group in table["refused"]:
@@ -74,22 +75,22 @@ def words_of(dialect: str) -> DeckWords:
 
 
 def fail(where: str, sentence: str) -> NoReturn:
-    """Raise the error for a fault in a file; `where` says file and line."""
+    """Raise `MeshError` for a fault in a file; `where` gives file and line."""
     raise MeshError(f"{where}: {sentence}")
 
 
 def lines_of(
     files: tuple[Path, ...], comment: re.Pattern[str], include: re.Pattern[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the lines of a file; a line that includes another file is replaced by its lines.
+    """Yield the lines of the last of the files, with included files in place.
 
-    Comments and empty lines are left out. The name of an included file may go on over several lines
-    until its quotation mark closes.
+    Comments and empty lines are left out. The name of an included file may continue over several
+    lines until its quotation mark closes.
 
     Parameters
     ----------
     files : tuple of Path
-        The chain of files of which each includes the next one. The last file is read.
+        The file to read last, after the files that include it, outermost first.
     comment : pattern
         The pattern of a comment.
     include : pattern
@@ -98,7 +99,7 @@ def lines_of(
     Yields
     ------
     where, line : str
-        File and number of the line, and its text.
+        File and line number, and the text of the line.
     """
     file = files[-1]
     text = read_text(file, MeshError, what="mesh file", otherwise="latin-1")
@@ -124,7 +125,7 @@ def lines_of(
 
 
 def whole(where: str, text: str) -> int:
-    """Return a text as a whole number; `where` names its file and line, for messages."""
+    """Return a text as an integer; `where` gives file and line, for the error message."""
     try:
         number = int(text)
     except ValueError:
@@ -135,9 +136,9 @@ def whole(where: str, text: str) -> int:
 
 
 def real(where: str, text: str) -> float:
-    """Return a text as a real number, an empty one as 0; `where` says file and line of it.
+    """Return a text as a float, an empty one as 0; `where` gives file and line.
 
-    Fortran writes D for E, and Nastran leaves the E out.
+    The exponent may be written with D as in Fortran, or without a letter as in Nastran.
     """
     with_exponent = _MISSING_EXPONENT.sub("E", text.upper().replace("D", "E") or "0")
     try:

@@ -1,6 +1,6 @@
-"""A structure as its engineer describes it: a TOML file beside a mesh or matrices, checked.
+"""The description of a structure: a TOML file beside a mesh or matrices.
 
-Places and lengths are in the unit of length of the mesh, which the file names; all else is in SI
+Positions and lengths are in the unit of length of the mesh, which the file names; all else is in SI
 units. Matrices, of any finite element code, are in newtons, seconds and the unit of length that the
 file names; a mass in kg and an acceleration in m/s^2 are turned into these units.
 """
@@ -53,7 +53,7 @@ class Gauge(tables.Named, Spot):
 def _span_a_plane(
     axes: tuple[tables.Direction, tables.Direction],
 ) -> tuple[tables.Direction, tables.Direction]:
-    """Return two axes; refuse them if they are parallel."""
+    """Return two axes; raise `ValueError` if they are parallel."""
     first, second = axes
     product_of_lengths = np.linalg.norm(first) * np.linalg.norm(second)
     if np.linalg.norm(np.cross(first, second)) <= LEAST_SINE * product_of_lengths:
@@ -76,7 +76,7 @@ class Rosette(Spot):
     """Angle of each gauge from axis 1 towards axis 2 [degrees]."""
 
     def gauges(self) -> list[Gauge]:
-        """Return the gauges of the rosette."""
+        """Return the gauges of the rosette, named by letters."""
         first_axis, second_axis, _ = axes_of(*self.axes)
         place = self.model_dump(include={*Spot.model_fields})
         gauges = []
@@ -324,17 +324,14 @@ def is_structure(content: Mapping[str, Any]) -> bool:
 def parse_structure(
     content: dict[str, Any], source: str = "the structure"
 ) -> MeshDesign | MatrixDesign:
-    """Return the structure that the content of a file describes, from a mesh or from matrices.
+    """Validate the content of a structure file, from a mesh or from matrices.
 
-    Parameters
-    ----------
-    source : str
-        The name of the file in messages.
+    `source` is the name of the file in error messages.
 
     Raises
     ------
     InvalidDesignError
-        If the content is not a structure; one sentence names the place, what was given and what was
+        If the content is not a structure; one sentence names the key, what was given and what was
         expected.
     """
     if "stiffness_matrix" in content:
@@ -345,7 +342,7 @@ def parse_structure(
 
 
 def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
-    """Read a structure file; its mesh file is read by `fe.structure.mesh_file.read_mesh`.
+    """Read and validate a structure file, without its mesh or matrices.
 
     Raises
     ------
@@ -363,13 +360,17 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
 def structure_hash(
     design: tables.StructureDesign, folder: Path, *, with_ports: bool = False
 ) -> str:
-    """Return the SHA-256 of the design and of the bytes of its files, 64 hexadecimal digits.
+    """Return the SHA-256 of a design and its files, as 64 hexadecimal digits.
+
+    The limits of the reduction and the name of the mesh file do not count.
 
     Parameters
     ----------
+    folder : Path
+        The names of the files are relative to it.
     with_ports : bool
-        Whether its ports count. They change no answer of the structure, but an effect is found at
-        one.
+        Whether ports count. They do not change the responses of the structure, but a missing effect
+        may be located at one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Strain gauges on the surface of a mesh as rows on the nodal displacements."""
+"""Strain gauges on the surface of a mesh, as rows that give strains from nodal displacements."""
 
 from itertools import product
 from typing import NamedTuple
@@ -15,8 +15,8 @@ from .location import SurfacePoint, on_surface
 from .mesh import StructureMesh
 
 STEEPEST = 30.0
-"""Largest angle [degrees] between a gauge's direction and the surface; below it, the direction is
-projected on the surface."""
+"""Largest angle between a gauge's direction and the surface, on which the direction is projected
+[degrees]."""
 _POINTS_ALONG = 20
 """Points along a gauge that has a length."""
 _POINTS_ACROSS = 10
@@ -24,18 +24,18 @@ _POINTS_ACROSS = 10
 
 
 class _GaugeStrain(NamedTuple):
-    """A strain that a gauge reads.
+    """A strain at one point in one cell, which a gauge averages with others.
 
     Attributes
     ----------
     gauge : int
-        Number of the gauge.
+        Index of the gauge.
     weight : float
         Weight of the strain in the mean of the gauge.
     local : (3,) array
         The local position in the cell.
     direction : (3,) array
-        Unit vector along which the strain is.
+        Unit vector of the normal strain.
     """
 
     gauge: int
@@ -51,26 +51,25 @@ def gauge_rows(
     turn: float = 0.0,
     offset: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[sparse.csr_array, FloatArray]:
-    """Return the strains of gauges as rows on the displacements.
+    """Return rows that give the strains of gauges from nodal displacements.
 
     A gauge without a length reads the strain at its point, the mean of the cells that meet there.
-    One with a length reads the mean of 20 points along it, one with a width of 10 points across it,
-    each projected on the surface.
+    A length is averaged over 20 points along the gauge and a width over 10 points across it, each
+    projected on the surface.
 
     Parameters
     ----------
     turn : float
-        Angle in the surface from the direction of each gauge to that of the strain, about the
-        outward normal [rad].
+        Angle from the gauge's direction to that of the strain, about the outward normal [rad].
     offset : tuple of float
-        Distance in the surface of each gauge from its point, along the gauge and across it [m].
+        Distance by which each gauge is moved on the surface, along itself and across [m].
 
     Returns
     -------
     rows : csr (gauges, full)
         The rows, positive in tension [1/m].
     moved : (gauges,) array
-        The distance of each gauge from its point [m].
+        The distance of each point from the surface, on which it is projected [m].
 
     Raises
     ------
@@ -87,7 +86,7 @@ def gauge_rows(
         if any(offset):
             along, across = gauge_axes(mesh, gauge, where)
             point = point + offset[0] * along + offset[1] * across
-        middle = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
+        middle = on_surface(mesh, point, f"{where}: the point {mesh.describe_point(point)}")
         direction = _projected_direction(np.asarray(gauge.direction), middle.normal, where)
         surface_points = [middle]
         if gauge.length or gauge.width:
@@ -120,14 +119,11 @@ def gauge_rows(
 
 
 def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors (3,) in the surface along a gauge and across it.
+    """Return tangential unit vectors (3,) along a gauge and across it.
 
-    The second is the outward normal of the surface times the first.
-
-    Parameters
-    ----------
-    where : str
-        The name of the gauge in sentences.
+    The second is the outward normal of the surface times the first. `where` is the name of the
+    gauge,
+    for error messages.
 
     Raises
     ------
@@ -135,7 +131,7 @@ def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArra
         If the gauge lies off the surface, or points out of it.
     """
     point = mesh.unit * np.asarray(gauge.point)
-    middle = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
+    middle = on_surface(mesh, point, f"{where}: the point {mesh.describe_point(point)}")
     along = _projected_direction(np.asarray(gauge.direction), middle.normal, where)
     return along, np.cross(middle.normal, along)
 
@@ -150,17 +146,9 @@ def _averaging_points(
 ) -> list[SurfacePoint]:
     """Return the points of the surface over which a gauge averages.
 
-    Parameters
-    ----------
-    point, direction, normal : (3,) array
-        The middle of the gauge [m], and unit vectors along it and normal to the surface.
-    where : str
-        The name of the gauge in sentences.
-
-    Raises
-    ------
-    InvalidDesignError
-        If the gauge reaches over the edge of the surface.
+    `point` is the middle of the gauge [m]; `direction` and `normal` are unit vectors along it and
+    out
+    of the surface. Raises `InvalidDesignError` if the gauge reaches over the edge of the surface.
     """
     length = mesh.unit * gauge.length
     width = mesh.unit * gauge.width
@@ -180,7 +168,9 @@ def _averaging_points(
         ):
             offset = along_fraction * length * direction + across_fraction * width * across
             position = point + offset
-            points.append(on_surface(mesh, position, f"{over_edge} {mesh.place(position)}"))
+            points.append(
+                on_surface(mesh, position, f"{over_edge} {mesh.describe_point(position)}")
+            )
         return points
 
     averaged = project_grid(_middles(_POINTS_ALONG), _middles(_POINTS_ACROSS))
@@ -190,17 +180,14 @@ def _averaging_points(
 
 
 def _middles(count: int) -> FloatArray:
-    """Return the middles (count,) of equal intervals of -0.5 to 0.5."""
+    """Return the midpoints (count,) of equal intervals of -0.5 to 0.5."""
     return (np.arange(count) + 0.5) / count - 0.5
 
 
 def _projected_direction(direction: FloatArray, normal: FloatArray, where: str) -> FloatArray:
-    """Return a direction (3,) projected on the surface with a unit normal (3,), of length one.
+    """Project a direction (3,) on the surface with a unit normal (3,), and normalise it.
 
-    Raises
-    ------
-    InvalidDesignError
-        If the direction points out of the surface by more than `STEEPEST`.
+    Raises `InvalidDesignError` if it points out of the surface by more than `STEEPEST`.
     """
     direction = unit_vector(direction)
     sine = min(1.0, abs(float(direction @ normal)))
@@ -215,17 +202,11 @@ def _projected_direction(direction: FloatArray, normal: FloatArray, where: str) 
 
 
 def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
-    """Return rosettes that are distributed evenly over the faces of the surface.
+    """Return up to `count` rosettes, distributed evenly over the faces of the surface.
 
-    Parameters
-    ----------
-    count : int
-        The largest number of rosettes; there are fewer if several would lie on one face.
-
-    Returns
-    -------
-    list of Rosette
-        The rosettes `spread_1`, `spread_2` and so on.
+    Their positions are the faces nearest to the centres of k-means clusters; there are fewer
+    rosettes
+    if several would lie on one face. They are named `spread_1`, `spread_2` and so on.
     """
     from scipy.cluster.vq import kmeans2, vq
 

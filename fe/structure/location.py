@@ -1,4 +1,4 @@
-"""Locate points in a mesh: in a cell, or on a face of the surface, at a local position."""
+"""Locate points in a mesh: in a cell, or on a face of its surface."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,9 +13,9 @@ from fe.runtime.errors import InvalidDesignError
 from .mesh import StructureMesh
 
 FARTHEST = 0.1
-"""Largest distance of a point from the surface, in sizes of the nearest face.
+"""Largest distance of a point from the surface, relative to the radius of the nearest face.
 
-Coordinates are rounded, and the faces of a mesh lie beside the curved surface that they stand for.
+Coordinates are rounded, and the faces of a mesh only approximate a curved surface.
 """
 _INSIDE = 1e-9
 _MOST_STEPS = 25
@@ -26,7 +26,7 @@ _SAME_SIDE = 0.9  # cosine between the normals of faces that form one smooth sur
 
 
 class SurfacePoint(NamedTuple):
-    """Point of the surface, on each of the f faces that meet there.
+    """A point of the surface, located on each of the f faces that meet there.
 
     Attributes
     ----------
@@ -52,11 +52,11 @@ class _Parametrisation(NamedTuple):
     Attributes
     ----------
     cells : (n,) array of int
-        The numbers of the cells.
+        Indices of the cells.
     origin : (n, 3) array
         Local positions where the coordinates are zero.
     tangents : (n, t, 3) array
-        The derivatives of the local positions by the coordinates.
+        Derivatives of the local positions by the coordinates.
     """
 
     cells: IntArray
@@ -72,7 +72,7 @@ class _NearestPoints(NamedTuple):
     local : (n, 3) array
         Local positions.
     residual : (n, 3) array
-        From each of them to the given point [m].
+        Vector from each of them to the given point [m].
     edges : (n, t, 3) array
         Derivatives of the positions in space by the coordinates [m].
     """
@@ -87,26 +87,21 @@ Restriction = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, FloatArray]:
-    """Return the cell of a point in the structure or close to its surface, and its local position.
+    """Return the cell that contains a point, and the point's local position (3,) in it.
+
+    For a point that lies slightly outside, they are those of the nearest point of the surface.
 
     Parameters
     ----------
     point : (3,) array
         The position of the point [m].
     where : str
-        The beginning of the message on a point that lies outside.
-
-    Returns
-    -------
-    cell : int
-        The cell.
-    local : (3,) array
-        The local position in the cell.
+        The beginning of the error message, which names the point.
 
     Raises
     ------
     InvalidDesignError
-        If the point lies outside.
+        If the point lies farther outside than `FARTHEST` allows.
     """
     # cells that may hold the point: those whose bounding spheres do
     distance = np.linalg.norm(mesh.centres - point, axis=1)
@@ -131,7 +126,7 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
 
 
 def _clip_near_cell(coordinates: FloatArray, _: FloatArray) -> FloatArray:
-    """Return local positions (n, 3) clipped to a box around the reference cell."""
+    """Clip local positions (n, 3) to a box around the reference cell."""
     return np.clip(coordinates, -2.0, 3.0)
 
 
@@ -151,9 +146,9 @@ def _nearest_points(
     parametrisation : _Parametrisation
         The allowed positions in n cells, by t coordinates.
     start : (n, t) array
-        Coordinates to start from.
+        Initial coordinates.
     restrict : Restriction
-        Keeps the coordinates where they are allowed.
+        Projects the coordinates on the allowed ones after each step.
     """
     cells, origin, tangents = parametrisation
     nodes = mesh.nodes[cells]
@@ -187,12 +182,12 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     point : (3,) array
         The position of the point [m].
     where : str
-        The beginning of the error message, which says which point is meant.
+        The beginning of the error message, which names the point.
 
     Raises
     ------
     InvalidDesignError
-        If the point lies farther from the surface than `FARTHEST` times the size of a face.
+        If the point lies farther from the surface than `FARTHEST` times the radius of a face.
     """
     spheres = mesh.face_spheres
     centre_distance = np.linalg.norm(spheres.centre - point, axis=1)
@@ -214,7 +209,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
         raise InvalidDesignError(
             f"{where} lies {distance[nearest_face] / mesh.unit:.3g} {mesh.unit_name} off the "
             f"surface of {mesh.source}{side}; the nearest point of the surface is "
-            f"{mesh.place(point - nearest_points.residual[nearest_face])}."
+            f"{mesh.describe_point(point - nearest_points.residual[nearest_face])}."
         )
     # all faces of one smooth surface that meet there
     meets = distance <= distance[nearest_face] + _SAME_PLACE * size
@@ -231,15 +226,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
 def _nearest_on_faces(
     mesh: StructureMesh, point: FloatArray, cells: IntArray, face_numbers: IntArray
 ) -> _NearestPoints:
-    """Return the points of faces that are nearest to a point.
-
-    Parameters
-    ----------
-    point : (3,) array
-        The position of the point [m].
-    cells, face_numbers : (n,) array of int
-        The cell of each face, and its number in the cell.
-    """
+    """Find the points of faces (n,), given by cell and index in it, nearest to a point."""
     frames = mesh.kind.face_frames
     is_triangular = np.array([len(face) == 3 for face in mesh.kind.faces])
     is_triangle = is_triangular[face_numbers]
@@ -257,12 +244,12 @@ def _nearest_on_faces(
 def _nearest_on_face(
     corners: FloatArray, coordinates: FloatArray, metric: FloatArray
 ) -> FloatArray:
-    """Return the points of convex faces that are nearest to points of their planes.
+    """Project points on convex faces of their planes.
 
     Parameters
     ----------
     corners : (n, 4, 2) array
-        Corners of the faces; a triangle has its last one twice.
+        Corners of the faces; the last corner of a triangle occurs twice.
     coordinates : (n, 2) array
         The points.
     metric : (n, 2, 2) array

@@ -1,7 +1,7 @@
-"""From matrices and a structure file to affine operators.
+"""Assemble the affine operators of a structure from matrices.
 
 Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in
-metres (turns times the unit of length). A row that reads a displacement is then, transposed, a
+metres (rotations times the unit of length). A row that reads a displacement is then, transposed, a
 force of 1 N there.
 """
 
@@ -29,16 +29,16 @@ from .matrix_design import (
     NodeOutput,
     StiffnessPart,
 )
-from .matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, MatrixFiles, place_in_words
-from .matrix_tables import Place, read_matrix, read_unknowns
+from .matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, MatrixFiles, describe_dof
+from .matrix_tables import Dof, read_matrix, read_unknowns
 from .tables import MOTIONS
 
 _ROUNDING = 1e-12
 """Entries of a difference of matrices below this fraction of the diagonal are rounding."""
 _INDEFINITE = 1e-3
-"""Fraction of the whole by which a part may be negative: matrices in files are rounded."""
+"""Fraction of the whole stiffness by which a part may be negative, as matrices in files are rounded."""
 _FREE = 1e-10
-"""A motion with less stiffness than this fraction of its diagonal is free."""
+"""A mode is free if its stiffness, scaled to a unit diagonal, is below this."""
 _MOST_FREE_MOTIONS = 7
 """Free motions that are counted at most."""
 
@@ -60,16 +60,17 @@ class MatrixStructure(AffineStructure):
 def assemble_matrices(
     design: MatrixDesign, folder: Path, design_hash: str, *, yielding: bool = False
 ) -> MatrixStructure:
-    """Make the affine operators of a structure from matrices.
+    """Assemble the affine operators of a structure from matrices.
 
     Parameters
     ----------
-    design_hash : str
-        The hash of the design and its files.
+    folder : Path
+        The names of the files are relative to it.
     yielding : bool
-        Whether the motions that the supports hold are unknowns, behind all others. The nodes of a
-        support then shift together, and turn each by the same angle: files of matrices have no
-        places of nodes about which they could turn together.
+        Whether the motions that the supports hold are added as the last unknowns. The nodes of a
+        support then shift together, and each turns by the same angle: matrix files have no
+        positions
+        of nodes, which a common rotation would need.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def assemble_matrices(
         If a file cannot be read, does not fit the others, lacks what the design names, or is not of
         a structure: unsymmetric, indefinite, not held, or with mass that nothing holds.
     """
-    files = MatrixFiles(folder, _places(design, folder), design.unit)
+    files = MatrixFiles(folder, _row_dofs(design, folder), design.unit)
     stiffness = sum(files.matrix(name, "stiffness_matrix") for name in design.stiffness_matrix)
     mass = sum(files.matrix(name, "mass_matrix") for name in design.mass_matrix)
     free_rows = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
@@ -85,9 +86,9 @@ def assemble_matrices(
         raise MeshError(
             f"{folder}: the matrices have no row that is free and has stiffness or mass."
         )
-    free_places = [files.places[row] for row in free_rows]
-    _check_structure(stiffness[free_rows][:, free_rows], mass[free_rows][:, free_rows], free_places)
-    unknowns = _Unknowns(sparse.eye_array(len(files.places), format="csc")[:, free_rows].tocsr())
+    free_dofs = [files.dofs[row] for row in free_rows]
+    _check_structure(stiffness[free_rows][:, free_rows], mass[free_rows][:, free_rows], free_dofs)
+    unknowns = _Unknowns(sparse.eye_array(len(files.dofs), format="csc")[:, free_rows].tocsr())
     if yielding:
         unknowns = _with_held_motions(design, files, unknowns)
     fields = _fields(design, files, mass, unknowns)
@@ -95,7 +96,7 @@ def assemble_matrices(
     fields["expansion"] = (_nodal_displacements(files) @ unknowns.expansion).tocsr()
     return MatrixStructure(
         design=design,
-        nodes=tuple(sorted({node for node, _ in files.places})),
+        nodes=tuple(sorted({node for node, _ in files.dofs})),
         **fields,
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, unknowns)),
         design_hash=design_hash,
@@ -110,7 +111,7 @@ class _Unknowns(NamedTuple):
     expansion : csr (R, n)
         Unknowns to the R rows of the matrices: first the free rows, then motions of supports.
     motions : tuple of SupportMotion
-        These motions.
+        The motions of supports.
     """
 
     expansion: sparse.csr_array
@@ -123,14 +124,14 @@ class _Unknowns(NamedTuple):
 
 
 def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unknowns) -> _Unknowns:
-    """Return the unknowns with the motions that the supports of the design hold behind them."""
+    """Append the motions that the supports hold to the unknowns."""
     columns: dict[tuple[str, str], FloatArray] = {}
     for label, support in design.numbered("support"):
         numbers = sorted(support.nodes)
         name = f"node {numbers[0]}" if len(numbers) == 1 else f"nodes {numbers[0]} to {numbers[-1]}"
         for motion in support.hold:
             component = MOTIONS.index(motion) + 1
-            column = columns.setdefault((name, motion), np.zeros(len(files.places)))
+            column = columns.setdefault((name, motion), np.zeros(len(files.dofs)))
             for node in support.nodes:
                 column[files.rows_of((node, component), label)] = 1.0
     motions = tuple(
@@ -145,40 +146,28 @@ def _with_held_motions(design: MatrixDesign, files: MatrixFiles, unknowns: _Unkn
     return _Unknowns(sparse.hstack((unknowns.expansion, *blocks)).tocsr(), motions)
 
 
-def _places(design: MatrixDesign, folder: Path) -> list[Place]:
-    """Return node and component of each row of the stiffness matrices.
+def _row_dofs(design: MatrixDesign, folder: Path) -> list[Dof]:
+    """Return the node and component of each row of the stiffness matrices.
 
-    The file of unknowns names them; without such a file, the stiffness matrices do.
-
-    Raises
-    ------
-    MeshError
-        If a stiffness matrix does not name its rows, and no file of unknowns does.
+    They are those of the file of unknowns, or else of the stiffness matrices. Raises `MeshError` if
+    neither names them.
     """
     if design.unknowns is not None:
         return read_unknowns(folder / design.unknowns)
-    places: set[Place] = set()
+    dofs: set[Dof] = set()
     for name in design.stiffness_matrix:
-        _, places_in_file = read_matrix(folder, name)
-        if places_in_file is None:
+        _, dofs_in_file = read_matrix(folder, name)
+        if dofs_in_file is None:
             raise MeshError(
                 f"{folder / name} does not say which node and component each row is; name a file "
                 "with a line for each row, such as `97.3`, by the key unknowns."
             )
-        places.update(places_in_file)
-    return sorted(places)
+        dofs.update(dofs_in_file)
+    return sorted(dofs)
 
 
 def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -> IntArray:
-    """Return the numbers of the rows that can move and that no support of the design holds.
-
-    Parameters
-    ----------
-    files : MatrixFiles
-        The matrix files of the design, with R rows.
-    can_move : (R,) array of bool
-        Whether a row has stiffness or mass.
-    """
+    """Return the indices of the rows that have stiffness or mass and that no support holds."""
     is_free = can_move.copy()
     for label, support in design.numbered("support"):
         for node, motion in itertools.product(support.nodes, support.hold):
@@ -190,8 +179,8 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
 def _fields(
     design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, unknowns: _Unknowns
 ) -> AffineFields:
-    """Return the fields of the affine model; its expansion enters the unknowns into all rows."""
-    size = len(files.places)
+    """Return the fields of the affine model; its expansion gives the rows of the matrices."""
+    size = len(files.dofs)
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
     loads = (_load(load, files, label) for label, load in design.numbered("load"))
 
@@ -219,15 +208,15 @@ def _fields(
 
 
 def _point_mass(part: MatrixMass, files: MatrixFiles, where: str) -> sparse.csr_array:
-    """Return the mass matrix (n, n) of 1 kg."""
+    """Return the mass matrix (n, n) of 1 kg of a point mass."""
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
-    places = [(part.node, axis) for axis in (1, 2, 3)]
-    places_with_rows = [place for place in places if place in files.rows]
-    if not places_with_rows:
-        places_with_rows = places[:1]  # refused by name below
-    unit_vectors = [files.unit_vector_at(place, where) for place in places_with_rows]
+    dofs = [(part.node, axis) for axis in (1, 2, 3)]
+    dofs_with_rows = [dof for dof in dofs if dof in files.rows]
+    if not dofs_with_rows:
+        dofs_with_rows = dofs[:1]  # refused by name below
+    unit_vectors = [files.unit_vector_at(dof, where) for dof in dofs_with_rows]
     selection = sparse.csr_array(np.transpose(unit_vectors))
     return sparse.csr_array(selection @ selection.T)
 
@@ -261,11 +250,14 @@ def _output_row(output: Extension | NodeOutput, files: MatrixFiles, where: str) 
 
 
 def _nodal_displacements(files: MatrixFiles) -> sparse.csr_array:
-    """Return the displacements of all nodes (3 nodes, n) from rows; zero for unknown components."""
-    nodes = sorted({node for node, _ in files.places})
-    displacements = sparse.lil_array((3 * len(nodes), len(files.places)))
-    for number, place in enumerate(itertools.product(nodes, (1, 2, 3))):
-        rows = files.rows.get(place, [])
+    """Return the matrix (3 nodes, n) from rows to displacements of all nodes.
+
+    Components without a row are zero.
+    """
+    nodes = sorted({node for node, _ in files.dofs})
+    displacements = sparse.lil_array((3 * len(nodes), len(files.dofs)))
+    for number, dof in enumerate(itertools.product(nodes, (1, 2, 3))):
+        rows = files.rows.get(dof, [])
         if len(rows) in READ_WEIGHTS:
             displacements[number, rows] = READ_WEIGHTS[len(rows)]
     return displacements.tocsr()
@@ -277,24 +269,11 @@ def _stiffness_terms(
     whole_stiffness: sparse.csr_array,
     unknowns: _Unknowns,
 ) -> Iterator[StiffnessTerm]:
-    """Yield a stiffness term for each part of the design, then one for the rest of the structure.
+    """Yield a stiffness term for each part of the design, then one for the remaining stiffness.
 
-    Each term is at least positive semidefinite, and the terms add up to the whole stiffness.
-
-    Parameters
-    ----------
-    files : MatrixFiles
-        The matrix files of the design, with R rows.
-    whole_stiffness : sparse (R, R) array
-        The stiffness of the whole structure.
-    unknowns : _Unknowns
-        The unknowns, which the terms have.
-
-    Raises
-    ------
-    MeshError
-        If the stiffness of a part is zero or indefinite, or if all parts together are stiffer than
-        the whole structure.
+    The terms add up to the whole stiffness (R, R). Raises `MeshError` if a part is zero or
+    indefinite,
+    or all parts together are stiffer than the whole.
     """
     nominal_values = {parameter.name: parameter.nominal for parameter in design.parameter}
     remainder = whole_stiffness
@@ -326,8 +305,9 @@ def _part_matrix(
 ) -> sparse.csr_array:
     """Return the stiffness (R, R) of a part.
 
-    A part has a matrix of its own, or a matrix of the whole structure in which the modulus of the
-    part is multiplied by a factor.
+    It is read from the part's own file, or follows from the matrix of the whole structure in which
+    the
+    modulus of the part is multiplied by a factor.
     """
     if part.changed is not None and part.times is not None:
         # whole - changed = (1 - factor) * part
@@ -339,23 +319,9 @@ def _part_matrix(
 def _free_part(
     whole_stiffness: sparse.csr_array, part: sparse.csr_array, unknowns: _Unknowns, *, refusal: str
 ) -> sparse.csr_array:
-    """Return a part's stiffness (n, n) on the unknowns.
+    """Project a part's stiffness (R, R) on the unknowns, without rounding errors of the whole.
 
-    Entries that are rounding errors of the whole stiffness are left out.
-
-    Parameters
-    ----------
-    whole_stiffness, part : sparse (R, R) array
-        The stiffness of the whole structure and of the part.
-    unknowns : _Unknowns
-        The unknowns.
-    refusal : str
-        The sentence with which an indefinite part is refused.
-
-    Raises
-    ------
-    MeshError
-        If the part is indefinite.
+    Raises `MeshError` with the sentence `refusal` if the part is indefinite.
     """
     entries = part.tocoo()
     scale = np.sqrt(np.abs(whole_stiffness.diagonal()))
@@ -379,31 +345,28 @@ def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:
         raise MeshError(refusal) from None
 
 
-def _check_structure(
-    stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]
-) -> None:
+def _check_structure(stiffness: sparse.csr_array, mass: sparse.csr_array, dofs: list[Dof]) -> None:
     """Raise `MeshError` if the free matrices (m, m) are not those of a structure at rest.
 
-    The stiffness must leave no motion free and be positive definite. The mass must be held, and be
-    positive semidefinite.
+    The stiffness must be positive definite, and the mass positive semidefinite.
     """
     stiffness_diagonal = stiffness.diagonal()
     mass_diagonal = mass.diagonal()
     _check_rows(
-        places,
+        dofs,
         stiffness_diagonal < 0.0,
         "a negative stiffness on its own: the matrix cannot belong to a structure at rest",
     )
     _check_rows(
-        places,
+        dofs,
         (stiffness_diagonal == 0.0) & (mass_diagonal != 0.0),
         "mass but no stiffness: hold it, or give it stiffness",
     )
-    _check_rows(places, mass_diagonal < 0.0, "a negative mass")
+    _check_rows(dofs, mass_diagonal < 0.0, "a negative mass")
     try:
-        Factorisation(stiffness).solve(np.random.default_rng(16).standard_normal(len(places)))
+        Factorisation(stiffness).solve(np.random.default_rng(16).standard_normal(len(dofs)))
     except SolutionError:
-        _refuse_singular(stiffness, places)
+        _refuse_singular(stiffness, dofs)
     floor = np.where(mass_diagonal > 0.0, mass_diagonal, mass_diagonal.mean() or 1.0)
     _check_definite(
         mass + sparse.diags_array(1e-6 * floor),
@@ -411,43 +374,36 @@ def _check_structure(
     )
 
 
-def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
-    """Raise `MeshError` if any of the m rows is faulty; the message names the first such row.
+def _check_rows(dofs: list[Dof], is_faulty: FloatArray, fault: str) -> None:
+    """Raise `MeshError` if any of the m rows is faulty; the message names the first one.
 
-    Parameters
-    ----------
-    places : list of Place
-        The node and component of each row.
-    is_faulty : (m,) array of bool
-        Whether a row has the fault.
-    fault : str
-        The fault of the row, as the object of "has": "a negative mass".
+    `fault` completes the sentence "node 1, component 2 has": "a negative mass".
     """
     count = int(is_faulty.sum())
     if not count:
         return
-    first_row = place_in_words(places[int(is_faulty.argmax())])
+    first_row = describe_dof(dofs[int(is_faulty.argmax())])
     count_text = f" ({count} rows are like it)" if count > 1 else ""
     raise MeshError(f"{first_row} has {fault}{count_text}.")
 
 
-def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
-    """Raise `MeshError` for a stiffness that is indefinite or leaves free motions."""
+def _refuse_singular(stiffness: sparse.csr_array, dofs: list[Dof]) -> None:
+    """Raise `MeshError` for a stiffness that is indefinite or leaves motions free."""
     # unit diagonal, lifted so that free motions have the least positive eigenvalues
     scale = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal()))
-    identity = sparse.eye_array(len(places))
+    identity = sparse.eye_array(len(dofs))
     lifted = sparse.csr_array(scale @ stiffness @ scale + _INDEFINITE * identity)
     _check_definite(
         lifted,
         "the stiffness is indefinite: some motion of the structure has negative stiffness.",
     )
-    count = min(_MOST_FREE_MOTIONS, len(places) - 1)
+    count = min(_MOST_FREE_MOTIONS, len(dofs) - 1)
     eigenvalues, shapes = lowest_eigenpairs(lifted, identity, count)
     free_count = int((eigenvalues < _INDEFINITE + _FREE).sum())
     lowest_shape = shapes.T[0]
     largest = int(np.abs(scale @ lowest_shape).argmax())
     raise MeshError(
         f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
-        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]] "
+        f"{describe_dof(dofs[largest])} moves most. Hold the structure by [[support]] "
         "in its structure file, or before its matrices are written (in a deck: *BOUNDARY)."
     )

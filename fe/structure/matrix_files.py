@@ -1,4 +1,4 @@
-"""Matrices and vectors of files, whose rows have the names of nodes and components."""
+"""Matrices and vectors from files, with rows named by node and component."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from scipy import sparse
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
 
-from .matrix_tables import Place, read_matrix, read_vector
+from .matrix_tables import Dof, read_matrix, read_vector
 from .tables import Vector
 
 RowWeights = Mapping[int, tuple[float, ...]]
-"""Weights of the rows that carry one name, by the number of these rows."""
+"""Weights of rows with the same node and component, by the number of such rows."""
 
 READ_WEIGHTS: RowWeights = {
     1: (1.0,),
@@ -24,64 +24,59 @@ READ_WEIGHTS: RowWeights = {
     4: (0.25, 0.25, 0.25, 0.25),
     8: (0.25, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0, 0.0),
 }
-"""Weights of the rows of a name in its displacement. CalculiX expands a node of a shell into two or
-three nodes through the thickness, and one of a beam into four or eight; the weights follow from
+"""Weights of such rows in the displacement of the node. CalculiX expands a node of a shell into two
+or three nodes through the thickness, and one of a beam into four or eight; the weights follow from
 what version 2.20 prints."""
 FORCE_WEIGHTS: RowWeights = {**READ_WEIGHTS, 3: (-0.5, 2.0, -0.5)}
-"""Weights of these rows in a force on the node, as CalculiX distributes it."""
+"""Weights of such rows in a force on the node, as CalculiX distributes it."""
 
 _UNSYMMETRIC = 1e-9
 """Largest asymmetry of a matrix, relative to its largest entry."""
 
 
-def place_in_words(place: Place) -> str:
-    """Return a node and its component as they stand in a sentence."""
-    node, component = place
+def describe_dof(dof: Dof) -> str:
+    """Format a node and its component for a message."""
+    node, component = dof
     return f"node {node}, component {component}"
 
 
 @dataclass(frozen=True)
 class MatrixFiles:
-    """Matrices and vectors of files, with n rows.
+    """The matrix files of a structure, with n rows.
 
     Attributes
     ----------
-    places : list of (int, int)
+    dofs : list of (int, int)
         Node and component of each row.
     unit : float
-        Metres in the unit of length of the matrices.
+        Unit of length of the matrices [m].
     """
 
     folder: Path
-    places: list[Place]
+    dofs: list[Dof]
     unit: float
 
     @cached_property
-    def rows(self) -> dict[Place, list[int]]:
-        """Rows of each node's component."""
-        rows: dict[Place, list[int]] = {}
-        for row, place in enumerate(self.places):
-            rows.setdefault(place, []).append(row)
+    def rows(self) -> dict[Dof, list[int]]:
+        """Indices of the rows of each node and component."""
+        rows: dict[Dof, list[int]] = {}
+        for row, dof in enumerate(self.dofs):
+            rows.setdefault(dof, []).append(row)
         return rows
 
-    def rows_of(self, place: Place, where: str) -> list[int]:
-        """Return the rows of a node's component.
+    def rows_of(self, dof: Dof, where: str) -> list[int]:
+        """Return the rows of a component of a node.
 
-        Parameters
-        ----------
-        place : (int, int)
-            Node and component.
-        where : str
-            The key of the design that names the node, for sentences.
+        `where` is the key of the design that names the node, for the error message.
 
         Raises
         ------
         MeshError
             If the matrices have no such row.
         """
-        if place in self.rows:
-            return self.rows[place]
-        node, component = place
+        if dof in self.rows:
+            return self.rows[dof]
+        node, component = dof
         components = [str(other) for number, other in sorted(self.rows) if number == node]
         known_rows = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
@@ -91,40 +86,33 @@ class MatrixFiles:
         )
 
     def unit_vector_at(
-        self, place: Place, where: str, weights: RowWeights = READ_WEIGHTS
+        self, dof: Dof, where: str, weights: RowWeights = READ_WEIGHTS
     ) -> FloatArray:
-        """Return the vector (n,) of 1 at a node's component, spread over the rows of that name.
+        """Return the vector (n,) with 1 at a component of a node.
 
-        Parameters
-        ----------
-        place : (int, int)
-            Node and component.
-        where : str
-            What names them, for sentences.
-        weights : RowWeights
-            Weights of rows that carry one name.
+        Where several rows have the same node and component, `weights` distributes the 1 over them.
 
         Raises
         ------
         MeshError
             If the matrices have no such row, or so many that their weights are not known.
         """
-        rows = self.rows_of(place, where)
+        rows = self.rows_of(dof, where)
         if len(rows) not in weights:
-            node, component = place
+            node, component = dof
             raise MeshError(
                 f"{where}: node {node} has {len(rows)} rows of component {component}, and how "
                 "these share what acts on the node is not known; name another node, or give a "
                 "vector."
             )
-        vector = np.zeros(len(self.places))
+        vector = np.zeros(len(self.dofs))
         vector[rows] = weights[len(rows)]
         return vector
 
     def direction_at(
         self, node: int, direction: Vector, where: str, weights: RowWeights = READ_WEIGHTS
     ) -> FloatArray:
-        """Return the vector (n,) of a direction (3,) at a node; the rest as in `unit_vector_at`."""
+        """Return the vector (n,) of a direction (3,) at a node, see `unit_vector_at`."""
         components = [
             value * self.unit_vector_at((node, axis), where, weights)
             for axis, value in enumerate(direction, start=1)
@@ -133,21 +121,21 @@ class MatrixFiles:
         return np.asarray(np.sum(components, axis=0))
 
     def uniform_field(self, field: Vector, where: str) -> FloatArray:
-        """Return the values (n,) of a vector field, such as an acceleration, equal at all nodes.
+        """Return the vector (n,) of a field that is equal at all nodes, such as an acceleration.
 
         Parameters
         ----------
         field : (3,) tuple
-            The components of the field along the axes; rotations are zero.
+            The components along the axes; rotations are zero.
         where : str
-            The key that needs the field, for messages.
+            The key of the design that needs the field, for the error message.
 
         Raises
         ------
         MeshError
-            If rows that rotate cannot be distinguished from rows that shift.
+            If rows of rotations cannot be distinguished from rows of translations.
         """
-        if len(self.rows) < len(self.places):
+        if len(self.rows) < len(self.dofs):
             raise MeshError(
                 f"{where}: several rows of the matrices have the same name, as for shells and "
                 "beams that were expanded to solids, so that rotations cannot be distinguished "
@@ -155,38 +143,38 @@ class MatrixFiles:
             )
         no_rotations = (0.0, 0.0, 0.0)
         values = (*field, *no_rotations)
-        return np.array([values[component - 1] for _, component in self.places])
+        return np.array([values[component - 1] for _, component in self.dofs])
 
     def vector(self, name: str, where: str, weights: RowWeights = READ_WEIGHTS) -> FloatArray:
-        """Return the vector (n,) of a file; raises `MeshError` if it cannot be read or used."""
+        """Read a vector (n,); raise `MeshError` if it cannot be read or has another length."""
 
-        def unit_vector_at(place: Place) -> FloatArray:
-            return self.unit_vector_at(place, where, weights)
+        def unit_vector_at(dof: Dof) -> FloatArray:
+            return self.unit_vector_at(dof, where, weights)
 
-        return read_vector(self.folder, name, unit_vector_at, len(self.places))
+        return read_vector(self.folder, name, unit_vector_at, len(self.dofs))
 
     def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
-        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in our order.
+        """Read a symmetric matrix (n, n) [N/m or kg], with rows in the order of `dofs`.
 
         Parameters
         ----------
         name : str
-            The file, and the matrix in it.
+            `FILE` or `FILE:MATRIX`.
         where : str
-            The key that names it, for sentences.
+            The key of the design that names it, for error messages.
         partial : bool
-            Whether the matrix may have fewer rows, as a table whose last rows are zero.
+            Whether the matrix may have fewer rows, as a table does whose last rows are zero.
 
         Raises
         ------
         MeshError
             If the matrix cannot be read, has other rows, is not finite or not symmetric.
         """
-        matrix, places_in_file = read_matrix(self.folder, name)
-        size = len(self.places)
+        matrix, dofs_in_file = read_matrix(self.folder, name)
+        size = len(self.dofs)
         label = f"{where}: {self.folder / name}"
-        if places_in_file is not None:
-            rows = [self.rows_of(place, label)[0] for place in places_in_file]
+        if dofs_in_file is not None:
+            rows = [self.rows_of(dof, label)[0] for dof in dofs_in_file]
             selection = sparse.eye_array(size, format="csc")[:, rows].tocsr()
             matrix = (selection @ matrix @ selection.T).tocsr()
         if partial and matrix.shape[0] < size:
@@ -209,7 +197,7 @@ class MatrixFiles:
             worst = int(asymmetry.data.argmax())
             row, column = (int(indices[worst]) for indices in asymmetry.coords)
             raise MeshError(
-                f"{label} is not symmetric: its entries between {place_in_words(self.places[row])} "
-                f"and {place_in_words(self.places[column])} differ by {asymmetry.data[worst]:.3g}; "
+                f"{label} is not symmetric: its entries between {describe_dof(self.dofs[row])} "
+                f"and {describe_dof(self.dofs[column])} differ by {asymmetry.data[worst]:.3g}; "
                 "friction, follower loads and gyroscopic terms cannot be taken."
             )

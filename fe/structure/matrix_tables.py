@@ -1,9 +1,8 @@
-"""Reading the matrices and vectors of other finite element codes.
+"""Read matrices and vectors of other finite element codes.
 
 The content of a file tells its format: MatrixMarket; archives of NumPy and SciPy (`.npz`, `.npy`);
 DMIG of Nastran; tables of `row column value` (CalculiX' `.sti` and `.mas`, Abaqus' COORDINATE) or
-of `node component node component value` (Abaqus' MATRIX INPUT). Those that name nodes bring their
-own unknowns.
+of `node component node component value` (Abaqus' MATRIX INPUT), which also tell what each row is.
 """
 
 import io
@@ -25,8 +24,8 @@ from .deck_text import fail
 from .matrix_design import file_of
 from .nastran import cards
 
-Place = tuple[int, int]
-"""Node and component: 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""
+Dof = tuple[int, int]
+"""Degree of freedom: a node and its component, 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""
 
 _PLACE = re.compile(r"\s*(\d+)\s*[.,;\s]\s*([1-6])\s*")
 _SQUARE_FORMS = (1, 6)
@@ -37,14 +36,14 @@ _REAL_TYPES = (1, 2)
 
 
 class _FileContent(NamedTuple):
-    """The array of a file, and whether it is a table: lines of a place or two, and a value."""
+    """The array in a file, and whether its rows are entries: positions and a value."""
 
     array: FloatArray | sparse.sparray
     is_table: bool
 
 
-def read_unknowns(path: Path) -> list[Place]:
-    """Read the node and component of each row of a matrix, a line each: `97.3`, `97 3` or `97,3`.
+def read_unknowns(path: Path) -> list[Dof]:
+    """Read the node and component of each row, one a line: `97.3`, `97 3` or `97,3`.
 
     Raises
     ------
@@ -65,22 +64,22 @@ def read_unknowns(path: Path) -> list[Place]:
     return unknowns
 
 
-def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] | None]:
-    """Read a matrix, and the unknown of each row where the file says it.
+def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Dof] | None]:
+    """Read a matrix and, if the file has them, the node and component of each row.
 
-    A table may leave out one of each two entries that mirror each other.
+    A table may hold one triangle of a symmetric matrix only.
 
     Parameters
     ----------
     name : str
-        `FILE` or `FILE:MATRIX`.
+        `FILE` or `FILE:MATRIX`, relative to the folder.
 
     Returns
     -------
     matrix : (n, n) sparse array
         The matrix.
     unknowns : list of (int, int) or None
-        Node and component of each row; None if the file does not say them.
+        Node and component of each row; None if the file does not have them.
 
     Raises
     ------
@@ -103,10 +102,10 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] 
     positions = table[:, :-1].astype(np.int64)
     unknowns = None
     if width == 5:
-        both_places = positions.reshape(-1, 2)
-        places, index_of_place = np.unique(both_places, axis=0, return_inverse=True)
-        unknowns = [(node, component) for node, component in places.tolist()]
-        indices = index_of_place.reshape(-1, 2)
+        dof_pairs = positions.reshape(-1, 2)
+        dofs, index_of_dof = np.unique(dof_pairs, axis=0, return_inverse=True)
+        unknowns = [(node, component) for node, component in dofs.tolist()]
+        indices = index_of_dof.reshape(-1, 2)
     else:
         if positions.min() < 1:
             fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
@@ -119,7 +118,7 @@ def _are_whole(numbers: FloatArray) -> bool:
 
 
 def _square_matrix(path: Path, matrix: FloatArray | sparse.sparray) -> sparse.csr_array:
-    """Return the matrix of a file as a sparse one; refuse one that is not square or not real."""
+    """Return a matrix as a sparse one; raise `MeshError` if it is not square or not real."""
     is_square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
     if not is_square or matrix.dtype.kind not in "fiu":
         fail(
@@ -131,22 +130,22 @@ def _square_matrix(path: Path, matrix: FloatArray | sparse.sparray) -> sparse.cs
 
 
 def _symmetric_matrix(indices: IntArray, values: FloatArray) -> sparse.csr_array:
-    """Return the matrix of a table, with the mirrored entries if the table has one triangle only.
+    """Assemble a matrix from entries, and mirror it if only one triangle is given.
 
     Parameters
     ----------
     indices : (N, 2) array
         Row and column of each entry, from 0.
     values : (N,) array
-        The entries; those of one place are added.
+        The entries; those at the same position are added.
     """
     size = int(indices.max()) + 1
     shape = (size, size)
-    places = tuple(indices.T)
-    matrix = sparse.coo_array((values, places), shape).tocsr()
+    positions = tuple(indices.T)
+    matrix = sparse.coo_array((values, positions), shape).tocsr()
     # a table of one triangle has a mirrored entry for its diagonal entries only
     ones = np.ones(len(values))
-    pattern = sparse.coo_array((ones, places), shape).tocsr()
+    pattern = sparse.coo_array((ones, positions), shape).tocsr()
     mirrored_entries = pattern.multiply(pattern.T).tocoo()
     has_one_triangle = (mirrored_entries.row == mirrored_entries.col).all()
     if has_one_triangle:
@@ -156,23 +155,18 @@ def _symmetric_matrix(indices: IntArray, values: FloatArray) -> sparse.csr_array
 
 
 def read_vector(
-    folder: Path, name: str, unit_vector: Callable[[Place], FloatArray], size: int
+    folder: Path, name: str, unit_vector: Callable[[Dof], FloatArray], size: int
 ) -> FloatArray:
-    """Read a vector: as many numbers as there are unknowns, or lines of node, component and value.
+    """Read a vector (n,): n numbers, or lines of node, component and value.
 
     Parameters
     ----------
     name : str
-        `FILE` or `FILE:ARRAY`.
+        `FILE` or `FILE:ARRAY`, relative to the folder.
     unit_vector : callable
-        Returns the vector (n,) of 1 at a node's component.
+        Returns the vector (n,) with 1 at a component of a node.
     size : int
         Number n of unknowns.
-
-    Returns
-    -------
-    (n,) array
-        The vector.
 
     Raises
     ------
@@ -199,13 +193,7 @@ def read_vector(
 
 
 def _read(path: Path, array_name: str) -> _FileContent:
-    """Return the content of a file of any format; see the module.
-
-    Parameters
-    ----------
-    array_name : str
-        The array or matrix in it; empty if it has one only.
-    """
+    """Read a file of any format; `array_name` is empty if the file has one array only."""
     try:
         if path.suffix in (".npz", ".npy"):
             return _FileContent(_numpy_array(path, array_name), is_table=False)
@@ -225,7 +213,7 @@ def _read(path: Path, array_name: str) -> _FileContent:
 
 
 def _numpy_array(path: Path, array_name: str) -> FloatArray | sparse.sparray:
-    """Return an array of an archive of NumPy or SciPy."""
+    """Load an array from a file of NumPy or SciPy."""
     if path.suffix == ".npy":
         array: FloatArray = np.load(path, allow_pickle=False)
         return array
@@ -249,7 +237,7 @@ class _DmigMatrix(NamedTuple):
     Attributes
     ----------
     form : int
-        The form in Nastran's numbers: square, symmetric, ...
+        Nastran's number of the form: square, symmetric, ...
     entries : list of tuple of float
         Node and component of the row, node and component of the column, and value of each entry.
     """
@@ -259,7 +247,7 @@ class _DmigMatrix(NamedTuple):
 
 
 def _dmig_table(path: Path, matrix_name: str) -> FloatArray:
-    """Read a real square matrix from the DMIG of the bulk data, as a table (N, 5)."""
+    """Read a real square matrix from DMIG entries of the bulk data, as a table (N, 5)."""
     matrices: dict[str, _DmigMatrix] = {}
     for card in cards(path):
         if card.word != "DMIG":

@@ -1,4 +1,4 @@
-"""The mesh of a structure as its file has it, in metres: nodes, cells of one kind, named sets."""
+"""The mesh of a structure in metres: nodes, cells of one kind, named sets."""
 
 from collections.abc import Sized
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from fe.runtime.errors import MeshError
 from reporting.words import comma_list
 
 ALL_CELLS = "all"
-"""Name of the set of all cells, which no file has to hold."""
+"""Name of the set of all cells, which exists without being in the file."""
 _Content = TypeVar("_Content", bound=Sized)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Faces of cells.
+    """Some faces of cells.
 
     Attributes
     ----------
     cell : (m,) array of int
         Cell of each face.
     face : (m,) array of int
-        Number of the face in its cell.
+        Index of the face in its cell.
     """
 
     cell: IntArray
@@ -37,7 +37,7 @@ class Surface:
 
 
 class Spheres(NamedTuple):
-    """Spheres around m things.
+    """Bounding spheres of m cells or faces.
 
     Attributes
     ----------
@@ -53,16 +53,14 @@ class Spheres(NamedTuple):
 
 @dataclass(frozen=True)
 class StructureMesh(CellMesh):
-    """Mesh of a file in metres; nodes that no cell uses are left out.
+    """The mesh of a file, in metres, without nodes that no cell uses.
 
     Attributes
     ----------
     source : str
-        The file, for sentences.
+        The name of the file in messages.
     unit : float
-        Metres in a unit of length of the file.
-    unit_name : str
-        The name of the unit.
+        The file's unit of length [m].
     node_numbers : (nn,) array of int
         Numbers of the nodes in the file, or from 1 if it has none.
     cell_numbers : (nc,) array of int
@@ -74,8 +72,7 @@ class StructureMesh(CellMesh):
     loose : (l,) array of int
         Numbers of the nodes that no cell uses.
     remarks : tuple of str
-        What a user should know of the file: words that were ignored though their meaning is
-        unknown.
+        Sentences for the user on how the file was read.
     """
 
     source: str
@@ -91,23 +88,23 @@ class StructureMesh(CellMesh):
 
     @cached_property
     def size(self) -> float:
-        """Diagonal of the box around the structure [m]."""
+        """Diagonal of the structure's bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @property
     def boundary(self) -> Surface:
-        """The surface of the structure: the faces that belong to one cell alone."""
+        """The surface of the structure: the faces that belong to one cell only."""
         return Surface(self.outer_faces.cell, self.outer_faces.number)
 
     @cached_property
     def cell_radius(self) -> FloatArray:
-        """Radii (nc,) [m] of the spheres around the centres of the cells that hold their nodes."""
+        """Radii (nc,) [m] of the bounding spheres around the cells' centres."""
         distance = np.linalg.norm(self.nodes - self.centres[:, None], axis=2)
         return np.asarray(distance.max(axis=1))
 
     @cached_property
     def face_spheres(self) -> Spheres:
-        """Spheres around the centres of the faces of the surface that hold their nodes."""
+        """Bounding spheres of the faces of the surface, around the means of their nodes."""
         surface = self.boundary
         centre = np.empty((len(surface), 3))
         radius = np.empty(len(surface))
@@ -121,14 +118,14 @@ class StructureMesh(CellMesh):
             radius[faces] = distance.max(axis=1)
         return Spheres(centre, radius)
 
-    def place(self, point: FloatArray) -> str:
-        """Return a position (3,) [m] as it stands in a sentence, in the unit of the file."""
+    def describe_point(self, point: FloatArray) -> str:
+        """Format a position (3,) [m] for a message, in the unit of the file."""
         text = ", ".join(f"{value / self.unit + 0.0:.6g}" for value in point)
         return f"({text}) {self.unit_name}"
 
-    def cell(self, number: int) -> str:
-        """Return a cell as it stands in a sentence: its number in the file, and its position."""
-        return f"{self.cell_numbers[number]} at {self.place(self.centres[number])}"
+    def describe_cell(self, number: int) -> str:
+        """Format a cell for a message: its number in the file, and its centre."""
+        return f"{self.cell_numbers[number]} at {self.describe_point(self.centres[number])}"
 
     def cells_of(self, name: str, where: str) -> IntArray:
         """Return the cells (m,) of a set.
@@ -136,9 +133,9 @@ class StructureMesh(CellMesh):
         Parameters
         ----------
         name : str
-            Name of the set.
+            Name of the set; "all" are all cells, unless the file has a set of that name.
         where : str
-            The key in the design that names it, for sentences.
+            The key of the design that names the set, for the error message.
 
         Raises
         ------
@@ -153,7 +150,9 @@ class StructureMesh(CellMesh):
         return self._members(sets, name, "cells", "cell", where)
 
     def nodes_of(self, name: str, where: str) -> IntArray:
-        """Return the nodes (m,) of a set of nodes or of faces; the parameters are as in `cells_of`.
+        """Return the nodes (m,) of a set of nodes or of faces.
+
+        `where` is the key of the design that names the set, for the error message.
 
         Raises
         ------
@@ -172,23 +171,9 @@ class StructureMesh(CellMesh):
     def _members(
         self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str
     ) -> _Content:
-        """Return the members of a set that a design names.
+        """Return the members of a set; raise `MeshError` if it is missing or empty.
 
-        Parameters
-        ----------
-        sets : dict
-            Members of the sets by name.
-        name : str
-            Name of the set.
-        kind, member : str
-            The word for the content of the sets, and that for one member, in sentences.
-        where : str
-            The key in the design that names the set.
-
-        Raises
-        ------
-        MeshError
-            If there is no such set, or if it is empty.
+        `kind` and `member` are the words for what the set holds, in the plural and in the singular.
         """
         members = _set_named(sets, name)
         if members is None:
@@ -201,9 +186,11 @@ class StructureMesh(CellMesh):
         return members
 
     def faces_of(self, name: str, where: str) -> Surface:
-        """Return the surface faces in a set of faces, or of nodes with all corners of a face.
+        """Return the surface faces of a set.
 
-        Parameters are those of `cells_of`.
+        These are the faces of a set of faces, or those whose corners all lie in a set of nodes.
+        `where`
+        is the key of the design that names the set, for the error message.
 
         Raises
         ------
@@ -219,14 +206,9 @@ class StructureMesh(CellMesh):
         return surface
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
-        """Return the faces of a set, or the surface faces with all corners among some nodes.
+        """Return the faces of a set or, if it holds no faces, those between nodes (m,).
 
-        Parameters
-        ----------
-        name : str
-            Name of the set.
-        nodes : (m,) array of int
-            The nodes that are used if there is no set of faces.
+        A face lies between the nodes if they include all of its corners. The result may be empty.
         """
         outer_faces = self.outer_faces
         face_set = _set_named(self.face_sets, name)
@@ -240,9 +222,9 @@ class StructureMesh(CellMesh):
 
 
 def _set_named(sets: dict[str, _Content], name: str) -> _Content | None:
-    """Return the members of a set by its name.
+    """Return the members of a set, or None if no set has this name.
 
-    The case of letters counts only if two names differ by nothing else.
+    Upper and lower case are distinguished only if two names differ by nothing else.
     """
     if name in sets:
         return sets[name]

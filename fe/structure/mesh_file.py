@@ -1,4 +1,4 @@
-"""Reading a mesh file and checking its mesh; how much memory a structure of the mesh takes."""
+"""Read a mesh file and check its mesh; estimate how much memory its structure takes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +24,7 @@ _READERS: dict[str, Callable[[Path], Deck]] = {
     ".nas": read_nastran,
     ".fem": read_nastran,
 }
-"""Readers of this project by the ending of the file; meshio reads all others."""
+"""Readers of this project by file extension; meshio reads all other files."""
 
 LARGEST_EDGE_SHIFT = 0.3
 """Largest distance of a mid-edge node from the middle of its edge, in lengths of the edge."""
@@ -32,21 +32,14 @@ LARGEST_EDGE_SHIFT = 0.3
 
 @np.errstate(over="ignore", invalid="ignore")  # an overflow makes the Jacobian fail its check
 def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
-    """Read a mesh file and check its mesh.
+    """Read a mesh file, in a format given by its extension, and check its mesh.
 
     Parameters
     ----------
-    path : Path
-        The file; its ending says its format.
     unit : float
-        Metres in its unit of length.
+        The file's unit of length [m].
     unit_name : str
         The name of the unit.
-
-    Returns
-    -------
-    StructureMesh
-        The mesh, its nodes in metres.
 
     Raises
     ------
@@ -70,7 +63,7 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
 
 
 def _check_edges(mesh: StructureMesh) -> None:
-    """Refuse a mesh with a mid-edge node far from the middle of its edge."""
+    """Raise `MeshError` if a mid-edge node lies far from the middle of its edge."""
     corner_count = len(mesh.kind.corners)
     for edge, (start_node, end_node) in enumerate(mesh.kind.edges):
         start, end = mesh.nodes[:, start_node], mesh.nodes[:, end_node]
@@ -81,14 +74,17 @@ def _check_edges(mesh: StructureMesh) -> None:
             cell = int(is_far.argmax())
             node = mesh.node_numbers[mesh.cells[cell, corner_count + edge]]
             raise MeshError(
-                f"{mesh.source}: node {node} of element {mesh.cell(cell)} lies far from the middle "
-                "of its edge; the nodes of the element are in another order, or the edge is bent "
-                "too much."
+                f"{mesh.source}: node {node} of element {mesh.describe_cell(cell)} lies far from "
+                "the middle of its edge; the nodes of the element are in another order, or the edge "
+                "is bent too much."
             )
 
 
 def _check_jacobians(mesh: StructureMesh) -> None:
-    """Refuse a mesh with elements whose Jacobian is not positive everywhere."""
+    """Raise `MeshError` if the Jacobian of a cell is not positive everywhere.
+
+    It is checked at the nodes and at the integration points.
+    """
     integration_points = mesh.kind.stiffness_rule[0]
     local_points = np.vstack((mesh.kind.node_positions, integration_points))
     least_by_batch = []
@@ -98,7 +94,7 @@ def _check_jacobians(mesh: StructureMesh) -> None:
     least = np.concatenate(least_by_batch)
     is_bad = ~((least > 0.0) & (least < np.inf))  # also where it is not a number
     if is_bad.any():
-        worst = mesh.cell(int(least.argmin()))
+        worst = mesh.describe_cell(int(least.argmin()))
         raise MeshError(
             f"{mesh.source}: {is_bad.sum()} of {len(is_bad)} elements are inside out or flat "
             f"(their Jacobian is not positive everywhere), the worst is element {worst}. "
@@ -107,7 +103,7 @@ def _check_jacobians(mesh: StructureMesh) -> None:
 
 
 def _remedy_of_bad_elements(mesh: StructureMesh) -> str:
-    """Return what to do about elements without volume, for kinds with curved edges and others."""
+    """Return the advice for cells with a Jacobian that is not positive."""
     if mesh.kind.edges:
         return (
             "At a curved surface make the mesh finer there, or let the mesher optimise its "
@@ -117,7 +113,7 @@ def _remedy_of_bad_elements(mesh: StructureMesh) -> str:
 
 
 def _check_connected(mesh: StructureMesh) -> None:
-    """Refuse a mesh that falls into parts which share no node."""
+    """Raise `MeshError` if the mesh falls into parts that share no node."""
     # graph from the first node of each element to its other nodes
     first_nodes = np.repeat(mesh.cells[:, :1], mesh.cells.shape[1], axis=1)
     ones = np.ones(mesh.cells.size, dtype=np.int8)
@@ -132,8 +128,8 @@ def _check_connected(mesh: StructureMesh) -> None:
     first_cell = int((part_of_cell == smallest_part).argmax())
     raise MeshError(
         f"{mesh.source}: the mesh falls into {part_count} parts that share no node; the smallest, "
-        f"of {cell_counts.min()} elements, is around {mesh.place(mesh.centres[first_cell])}. Merge "
-        "the nodes where the parts touch, or leave parts out."
+        f"of {cell_counts.min()} elements, is around {mesh.describe_point(mesh.centres[first_cell])}"
+        ". Merge the nodes where the parts touch, or leave parts out."
     )
 
 
@@ -148,12 +144,9 @@ _FACTOR_BYTES = 520.0
 
 
 def memory_estimate(mesh: StructureMesh) -> float:
-    """Return the memory that assembly and factorisation take, from the mesh's order of elimination.
+    """Estimate the memory [bytes] for assembly and factorisation.
 
-    Returns
-    -------
-    float
-        The memory [bytes].
+    The fill-in is counted from the order in which the nodes are eliminated.
     """
     # graph of nodes that share a cell
     cell_count, nodes_per_cell = mesh.cells.shape
@@ -179,17 +172,9 @@ def memory_estimate(mesh: StructureMesh) -> float:
 
 
 def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
-    """Refuse a mesh whose assembly and factorisation would take too much memory.
+    """Raise `MeshError` if assembly and factorisation would take too much memory.
 
-    Parameters
-    ----------
-    limit : float, optional
-        The allowed memory [bytes]; by default what the machine has left.
-
-    Raises
-    ------
-    MeshError
-        If it would take more.
+    `limit` is the allowed memory [bytes], by default what the machine has left.
     """
     allowed_memory = available_memory() if limit is None else limit
     # An upper estimate first, which takes no time; four times as many entries as remain when they

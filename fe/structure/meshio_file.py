@@ -1,4 +1,4 @@
-"""Reading meshes of Gmsh, VTU, MED and other formats by meshio."""
+"""Read meshes of Gmsh, VTU, MED and other formats with meshio."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _LONGEST_REASON = 500
 
 
 def read_by_meshio(path: Path) -> Deck:
-    """Read the mesh of a file of any format that meshio knows.
+    """Read the mesh of a file in any format that meshio knows.
 
     Raises
     ------
     MeshError
-        If meshio cannot read it, or loses elements of it.
+        If meshio cannot read the file, or would lose elements of it.
     """
     if path.suffix.lower() == ".msh":
         _refuse_options_of_gmsh(path)
@@ -65,13 +65,10 @@ def read_by_meshio(path: Path) -> Deck:
 
 
 def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
-    """Add the elements of a mesh.
+    """Add the elements of a mesh; return their numbers in the deck, an array for each block.
 
-    Returns
-    -------
-    list of (E,) array
-        For each block of elements the numbers that they have in the deck; `_LEFT_OUT` for those
-        that were left out. Elements that are there twice share a number.
+    Elements outside the physical groups of Gmsh get the number `_LEFT_OUT`. Elements that occur
+    twice in a file of Gmsh share a number.
     """
     suffix = deck.path.suffix.lower()
     outside_blocks = _outside_physical_groups(mesh)
@@ -104,16 +101,9 @@ def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
 
 
 def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
-    """Return the nodes (E, n) of a block of elements, or no nodes if the type is unknown.
+    """Return the nodes (E, n) of a block in meshio's order, or none if the type is unknown.
 
-    Parameters
-    ----------
-    block_type : str
-        The type of the elements in meshio.
-    data : (E, n) array
-        The nodes of the elements as meshio has read them.
-    suffix : str
-        The ending of the file: MED has an order of nodes of its own.
+    meshio leaves the nodes of MED files in MED's own order.
     """
     if block_type not in KINDS and block_type not in FLAT:
         return np.zeros((len(data), 0), dtype=np.int64)
@@ -123,7 +113,7 @@ def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
 
 
 class _NamedArrays(NamedTuple):
-    """Sets of a mesh, and its data at points or cells: arrays by name, one for each block."""
+    """Sets and data of nodes or elements: by name, one array for each block."""
 
     sets: Mapping[str, Sequence[ArrayLike | None]]
     data: Mapping[str, Sequence[ArrayLike]]
@@ -134,18 +124,9 @@ def _add_sets(
 ) -> None:
     """Add the sets of the nodes, or of one block of elements.
 
-    Parameters
-    ----------
-    mesh : meshio.Mesh
-        The mesh as meshio read it, in the unit of the file.
-    kind : {"NSET", "ELSET"}
-        Sets of nodes, or of elements.
-    numbers : (n,) array
-        The numbers of the nodes or elements in the deck.
-    arrays : _NamedArrays
-        The sets and data of nodes or elements.
-    block : int
-        The index of the block in these arrays.
+    `kind` is "NSET" or "ELSET"; `numbers` (n,) are the numbers of the nodes or elements in the
+    deck;
+    `block` is the index in the lists of `arrays`.
     """
     named_sets: list[tuple[str, IntArray]] = []
     for name, members in arrays.sets.items():
@@ -168,25 +149,10 @@ def _add_sets(
 def _sets_of_values(
     mesh: Mesh, label: str, arrays: Sequence[ArrayLike], block: int
 ) -> Iterator[tuple[str, IntArray]]:
-    """Yield the sets of nodes or elements with one value in an array of integers.
+    """Yield the name and the member indices of each set that an array of integers defines.
 
-    Parameters
-    ----------
-    mesh : meshio.Mesh
-        The mesh as meshio read it, in the unit of the file.
-    label : str
-        The name of the array, such as "gmsh:physical" or "cell_tags".
-    arrays : sequence of (n,) array
-        The array for each block.
-    block : int
-        The index of the block.
-
-    Yields
-    ------
-    name : str
-        A name of the set, in the words of the file.
-    indices : (k,) array
-        The indices of its members in the block.
+    A set holds the nodes or elements of one value. `label` is the name of the array, such as
+    "gmsh:physical" or "cell_tags".
     """
     array = np.asarray(arrays[block])
     if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
@@ -206,18 +172,9 @@ def _sets_of_values(
 
 
 def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]:
-    """Return the names that a file gives to a value of an array of integers.
+    """Return the set names that a file gives to a value of an integer array.
 
-    Parameters
-    ----------
-    mesh : meshio.Mesh
-        The mesh as meshio read it, in the unit of the file.
-    label : str
-        The name of the array.
-    value : int
-        The value whose names are sought.
-    block : int
-        The index of the block of elements that have it.
+    Without a name the set is called `label=value`.
     """
     number_name = f"{label}={value}"
     if label in ("cell_tags", "point_tags"):  # MED counts families of named groups
@@ -238,9 +195,10 @@ def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]
 
 
 def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
-    """Return for each block of a mesh from Gmsh which elements belong to no part of the structure.
+    """Return for each block of a mesh from Gmsh which elements are not part of the structure.
 
-    Gmsh writes elements without a physical group, as group 0, if its option Mesh.SaveAll is set.
+    Gmsh also writes elements without a physical group, as group 0, if its option Mesh.SaveAll is
+    set.
     They are construction geometry if other elements of their dimension have a group. If no solid
     element has one, the groups name faces only, and all solid elements are the structure.
     """
@@ -267,7 +225,7 @@ _PARAMETRIC = (
 
 
 def _refuse_options_of_gmsh(path: Path) -> None:
-    """Refuse a mesh that Gmsh has saved in parts, or with parameters of nodes on surfaces."""
+    """Raise `MeshError` for a mesh that is partitioned or has parametric coordinates."""
     content = path.read_bytes()
     if b"$PartitionedEntities" in content or b"$GhostElements" in content:
         fail(
@@ -280,7 +238,7 @@ def _refuse_options_of_gmsh(path: Path) -> None:
 
 
 def _check_element_lines(path: Path) -> None:
-    """Refuse a text file of Gmsh with more lines of elements than it declares.
+    """Raise `MeshError` if a text file of Gmsh has more element lines than it declares.
 
     Version 2 declares the number of elements, version 4 the numbers of blocks and of elements; Gmsh
     writes one line for each.
@@ -306,7 +264,7 @@ def _check_element_lines(path: Path) -> None:
 
 
 def _mesh_of_meshio(path: Path) -> Mesh:
-    """Return the mesh that meshio reads from a file; if it fails, say in one sentence why."""
+    """Let meshio read a file; if it fails, raise `MeshError` with the reason."""
     printed_text = io.StringIO()
     reasons_of_formats = io.StringIO()
     try:

@@ -1,7 +1,7 @@
-"""Reading the meshes of Nastran from the bulk data of its decks (`.bdf`, `.nas`, `.fem`).
+"""Read meshes of Nastran from the bulk data of decks (`.bdf`, `.nas`, `.fem`).
 
-meshio reads such files as well, but takes every grid point for Cartesian, passes rigid elements
-over, and does not name the line of a fault.
+meshio reads such files as well, but takes every grid point for Cartesian, ignores rigid elements,
+and does not name the line of a fault.
 """
 
 import re
@@ -24,7 +24,7 @@ _ORDER_FOR_MESHIO = {
     "hexahedron20": (*range(12), *range(16, 20), *range(12, 16)),
     "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
 }
-"""The places of nodes: Nastran counts the middles of the upright edges before those of the top."""
+"""Indices of nodes: Nastran counts the middles of the upright edges before those of the top."""
 
 _FLAT_WORDS = words_of("nastran").flat
 _SECTION_WORDS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
@@ -44,11 +44,11 @@ class _Card(NamedTuple):
     Attributes
     ----------
     word : str
-        The word that it begins with.
+        Its keyword.
     where : str
-        The file and the line of the entry.
+        File and line of the entry.
     fields : list of str
-        The fields of the entry from the second on, with those of its continuations.
+        The fields after the keyword, with those of continuation lines.
     """
 
     word: str
@@ -56,30 +56,31 @@ class _Card(NamedTuple):
     fields: list[str]
 
     def whole(self, index: int, default: int = 0) -> int:
-        """Return a field as a whole number; the default if it is empty."""
+        """Return a field as an integer, or the default if it is empty."""
         text = self.fields[index] if index < len(self.fields) else ""
         return whole(self.where, text) if text else default
 
     def reals(self, first: int, count: int) -> list[float]:
-        """Return fields as real numbers; 0 for empty ones."""
+        """Return `count` fields as floats, empty ones as 0."""
         padded_fields = self.fields + [""] * (first + count)
         return [real(self.where, text) for text in padded_fields[first : first + count]]
 
     @property
     def is_by_grid_points(self) -> bool:
-        """Whether a coordinate system is given by grid points, as by CORD1R."""
+        """Whether the card defines a coordinate system by grid points, such as CORD1R."""
         return self.word[4] == "1"
 
 
 def read_nastran(path: Path) -> Deck:
-    """Read the mesh of a deck: its bulk data, with or without the sections above it.
+    """Read the mesh of a Nastran deck, with or without the sections above the bulk data.
 
-    The elements of a property are the set `nastran:ref=` and its number.
+    The elements of a property become the set `nastran:ref=` with the property's number.
 
     Raises
     ------
     MeshError
-        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
+        If the deck cannot be read, or has an entry that the mesh would lose. The message names the
+        line.
     """
     deck = Deck(path, words_of("nastran"))
     points = _GridPoints()
@@ -105,8 +106,9 @@ def read_nastran(path: Path) -> Deck:
 class _GridPoints:
     """The grid points of a deck, and the coordinate systems that they are given in.
 
-    Coordinate systems may be given by grid points, and these in other systems: both are resolved
-    when they are needed, after the whole deck was read.
+    Systems may be defined by grid points, and these in other systems. So both are resolved only
+    after
+    the whole deck was read.
 
     Attributes
     ----------
@@ -129,23 +131,17 @@ class _GridPoints:
             fail(card.where, f"the grid point {number} is there twice; delete one.")
 
     def add_systems(self, card: _Card) -> None:
-        """Add the coordinate systems of a card; one by grid points may hold two."""
+        """Add the coordinate systems of a card; a card by grid points may hold two."""
         holds_two = card.is_by_grid_points and card.whole(4) != 0
         for first_field in (0, 4) if holds_two else (0,):
             number = card.whole(first_field)
             self._system_cards[number] = card._replace(fields=card.fields[first_field:])
 
     def point(self, number: int, where: str, depth: int = 0) -> FloatArray:
-        """Return a grid point in space (3,).
+        """Return the global coordinates (3,) of a grid point.
 
-        Parameters
-        ----------
-        number : int
-            The number of the grid point.
-        where : str
-            File and line of what names it.
-        depth : int
-            The number of systems that are being resolved.
+        `where` is the file and line that name it, for the error message; `depth` counts the nested
+        coordinate systems.
         """
         if number not in self.grids:
             fail(where, f"the grid point {number} is not there.")
@@ -154,7 +150,7 @@ class _GridPoints:
         return system.to_space(card.reals(2, 3))
 
     def _system(self, number: int, where: str, depth: int) -> CoordinateSystem:
-        """Return a coordinate system by its number; see `point`."""
+        """Return a coordinate system by its number; the parameters are as in `point`."""
         if number in self._systems:
             return self._systems[number]
         if number not in self._system_cards:
@@ -181,7 +177,7 @@ class _GridPoints:
 
 
 def _add_element(deck: Deck, card: _Card) -> None:
-    """Add an element, and its number to the set of its property."""
+    """Add an element, also to the set of its property."""
     number = card.whole(0)
     if card.word in _FLAT_WORDS:
         meshio_name = _FLAT_WORDS[card.word]
@@ -194,7 +190,7 @@ def _add_element(deck: Deck, card: _Card) -> None:
 
 
 def _solid_element(card: _Card) -> tuple[str, list[int]]:
-    """Return the type in meshio of a solid element, and its nodes in meshio's order."""
+    """Return the meshio type of a solid element, and its nodes in meshio's order."""
     fields = [card.whole(field) for field in range(2, len(card.fields))]
     nodes = [node for node in fields if node]
     corner_count = _CORNERS_OF_SOLIDS[card.word]
@@ -211,7 +207,7 @@ def _solid_element(card: _Card) -> tuple[str, list[int]]:
 
 
 class _Line(NamedTuple):
-    """A line of the bulk data: head, fields, and the marker of the line that continues it."""
+    """A line of the bulk data, with the marker that names its continuation."""
 
     where: str
     head: str
@@ -225,15 +221,15 @@ class _Line(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The marker of the line that this one continues; empty if that is the line before."""
+        """The marker of the line that this one continues; empty for the previous line."""
         return self.head[1:].upper()
 
 
 def cards(path: Path) -> list[_Card]:
-    """Return the entries of a file's bulk data, each with the fields on its continuation lines.
+    """Return the entries of the bulk data, each with the fields of its continuation lines.
 
     A continuation without a name belongs to the line above it. One with a name belongs to the line
-    that ends with this name as its marker, which may stand above or below.
+    that ends with this name as its marker, which may be above or below.
     """
     lines = _bulk_lines(path)
     finished_cards: list[_Card] = []
@@ -281,7 +277,7 @@ def cards(path: Path) -> list[_Card]:
 
 
 def _bulk_lines(path: Path) -> list[_Line]:
-    """Return the lines of the bulk data up to ENDDATA."""
+    """Return the lines of the bulk data up to ENDDATA, with repetitions written out."""
     lines = list(lines_of((path,), _COMMENT, _INCLUDE))
     start = 0
     for number, (_, text) in enumerate(lines, start=1):
@@ -302,10 +298,11 @@ def _bulk_lines(path: Path) -> list[_Line]:
 
 
 def _replicated(line: _Line, lines_above: list[_Line]) -> list[_Line]:
-    """Return the lines that a line with `=` stands for, which repeats the line above.
+    """Write out a line of which a field or the head is `=`, which repeats the line above.
 
-    A field `=` has the value of the line above, `==` all fields from there on have, and `*(i)` adds
-    i to it. A line `=n` repeats the increments of the line above n times.
+    A field `=` has the value of the line above; at `==` this and all further fields have; `*(i)`
+    adds i
+    to it. A line `=n` repeats the increments of the line above n times.
     """
     count_text = line.head.lstrip("=").strip("()")
     if not lines_above or (count_text and len(lines_above) < 2):
@@ -334,7 +331,7 @@ def _replicated(line: _Line, lines_above: list[_Line]) -> list[_Line]:
 
 
 def _with_changed_fields(line: _Line, previous: _Line) -> _Line:
-    """Return a copy of the previous line in which the fields that a line states are changed."""
+    """Return the previous line with the fields changed that a line states."""
     fields = list(previous.fields)
     for number, text in enumerate(line.fields[: len(fields)]):
         if text == "==":
@@ -356,7 +353,7 @@ def _increment(where: str, first: str, last: str) -> str:
 
 
 def _incremented(where: str, text: str, increment: str) -> str:
-    """Return a field with an increment added; a whole number stays one."""
+    """Return a field with an increment added; an integer stays one."""
     if increment == "0":
         return text
     if _WHOLE_NUMBER.fullmatch(text):
@@ -365,7 +362,7 @@ def _incremented(where: str, text: str, increment: str) -> str:
 
 
 def _refuse_continuation(line: _Line) -> NoReturn:
-    """Refuse a continuation that belongs to no line."""
+    """Raise the error for a continuation that belongs to no line."""
     fail(
         line.where,
         f"the continuation {short_repr(line.head)} follows no line that it could continue.",
@@ -373,15 +370,9 @@ def _refuse_continuation(line: _Line) -> NoReturn:
 
 
 def _fields(where: str, text: str) -> list[str]:
-    """Return the fields of a line: its word, four or eight values, the marker of its continuation.
+    """Split a line into its keyword, four or eight values, and its continuation marker.
 
-    Parameters
-    ----------
-    where : str
-        File and line.
-    text : str
-        The line, in free format, with commas, or in fixed format, with columns of 8 or 16
-        characters.
+    The line is in free format, with commas, or in fixed format, in columns of 8 or 16 characters.
     """
     if "," not in text:
         return _fields_in_columns(text)
@@ -402,7 +393,7 @@ def _fields(where: str, text: str) -> list[str]:
 
 
 def _fields_in_columns(text: str) -> list[str]:
-    """Return the fields of a line in fixed format, see `_fields`."""
+    """Split a line in fixed format, as `_fields` does."""
     word = text[:8]
     marker = text[72:]
     width = 16 if "*" in word else 8

@@ -1,4 +1,4 @@
-"""Nodal loads of forces, pressures and accelerations, and the displacement of points and ports."""
+"""Nodal values of loads, and the nodal weights of points, sets and ports."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class FaceAreas(NamedTuple):
 
 
 def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
-    """Return the integrals of each node's shape function over faces."""
+    """Integrate each node's shape function over faces."""
     kind = mesh.kind
     frames = kind.face_frames
     vectors = np.zeros((len(mesh.points), 3))
@@ -64,24 +64,16 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
 
 
 def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
-    """Return the nodal values of a load.
+    """Return the nodal values (nodes, 3) of a load: forces [N], or an acceleration [m/s^2].
 
-    Parameters
-    ----------
-    where : str
-        The name of the load in sentences.
-
-    Returns
-    -------
-    (nodes, 3) array
-        Forces [N], or an acceleration [m/s^2].
+    `where` is the name of the load, for error messages.
 
     Raises
     ------
     MeshError
         If the set of the load is missing, empty or holds no face.
     InvalidDesignError
-        If the point of the load lies outside.
+        If the point of the load lies outside the structure.
     """
     if load.acceleration is not None:
         return np.tile(load.acceleration, (len(mesh.points), 1))
@@ -96,19 +88,15 @@ def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
 def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     """Return the row (nodes, 3) that reads the displacement of a port.
 
-    Transposed, the row is a force of 1 N at the port.
-
-    Parameters
-    ----------
-    where : str
-        The name of the port in sentences.
+    Transposed, the row is a force of 1 N at the port. `where` is the name of the port, for error
+    messages.
 
     Raises
     ------
     MeshError
         If the set of the port is missing or empty.
     InvalidDesignError
-        If the point of the port lies outside.
+        If the point of the port lies outside the structure.
     """
     return np.outer(force_weights(mesh, port, where), unit_vector(port.direction))
 
@@ -121,9 +109,9 @@ def force_weights(mesh: StructureMesh, part: MeshLoad | MeshPort, where: str) ->
 
 
 def set_weights(mesh: StructureMesh, name: str, where: str) -> FloatArray:
-    """Return the weights (nodes,) of the nodes of a set in its mean displacement.
+    """Return the weights (nodes,) of nodes in the mean displacement of a set; their sum is one.
 
-    They are by area if the set holds faces, else equal; their sum is one.
+    A set of faces is weighted by area, a set of nodes equally.
 
     Raises
     ------
@@ -141,22 +129,24 @@ def set_weights(mesh: StructureMesh, name: str, where: str) -> FloatArray:
 
 
 def point_weights(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:
-    """Return the weights (nodes,) of the nodes in the displacement of a point.
+    """Return the weights (nodes,) of nodes in the displacement of a point.
 
     Parameters
     ----------
     point : (float, float, float)
         The point, in the unit of length of the mesh.
     where : str
-        The name of the point's owner in sentences, such as a load.
+        The name of the load, mass or output at the point, for the error message.
 
     Raises
     ------
     InvalidDesignError
-        If the point lies outside.
+        If the point lies outside the structure.
     """
     position = mesh.unit * np.asarray(point)
-    cell, local_position = attach(mesh, position, f"{where}: the point {mesh.place(position)}")
+    cell, local_position = attach(
+        mesh, position, f"{where}: the point {mesh.describe_point(position)}"
+    )
     (values,), _ = mesh.kind.shape_functions(local_position[None])
     weights = np.zeros(len(mesh.points))
     weights[mesh.cells[cell]] = values

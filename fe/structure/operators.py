@@ -1,4 +1,4 @@
-"""From a structure file and its mesh to affine operators, and fields of both for ParaView."""
+"""Assemble the affine operators of a structure file, and write its fields for ParaView."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -41,11 +41,11 @@ class Structure(AffineStructure):
     Attributes
     ----------
     material_of : (nc,) array of int
-        Number of the material of each cell.
+        Index of the material of each cell.
     region_of : (nc,) array of int
-        Number of the damage region of each cell, -1 for none.
+        Index of the damage region of each cell, -1 for none.
     gauges_moved : (gauges,) array
-        Distance of each gauge from where it was asked for [m].
+        Distance of each gauge from its position in the design [m].
     """
 
     design: MeshDesign
@@ -56,17 +56,14 @@ class Structure(AffineStructure):
 
     @property
     def mesh(self) -> StructureMesh:
-        """Its mesh."""
+        """The mesh of the body."""
         return self.body.mesh
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
-    """Read the mesh of a design, and add the sets that the design defines.
+    """Read the mesh of a design, and add the sets in boxes that the design defines.
 
-    Parameters
-    ----------
-    file : Path
-        The path of the design's file; the design may name the mesh relative to it.
+    The path of the mesh is relative to `file`, the path of the design's file.
 
     Raises
     ------
@@ -94,19 +91,9 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
 def _part_of_cells(
     mesh: StructureMesh, labelled: list[tuple[str, MeshMaterial | Damage]], kind: str
 ) -> IntArray:
-    """Return the number (nc,) of the part whose set holds each cell, -1 for none.
+    """Return the index (nc,) of the material or region whose set holds each cell, -1 for none.
 
-    Parameters
-    ----------
-    labelled : list of (str, Material or Damage)
-        The parts, each with its key in the file.
-    kind : str
-        The noun of the parts in sentences.
-
-    Raises
-    ------
-    MeshError
-        If a set is missing or empty, or two overlap.
+    Raises `MeshError` if a set is missing or empty, or two overlap.
     """
     part_of_cell = np.full(len(mesh.cells), -1, dtype=np.int64)
     for number, (label, part) in enumerate(labelled):
@@ -116,22 +103,22 @@ def _part_of_cells(
             _, other_part = labelled[part_of_cell[shared_cells[0]]]
             raise MeshError(
                 f"{label}: the {kind}s {part.name!r} and {other_part.name!r} share "
-                f"{len(shared_cells)} elements, such as {mesh.cell(shared_cells[0])}; their sets "
-                "must not overlap."
+                f"{len(shared_cells)} elements, such as {mesh.describe_cell(shared_cells[0])}; "
+                "their sets must not overlap."
             )
         part_of_cell[cells] = number
     return part_of_cell
 
 
 class _StiffnessParts(NamedTuple):
-    """Parts of the stiffness: the pairs of a parameter and a damage region that occur.
+    """The pairs of parameter and damage region that share a stiffness term.
 
     Attributes
     ----------
     part_of : (nc,) array of int
-        Part of each cell.
+        Index of the pair of each cell.
     names : tuple of (str or None, str or None)
-        Parameter and damage region of each part.
+        Parameter and damage region of each pair.
     """
 
     part_of: IntArray
@@ -141,7 +128,7 @@ class _StiffnessParts(NamedTuple):
 def _stiffness_parts(
     design: MeshDesign, material_of: IntArray, region_of: IntArray
 ) -> _StiffnessParts:
-    """Return the parts of the stiffness from material and region (nc,) of each cell."""
+    """Return the pairs of parameter and region that occur, from those of each cell."""
     parameters: list[str | None] = [parameter.name for parameter in design.parameter]
     parameters.append(None)
     regions: list[str | None] = [region.name for region in design.damage]
@@ -163,12 +150,12 @@ def load_and_assemble(
     mass_as_stiffness: bool = False,
     yielding: bool = False,
 ) -> Structure:
-    """Read a structure file with its mesh, check both and assemble the affine operators.
+    """Read a structure file and its mesh, check both and assemble the affine operators.
 
     Parameters
     ----------
     memory_limit : float, optional
-        Bytes that assembly and factorisation may take; by default what the machine has free.
+        Memory that assembly and factorisation may take [bytes]; by default all that is free.
     mass_as_stiffness : bool
         Integrate the mass at the points of the stiffness, as CalculiX does; this is not exact for
         tetrahedra.
@@ -232,7 +219,7 @@ def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
     if len(cells_without_material):
         raise MeshError(
             f"{mesh.source}: {len(cells_without_material)} of {len(mesh.cells)} elements have no "
-            f"material, among them {mesh.cell(cells_without_material[0])}."
+            f"material, among them {mesh.describe_cell(cells_without_material[0])}."
         )
 
 
@@ -245,7 +232,7 @@ def _body(
     *,
     mass_as_stiffness: bool,
 ) -> Body[StructureMesh]:
-    """Return the body of a design, from material and region (nc,) of each cell, and supports."""
+    """Combine mesh, materials, supports and point masses into a body."""
     parts = _stiffness_parts(design, material_of, region_of)
     elasticities = np.array([material.elasticity for material in design.material])
     densities = np.array([material.density for material in design.material])
@@ -267,12 +254,13 @@ def _body(
 def assemble_structure(
     file: Path | str, memory_limit: float | None = None, *, yielding: bool = False
 ) -> AffineStructure:
-    """Read a structure file with its mesh or its matrices, and assemble the affine operators.
+    """Read a structure file with its mesh or matrices, and assemble the affine operators.
 
     Parameters
     ----------
     memory_limit : float, optional
-        Bytes that assembly and factorisation may take; by default what the machine has free.
+        Memory that assembly and factorisation of a mesh may take [bytes]; by default all that is
+        free.
     yielding : bool
         Whether the motions that the supports hold are unknowns, too.
 
@@ -292,7 +280,7 @@ def assemble_structure(
 
 
 def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) -> sparse.csr_array:
-    """Return rows (m, full) of displacements of points along directions, each with its label."""
+    """Return rows (m, full) that read displacements of points along directions."""
     rows = []
     for label, output in labelled:
         weights = point_weights(mesh, output.point, label)
@@ -301,7 +289,7 @@ def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) ->
 
 
 def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, MeshPort]]) -> sparse.csr_array:
-    """Return rows (ports, full) of the displacements of ports, each with its label."""
+    """Return rows (ports, full) that read the displacements of ports."""
     rows = []
     for label, port in labelled:
         row = port_row(mesh, port, label)
@@ -311,9 +299,9 @@ def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, MeshPort]]) -> spa
 
 
 def mass_and_centre(structure: Structure) -> tuple[float, FloatArray]:
-    """Return the mass [kg] with the nominal point masses, and the centre of gravity (3,) [m].
+    """Return the mass [kg] with nominal point masses, and the centre of gravity (3,) [m].
 
-    Without mass the centre is the mean of the nodes.
+    The centre of a structure without mass is the mean of its nodes.
     """
     nodal_mass = structure.body.nodal_mass
     points = structure.mesh.points
@@ -325,22 +313,23 @@ def mass_and_centre(structure: Structure) -> tuple[float, FloatArray]:
 def write_structure_vtu(
     path: Path | str, structure: Structure, values: Mapping[str, float] | None = None
 ) -> None:
-    """Solve the full model and write its field as a VTU file, whole or not at all.
+    """Solve the structure for all loads together and write the fields as a VTU file.
 
     Point data is `displacement` [m]. Cell data are `strain` at the centres, `material` and `region`
-    (their numbers in the file from 1, 0 for no region) and `stiffness_loss`.
+    (their numbers in the structure file, from 1; 0 for no region) and `stiffness_loss`.
 
     Parameters
     ----------
     values : mapping of str to float, optional
-        Parameters, losses, free masses and controls by name; the others are nominal, and healthy.
+        Parameters, losses, free masses and controls by name. All others have their nominal values,
+        and the losses are zero.
 
     Raises
     ------
     SolutionError
         If the structure cannot be solved.
     FileNotWrittenError
-        If the file cannot be written.
+        If the file cannot be written; it is written whole or not at all.
     """
     mesh = structure.mesh
     chosen_values = dict(values or {})

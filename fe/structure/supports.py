@@ -17,7 +17,7 @@ from .nodal_loads import set_weights
 from .tables import MOTIONS
 
 _FREE = 1e-8
-"""A rigid motion is free if the supports resist it by less than this part of the stiffest one."""
+"""A rigid motion is free if the supports resist it less than this fraction of the stiffest one."""
 
 
 class RigidSet(NamedTuple):
@@ -25,10 +25,8 @@ class RigidSet(NamedTuple):
 
     Attributes
     ----------
-    nodes : (m,) array of int
-        Numbers of the nodes.
     point : (3,) array
-        The point about which it turns [m].
+        The point about which the body turns [m].
     held : (6,) array of bool
         Whether each motion, along x, y, z and about them, is held.
     springs : (6,) array
@@ -42,7 +40,7 @@ class RigidSet(NamedTuple):
 
 
 class Supports(NamedTuple):
-    """The n free unknowns: free displacements, then the motions of rigid sets by 1 m and 1 rad.
+    """The n free unknowns: free displacements, then motions of rigid sets by 1 m and 1 rad.
 
     Attributes
     ----------
@@ -53,8 +51,8 @@ class Supports(NamedTuple):
     springs : (n,) array
         Springs to the ground [N/m, N m/rad].
     motions : tuple of SupportMotion
-        Motions of supports that are unknowns: those of rigid sets on springs and, of yielding
-        supports, the motions that would be held, which come last.
+        Support motions that are unknowns: those of rigid sets on springs and, if the supports
+        yield, the motions that would be held, which come last.
     """
 
     expansion: sparse.csr_array
@@ -71,7 +69,7 @@ class Supports(NamedTuple):
 def supports(
     points: FloatArray, is_held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
 ) -> Supports:
-    """Return the free unknowns of a structure, some of whose nodes are held, sprung or rigid.
+    """Return the free unknowns of a structure with held, sprung and rigid nodes.
 
     Parameters
     ----------
@@ -99,7 +97,10 @@ def supports(
 def _body_expansion(
     points: FloatArray, body: RigidSet, is_moving: BoolArray | None = None
 ) -> sparse.coo_array:
-    """Return the displacements (3 nodes, m) of all nodes by m motions of a body, the free ones."""
+    """Return the displacements (3 nodes, m) of all nodes by m unit motions of a body.
+
+    The motions are those that are not held, or those that `is_moving` (6,) selects.
+    """
     motions = rigid_motions(points[body.nodes], body.point, 2.0)
     moving = sparse.coo_array(motions[:, ~body.held if is_moving is None else is_moving])
     number_in_body, component = np.divmod(moving.row, 3)
@@ -134,13 +135,14 @@ class _NodeSupports:
 def supports_of_design(
     design: MeshDesign, mesh: StructureMesh, *, yielding: bool = False
 ) -> Supports:
-    """Return the supports of a design.
+    """Check the supports of a design and return the free unknowns.
 
     Parameters
     ----------
     yielding : bool
-        Whether the motions that the supports hold are unknowns, behind all others. What a set of
-        nodes holds then moves as a rigid body does, by six motions about the centre of the set.
+        Whether the motions that the supports hold are added as the last unknowns. The displacements
+        that a set of nodes holds then move as a rigid body, by six motions about the centre of the
+        set.
 
     Raises
     ------
@@ -188,7 +190,7 @@ def supports_of_design(
 def _sprung_motions(
     sets: Iterable[str], bodies: Iterable[RigidSet], first: int
 ) -> tuple[SupportMotion, ...]:
-    """Return motions of rigid sets against springs; unknown `first` is the first free motion."""
+    """Return the motions of rigid sets that have springs; `first` is their first unknown."""
     motions = []
     unknown = first
     for set_name, body in zip(sets, bodies, strict=True):
@@ -203,10 +205,10 @@ def _sprung_motions(
 def _held_motions(
     design: MeshDesign, mesh: StructureMesh
 ) -> Iterator[tuple[tuple[str, str], sparse.coo_array]]:
-    """Yield set and motion of what sets of nodes hold, with its displacements (full, 1).
+    """Yield the set, the motion and the displacements (full, 1) of each motion that a set holds.
 
-    A set with several tables is held as all of them say. Motions that move none of the held
-    displacements, such as a turn of nodes on a line about this line, are left out.
+    Several tables of one set add up. Motions that move none of the held displacements, such as a
+    rotation of collinear nodes about their line, are left out.
     """
     held_of_set: dict[str, BoolArray] = {}
     for label, support in design.numbered("support"):
@@ -231,7 +233,7 @@ def _held_motions(
 def _with_unknown_motions(
     held_supports: Supports, columns: dict[tuple[str, str], sparse.coo_array]
 ) -> Supports:
-    """Return supports with further unknowns: motions by set and name, as columns (full, 1)."""
+    """Append motions of sets, given by their displacements (full, 1), to the unknowns."""
     first = held_supports.expansion.shape[1]
     motions = tuple(
         SupportMotion(set_name, motion, first + number, 0.0)
@@ -249,12 +251,12 @@ def _with_unknown_motions(
 def _check_no_shared_nodes(
     mesh: StructureMesh, nodal: _NodeSupports, bodies: dict[str, RigidSet]
 ) -> None:
-    """Raise `MeshError` if a node of a rigid set, by its label, belongs to another support, too."""
+    """Raise `MeshError` if a node of a rigid set belongs to another support, too."""
     is_supported = np.any(nodal.resists, axis=1)
     for label, body in bodies.items():
         shared_nodes = body.nodes[is_supported[body.nodes]]
         if len(shared_nodes):
-            place = mesh.place(mesh.points[shared_nodes[0]])
+            place = mesh.describe_point(mesh.points[shared_nodes[0]])
             raise MeshError(
                 f"{label}: {len(shared_nodes)} nodes of the rigid set belong to another support, "
                 f"too, such as that at {place}; say what holds it in its own table."
@@ -263,7 +265,7 @@ def _check_no_shared_nodes(
 
 
 def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: str) -> RigidSet:
-    """Return the rigid set of a support; raises `MeshError` if its nodes lie on a line."""
+    """Return the rigid set of a support; raise `MeshError` if its nodes are collinear."""
     point = mesh.unit * np.asarray(support.rigid_about)
     motions = rigid_motions(mesh.points[nodes], point, 2.0)
     rank = np.linalg.matrix_rank(motions, _FREE * np.linalg.norm(motions))
@@ -279,7 +281,7 @@ def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: st
 
 
 def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatArray:
-    """Return the displacements of points in six rigid motions.
+    """Return the displacements (3 m, 6) of points in six rigid motions, along and about x, y, z.
 
     Parameters
     ----------
@@ -288,12 +290,7 @@ def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatA
     centre : (3,) array
         The point about which the motions turn [m].
     size : float
-        Turns are scaled by 2 / size [m].
-
-    Returns
-    -------
-    (3 m, 6) array
-        Displacements, along and about x, y, z.
+        The angle of a rotation is 2 rad m / size; a size of 2 m gives unit rotations.
     """
     arm = (points - centre) / (0.5 * size)
     motions = np.zeros((len(points), 3, 6))
@@ -307,10 +304,10 @@ def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatA
 def _check_rigid_motions(
     mesh: StructureMesh, nodal: _NodeSupports, bodies: tuple[RigidSet, ...]
 ) -> None:
-    """Raise `MeshError` if supports resist fewer than six rigid motions; it says which one is free.
+    """Raise `MeshError` if the supports leave a rigid motion free; the message describes it.
 
-    Every resisting displacement counts alike: what matters is whether it resists, not how stiff it
-    is.
+    It is found by a singular value decomposition. All resisting displacements count alike, however
+    stiff they are.
     """
     # what each rigid motion of the structure does to the displacements that are resisted
     centre = mesh.points.mean(axis=0)
@@ -336,7 +333,7 @@ def _check_rigid_motions(
 
 
 def _motion_in_words(motion: FloatArray, mesh: StructureMesh, centre: FloatArray) -> str:
-    """Return a rigid motion (6,) about a centre (3,) [m] as it stands in a sentence."""
+    """Describe a rigid motion (6,) about a centre (3,) [m] for a message."""
     shift, scaled_turn = np.split(motion, 2)
     if np.linalg.norm(scaled_turn) < 1e-6:
         return f"a shift along ({_components(shift / np.linalg.norm(shift))})"
@@ -344,9 +341,10 @@ def _motion_in_words(motion: FloatArray, mesh: StructureMesh, centre: FloatArray
     axis = turn / np.linalg.norm(turn)
     point_on_axis = centre + np.cross(turn, shift) / (turn @ turn)
     rounded_point = mesh.size * np.round(point_on_axis / mesh.size, 9)
-    return f"a turn about the axis along ({_components(axis)}) through {mesh.place(rounded_point)}"
+    point_text = mesh.describe_point(rounded_point)
+    return f"a turn about the axis along ({_components(axis)}) through {point_text}"
 
 
 def _components(vector: FloatArray) -> str:
-    """Return the components of a vector (3,) as text, without negative zeros."""
+    """Format the components of a vector (3,) without negative zeros."""
     return ", ".join(f"{value + 0.0:.3g}" for value in np.round(vector, 9))

@@ -17,7 +17,7 @@ Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Modulus = Annotated[float, Field(ge=1e6, le=1e13)]
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-"""Units of length and their size [m]."""
+"""Units of length in metres."""
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Motions of a rigid set of nodes: along the axes, then about them."""
 
@@ -36,7 +36,7 @@ class DesignSection(Section):
 
 
 def _tuples(item: object) -> object:
-    """Return a value of a TOML file with its lists as tuples, which a strict section takes."""
+    """Return a TOML value with its lists as tuples, as strict sections need them."""
     if isinstance(item, list):
         return tuple(_tuples(entry) for entry in item)
     return item
@@ -290,7 +290,7 @@ class StructureDesign(DesignSection):
         )
 
     def _equal_names(self, keys: tuple[str, ...]) -> Iterator[Check]:
-        """Yield the checks against rows with the same name in some tables."""
+        """Yield the checks that no two rows of some tables have the same name."""
         first_place: dict[str, str] = {}
         for key in keys:
             for place, row in self.numbered(key):
@@ -304,17 +304,18 @@ class StructureDesign(DesignSection):
     def wrong_ties(
         self, table: str, key: str, named_table: str, *, tied: str, untied: str
     ) -> Iterator[Check]:
-        """Yield the checks against ties: names that the other table lacks, and names without a tie.
+        """Yield the checks that rows of a table refer to names of another, and that each is used.
 
         Parameters
         ----------
         table, key : str
-            The table whose rows are tied, and the key that holds the name.
+            The table whose rows refer to names, and the key that holds the name.
         named_table : str
             The table whose rows have these names.
         tied, untied : str
-            The words of a message on a row that is tied to a name, and on a name without such a
-            row.
+            The verbs of the messages on a row that refers to an unknown name, and on a name to
+            which no
+            row refers.
         """
         known_names = [row.name for row in getattr(self, named_table)]
         place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}
@@ -325,7 +326,7 @@ class StructureDesign(DesignSection):
             yield name not in place_of_name, f"the {named_table} {name!r} {untied}"
 
     def numbered(self, key: str) -> Iterator[tuple[str, Any]]:
-        """Yield each entry of a table with its place in the file, such as `load[1]`."""
+        """Yield each row of a table with its label in messages, such as `load[1]`."""
         for number, part in enumerate(getattr(self, key), start=1):
             yield f"{key}[{number}]", part
 

@@ -1,4 +1,4 @@
-"""Fields on a mesh as a VTU file, VTK's XML format for ParaView.
+"""Write fields on a mesh as a VTU file, VTK's XML format for ParaView.
 
 Arrays are compressed by zlib, in one block each, and written in base64, as VTK's class
 `vtkXMLUnstructuredGridReader` reads them. meshio writes the same format, but its import takes as
@@ -55,8 +55,6 @@ def write_vtu(
     cells : (str, (nc, k) array of int)
         The kind of the cells, a key of `VTK_NUMBERS`, and their nodes in the order of
         `fe.elements.kinds`.
-    point_data, cell_data : mapping of str to array
-        Values of the nodes and of the cells.
 
     Raises
     ------
@@ -92,7 +90,7 @@ def write_vtu(
 
 
 def _section(name: str, arrays: Data) -> list[str]:
-    """Return the lines of an element of XML that holds arrays."""
+    """Return the lines of an XML element that holds arrays."""
     lines = [f"<{name}>"]
     for array_name, values in arrays.items():
         lines.append(_data_array(array_name, np.ascontiguousarray(values)))
@@ -101,7 +99,7 @@ def _section(name: str, arrays: Data) -> list[str]:
 
 
 def _data_array(name: str, values: AnyArray) -> str:
-    """Return the element `DataArray` of an array of numbers or vectors of 64 bits."""
+    """Return the `DataArray` element of an array, converted to 64-bit numbers."""
     is_real = values.dtype.kind == "f"
     number_type = "Float64" if is_real else "Int64"
     content = values.astype(np.float64 if is_real else np.int64, copy=False).tobytes()

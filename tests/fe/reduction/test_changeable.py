@@ -108,7 +108,7 @@ class Yielding(NamedTuple):
 def yielding_beam(file: Path) -> Yielding:
     """Return the structure of a file with yielding supports."""
     full = assemble_structure(file, yielding=True)
-    return Yielding(full, with_changes(full, reduce_structure(full.held())))
+    return Yielding(full, with_changes(full, reduce_structure(full.with_held_supports())))
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +285,7 @@ def test_a_support_of_matrices_yields_in_series(tmp_path: Path) -> None:
     stiffness, _, load, _ = made.full_system({0: 1.0 / 250.0}, {"push": 1.0})
     displacements = np.linalg.solve(stiffness.toarray(), load)
     assert displacements == pytest.approx([0.005, 0.007, 0.004])
-    assert full.held().unknowns == 2
+    assert full.with_held_supports().unknowns == 2
 
 
 # ---------------------------------------------------------------- masses and losses of stiffness
@@ -309,7 +309,7 @@ def test_a_mass_at_the_tip_has_the_frequency_of_the_closed_form(
 def test_an_added_mass_has_the_frequencies_of_the_full_model(propped: Yielding) -> None:
     number = len(propped.model.mass_places) // 2
     structure = propped.changed(PlaceMass(propped.model.mass_places[number], 0.01))
-    full = propped.full.held()
+    full = propped.full.with_held_supports()
     rows = mass_places(propped.full)[number].rows[:, : full.unknowns]
     mass = (full.mass(full.masses) + 0.01 * (rows.T @ rows)).tocsr()
     squares, _ = lowest_eigenpairs(full.stiffness(), mass, 4)
@@ -337,7 +337,7 @@ def test_a_patch_that_loses_stiffness_is_that_of_the_full_model(
     slender: Yielding, number: int, loss: float
 ) -> None:
     structure = slender.changed(RegionStiffnessLoss(slender.model.loss_places[number], loss))
-    full = slender.full.held()
+    full = slender.full.with_held_supports()
     free = slice(0, full.unknowns)
     system = full.system_at(PUSH)
     stiffness = system.stiffness - loss * sum(
@@ -363,7 +363,7 @@ def test_a_patch_lies_around_a_gauge(write_beam: WriteBeam, tmp_path: Path) -> N
 
 def test_patches_do_not_overlap_and_leave_out_damage_regions(slender: Yielding) -> None:
     """All of them and the damage regions together hold the stiffness of the beam once."""
-    free = slice(0, slender.full.held().unknowns)
+    free = slice(0, slender.full.with_held_supports().unknowns)
     patches = sum(matrix for patch in loss_places(slender.full) for matrix in patch.terms.values())
     terms = slender.full.stiffness_terms
     outside = sum(term.matrix for term in terms if term.region is None)

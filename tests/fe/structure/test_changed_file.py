@@ -49,7 +49,7 @@ def test_a_file_states_a_support_that_yields_a_mass_and_a_load_that_leans(
 ) -> None:
     file = write_beam(tmp_path, cells=2)
     yielding = assemble_structure(file, yielding=True)
-    model = with_changes(yielding, reduce_structure(yielding.held()))
+    model = with_changes(yielding, reduce_structure(yielding.with_held_supports()))
     patch = ModelPatch(
         (
             SupportCompliance("root", "ry", 1e-3),
