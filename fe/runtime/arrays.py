@@ -1,7 +1,7 @@
-"""Types of arrays, columns of a law's memory, and records of arrays stored in `.npz` files.
+"""Array types, columns of a law's memory, and records of arrays that are stored as `.npz` files.
 
-A record is checked where it is made and read back to the last bit; its file has reproducible bytes,
-and nothing in it is pickled. NumPy and relative imports only: this file is copied into the FMU.
+A record is checked where it is made and read back to the last bit. Its file has reproducible bytes
+and holds no pickled objects. NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import io
@@ -29,7 +29,7 @@ elements."""
 
 
 def nan_where_masked(values: npt.ArrayLike) -> FloatArray:
-    """Return values as an array; a masked one becomes floats, with NaN where it is masked."""
+    """Return values as an array; a masked array becomes floats, with NaN where masked."""
     if isinstance(values, np.ma.MaskedArray):
         return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
     return np.asarray(values)
@@ -41,20 +41,12 @@ _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
 def arrays_to_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
     """Return the bytes of an `.npz` archive; equal arrays give equal bytes everywhere.
 
-    Parameters
-    ----------
-    arrays : mapping of str to array
-        The arrays by name; object arrays are refused, because they would need pickle.
-
-    Returns
-    -------
-    bytes
-        The archive, without compression: its result depends on the version of the library.
+    It is not compressed, since compressed bytes depend on the version of zlib.
 
     Raises
     ------
     ValueError
-        If an array holds Python objects.
+        If an array holds Python objects, which would need pickle.
     """
     members = {}
     for name, array in arrays.items():
@@ -87,19 +79,9 @@ def archive_bytes(members: Mapping[str, bytes], first: str = "") -> bytes:
 def arrays_from_bytes(
     content: bytes, where: str, required: Collection[str] = ()
 ) -> dict[str, AnyArray]:
-    """Return the arrays of an `.npz` archive after checking its checksums.
+    """Return the arrays of an `.npz` archive by name, after checking its checksums.
 
-    Parameters
-    ----------
-    where : str
-        The name of the source, for the error message.
-    required : collection of str
-        Names of arrays that the archive must hold.
-
-    Returns
-    -------
-    dict of str to array
-        The arrays by name.
+    `where` is the name of the source in error messages; `required` are names that must be there.
 
     Raises
     ------
@@ -129,18 +111,20 @@ def arrays_from_bytes(
 
 @dataclass(frozen=True, repr=False)
 class StoredArrays:
-    """A checked record of arrays and numbers of one design, which is stored in an `.npz` file.
+    """A checked record of arrays and numbers of one design, stored as an `.npz` file.
 
-    A kind of record is a subclass with its fields. An array is declared with the lengths of its
-    axes, `Annotated[FloatArray, "loads", 2]`. A number is the length itself. A name stands for one
-    length in all arrays of the record; `_axis_lengths` says it, or else the first array with that
-    axis. A number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`.
-    A tuple holds names.
+    A subclass declares the fields. An array is declared with the lengths of its axes,
+    `Annotated[FloatArray, "loads", 2]`. A number is the length itself; a name stands for one length
+    in
+    all arrays of the record, given by `_axis_lengths` or else by the first array with that axis. A
+    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple
+    holds
+    names.
 
     Class attributes
     ----------------
     record_name : str
-        The noun of the record, with its article, for sentences.
+        The noun of the record, with its article, for messages.
     version : int
         Version of the layout of its file.
 
@@ -177,7 +161,7 @@ class StoredArrays:
                 self._check_shape(field, declared, lengths)
 
     def _check_range(self, field: Field[object], limits: tuple[str | int | float, ...]) -> None:
-        """Raise `ReducedModelFileError` unless a number lies between its declared limits."""
+        """Raise `ReducedModelFileError` unless a number lies within its declared limits."""
         value = getattr(self, field.name)
         low, high = map(float, limits)
         if not (isfinite(value) and low <= value <= high):
@@ -191,19 +175,9 @@ class StoredArrays:
         axes: tuple[str | int | float, ...],
         lengths: dict[str, int],
     ) -> None:
-        """Check an array against its declared axes; learn the lengths of axes that are new.
+        """Raise `ReducedModelFileError` unless an array fits its declaration and is finite.
 
-        Parameters
-        ----------
-        axes : tuple of str or int
-            Names or lengths of the array's axes.
-        lengths : dict of str to int
-            The known lengths by the name of the axis; new ones are added.
-
-        Raises
-        ------
-        ReducedModelFileError
-            If the array has another shape or type, or holds a number that is not finite.
+        The lengths of axes that are not known yet are added to `lengths`.
         """
         array = getattr(self, field.name)
         (dtype,) = get_args(get_args(get_args(field.type)[0])[1])
@@ -236,7 +210,7 @@ class StoredArrays:
         return losses_of(stiffness_loss, self.regions)
 
     def _axis_lengths(self) -> dict[str, int]:
-        """Return the lengths of axes that follow from other axes or from the numbers of names."""
+        """Return the lengths of axes that follow from other fields."""
         return {}
 
     def to_bytes(self) -> bytes:
@@ -254,12 +228,7 @@ class StoredArrays:
     def from_bytes(cls, content: bytes, where: str = "") -> Self:
         """Return the record that `to_bytes` packed, equal to the last bit.
 
-        Parameters
-        ----------
-        content : bytes
-            An `.npz` archive.
-        where : str
-            The name of the source, for the error message.
+        `where` is the name of the source in error messages.
 
         Raises
         ------
@@ -287,7 +256,7 @@ class StoredArrays:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Return the record in a file that `to_bytes` made.
+        """Read a record from a file.
 
         Raises
         ------
@@ -300,14 +269,9 @@ class StoredArrays:
 
 
 def _value_from_array(field: Field[object], arrays: Mapping[str, AnyArray]) -> Any:
-    """Return the value of a field of a record: a number, text or names, or else the array itself.
+    """Convert a stored array to the type of a field: a number, text, names or an array.
 
-    Raises
-    ------
-    KeyError
-        If the file has no array of that name.
-    TypeError, ValueError
-        If the array does not hold such a value.
+    Raises `KeyError` if it is missing, and `TypeError` or `ValueError` if it cannot be converted.
     """
     array = arrays[field.name]
     declared_type = getattr(field.type, "__origin__", field.type)

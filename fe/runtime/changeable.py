@@ -1,8 +1,8 @@
-"""A reduced structure whose supports, masses and stiffness may change; see `fe.runtime.patch`.
+"""A reduced structure whose supports, masses and stiffness can be changed by a patch.
 
-Its coordinates are those of a `ReducedStructure`, followed by the columns that changes need: for
-each change a few of its own, so that a change is solved in the basis of the structure and in its
-own columns alone. NumPy and relative imports only.
+Its coordinates are those of a `ReducedStructure`, followed by extra columns for each possible
+change. A structure is solved in its own basis and the columns of the changes that act. NumPy and
+relative imports only.
 """
 
 from collections.abc import Iterable
@@ -29,13 +29,13 @@ from .patch import (
 from .reduced import ReducedModel
 
 LEAST_DIRECTION = 1e-11
-"""Squared length, relative to the largest, of a direction of the columns that is not used."""
+"""Eigenvalue, relative to the largest, below which a direction of the columns is left out."""
 KEPT_SUBSPACES = 32
 """Number of sets of changes whose matrices are kept."""
 
 
 class StructuralChanges(NamedTuple):
-    """The changes of a structure that a patch makes, each by its number from one.
+    """The structural changes of a patch, by their numbers in `ChangeableModel`, from one.
 
     Attributes
     ----------
@@ -63,17 +63,16 @@ class Subspace(NamedTuple):
     Attributes
     ----------
     basis : (n, k) array
-        The coordinates of the structure from those of the subspace. The last are the motions of
-        supports that are held otherwise.
+        The coordinates of the model from those of the subspace. The last are the released motions.
     released : int
-        The number of these motions.
+        Number of motions that the supports hold unless changed.
     stiffness : (T, k, k) array
         The stiffness terms.
     mass : (1 + P, k, k) array
         The mass terms.
     lost : dict of int to (Q,) array and (Q, k, k) array
-        For each change that is a loss, the numbers of the stiffness terms that its patch holds a
-        part of, and these parts.
+        For each change that is a loss, the stiffness terms to which the patch contributes, and the
+        contributions.
     """
 
     basis: FloatArray
@@ -177,12 +176,14 @@ class ChangeableModel(ReducedModel):
         }
 
     def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
-        """Return the changes of a patch, by their numbers from one.
+        """Collect the structural changes of a patch.
+
+        Compliances and masses at one location add up; what losses leave of one patch multiplies.
 
         Raises
         ------
         InvalidPatchError
-            If the structure has no such place, or a value is not possible.
+            If the structure has no such support or location, or a value is not possible.
         """
         compliances: dict[int, float] = {}
         masses: dict[int, float] = {}
@@ -215,14 +216,14 @@ class ChangeableModel(ReducedModel):
     def changed_load(
         self, load: FloatArray, control: str, patch: Iterable[Primitive]
     ) -> FloatArray:
-        """Return the load (n,) of a control as a patch moves and turns its force.
+        """Return the load (n,) of a control after a patch has moved and turned its force.
 
         Parameters
         ----------
         load : (n,) array
             The load per unit of the control.
         patch : iterable of Primitive
-            The patch, whose `LoadOffset` and `LoadTilt` of this control act.
+            Only `LoadOffset` and `LoadTilt` of this control act.
         """
         names = list(
             zip(self.load_controls, self.load_change_kinds, self.load_change_axes, strict=True)
@@ -238,7 +239,7 @@ class ChangeableModel(ReducedModel):
         return load
 
     def _place_number(self, places: tuple[str, ...], place: str, what: str) -> int:
-        """Return the number of a place; raise `InvalidPatchError` without one."""
+        """Return the index of a location; raise `InvalidPatchError` if there is none."""
         if place not in places:
             raise InvalidPatchError(
                 f"The structure {self.name} has no place {place!r} for {what}; it has "
@@ -248,26 +249,26 @@ class ChangeableModel(ReducedModel):
 
     @cached_property
     def _triangle(self) -> tuple[IntArray, IntArray]:
-        """Rows and columns of the lower triangle of a matrix (n, n)."""
+        """Row and column indices of the lower triangle of a matrix (n, n)."""
         rows, columns = np.tril_indices(len(self.column_owner))
         return rows, columns
 
     def parts_of_patch(self, change: int, basis: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Return the stiffness that a patch holds, by the number of its change from one.
+        """Return the contributions of a patch to the stiffness terms, in a subspace.
 
         Parameters
         ----------
         change : int
-            Number of the change.
+            Number of the change, from one.
         basis : (n, k) array
-            The coordinates of the structure from those of a subspace.
+            The coordinates of the model from those of the subspace.
 
         Returns
         -------
         terms : (Q,) array of int
-            Numbers of the stiffness terms.
+            Indices of the stiffness terms.
         parts : (Q, k, k) array
-            The part of each of these terms.
+            The contribution to each of these terms.
         """
         patch = change - 1 - len(self.supports) - len(self.mass_places)
         numbers = np.flatnonzero(self.loss_patch == patch)
@@ -280,7 +281,7 @@ class ChangeableModel(ReducedModel):
         return self.loss_term[numbers], np.array(parts)
 
     def support_number(self, support: str, motion: str) -> int:
-        """Return the number of a motion of a support; raise `InvalidPatchError` without one."""
+        """Return the index of a support's motion; raise `InvalidPatchError` if there is none."""
         pairs = list(zip(self.supports, self.motions, strict=True))
         if (support, motion) not in pairs:
             names = ", ".join(f"{name} {of_name}" for name, of_name in pairs) or "none"
@@ -292,28 +293,28 @@ class ChangeableModel(ReducedModel):
 
     @cached_property
     def subspace(self) -> "_Subspaces":
-        """The subspaces of sets of changes."""
+        """The subspaces in which sets of changes are solved."""
         return _Subspaces(self)
 
     def __getstate__(self) -> dict[str, object]:
-        """Return the fields: what is computed from them cannot be handed to another process."""
+        """Return the fields alone, as computed properties cannot be pickled."""
         return {name: vars(self)[name] for name in self.__dataclass_fields__}
 
     @cached_property
     def released_columns(self) -> IntArray:
-        """The column (S,) of each motion that is held, -1 for one against a spring."""
+        """The column (S,) of each held motion, -1 for a motion against a spring."""
         is_held = self.support_springs == 0.0
         return np.where(is_held, np.abs(self.support_rows).argmax(axis=1), -1)
 
     def reactions(self, loads: FloatArray, displacements: FloatArray) -> FloatArray:
-        """Return what the supports take of loads, along each motion [N or N m].
+        """Return the reactions of the supports to loads [N or N m].
 
         Parameters
         ----------
         loads : (n, k) array
             The loads.
         displacements : (n, k) array
-            The displacements at rest under them, with all supports as they are.
+            The static displacements under them, with unchanged supports.
 
         Returns
         -------
@@ -327,7 +328,7 @@ class ChangeableModel(ReducedModel):
         )
 
     def compliance_gains(self, vector: FloatArray) -> FloatArray:
-        """Return how much softer the structure gets per compliance of each motion of a support.
+        """Return the relative gain of compliance per added compliance of each support motion.
 
         Parameters
         ----------
@@ -337,8 +338,8 @@ class ChangeableModel(ReducedModel):
         Returns
         -------
         (S, L + M) array
-            The relative gain of the compliance under each load, and in each mode (of the inverse
-            squared frequency), per compliance [N/m or N m/rad].
+            The gain [N/m or N m/rad] of the compliance under each load, and of the inverse squared
+            frequency of each mode.
         """
         structure = ChangedStructure(self, vector, ModelPatch())
         loads = self.whole_load.T
@@ -356,18 +357,18 @@ class ChangeableModel(ReducedModel):
 
 
 class _Subspaces:
-    """The subspaces of a model by the changes that act, each computed once."""
+    """The subspaces of a model for sets of changes, each computed once."""
 
     def __init__(self, model: ChangeableModel) -> None:
         self._model = model
         self._of_changes = lru_cache(KEPT_SUBSPACES)(self._build)
 
     def __call__(self, changes: Iterable[int]) -> Subspace:
-        """Return the subspace in which some changes act, by their numbers from one."""
+        """Return the subspace for some changes, by their numbers from one."""
         return self._of_changes(tuple(sorted(set(changes))))
 
     def _build(self, changes: tuple[int, ...]) -> Subspace:
-        """Return the subspace: orthonormal directions, then the motions of released supports."""
+        """Build a subspace: orthonormal directions, then the motions of released supports."""
         model = self._model
         released_columns = model.released_columns
         released = [
@@ -378,7 +379,7 @@ class _Subspaces:
         acts = np.isin(model.column_owner, (0, *changes))
         acts[released_columns[released_columns >= 0]] = False
         columns = np.flatnonzero(acts)
-        # orthonormal in the energy of the middle of all ranges
+        # orthonormal in the energy norm at the midpoint of all ranges
         reference = np.append(model.bound_reference, 1.0)
         energy = dense_sum(reference, model.whole_stiffness)[np.ix_(columns, columns)]
         scale = 1.0 / np.sqrt(np.diag(energy))
@@ -418,24 +419,26 @@ class ChangedModes(NamedTuple):
 
 
 class ChangedStructure:
-    """A reduced structure at fixed inputs under a patch, in the k coordinates of its changes.
+    """A reduced structure with fixed inputs under a patch, in k coordinates.
 
     Parameters
     ----------
     vector : (V,) array
-        Values of its inputs.
+        Values of the inputs.
 
     Attributes
     ----------
     basis : (n, k) array
         The coordinates of the model from those of this structure: `Subspace.basis`.
     mass, stiffness : (k, k) array
-        The matrices.
+        Mass [kg] and stiffness [N/m].
 
     Raises
     ------
     InvalidPatchError
-        If the structure has no such support, or a compliance is negative.
+        If the structure has no such support or location, or a value is not possible.
+    OutsideModelError
+        If an input lies outside its range.
     """
 
     rigid_ports: frozenset[str] = frozenset()
@@ -493,7 +496,7 @@ class ChangedStructure:
 
     @cached_property
     def modes(self) -> ChangedModes:
-        """The lowest undamped modes; the last output is positive in each."""
+        """The lowest undamped modes, with the sign that makes the last output positive."""
         frequency, coordinates = lowest_modes(
             self._scaled_stiffness, self._scaled_mass, self.mode_count
         )

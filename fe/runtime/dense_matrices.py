@@ -9,7 +9,7 @@ from .arrays import FloatArray
 
 
 def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return the sum of T dense terms (T, n, m), each times a coefficient."""
+    """Return the sum of dense matrices (T, n, m) times coefficients (T,)."""
     flat_terms = terms.reshape(len(terms), -1)
     return np.asarray((coefficients @ flat_terms).reshape(terms.shape[1:]))
 
@@ -17,24 +17,24 @@ def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
 def lowest_modes(
     stiffness: FloatArray, mass: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest undamped modes of dense matrices.
+    """Compute the lowest undamped modes of dense matrices.
 
-    The problem is solved as M x = K x / omega^2: in a basis of modes the stiffness is well
-    conditioned and the mass is not, and the low modes are the largest eigenvalues, which keep all
-    their digits.
+    The problem is solved as M x = K x / omega^2. In a basis of modes the stiffness is well
+    conditioned
+    and the mass is not; the low modes then belong to the largest eigenvalues, which are accurate.
 
     Parameters
     ----------
     stiffness, mass : (n, n) array
         K and M.
     count : int
-        Number of modes M.
+        Number of modes.
 
     Returns
     -------
-    frequency : (M,) array
-        Natural frequencies [Hz].
-    shape : (n, M) array
+    frequency : (count,) array
+        Natural frequencies [Hz], ascending.
+    shape : (n, count) array
         Mass-normalised shapes.
     """
     # the standard problem L^-1 M L^-T y = y / omega^2, where K = L L^T and x = L^-T y

@@ -1,4 +1,4 @@
-"""Dry friction at ports that only modes move: it holds a port, lets it go, or reverses in a step.
+"""Dry friction at ports without residual flexibility: sticking, breaking loose, reversing.
 
 Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file
 is copied into the FMU. `fe.compilation` compiles it.
@@ -25,7 +25,7 @@ def hold_stuck_ports(
     state: ModalState,
     h: float,
 ) -> None:
-    """Hold the ports that stick by friction, by impulses at the beginning of step `k`.
+    """Hold ports that stick in step `k` of duration `h` [s], by impulses at its beginning.
 
     A port that needs a larger impulse than friction can give breaks loose.
     """
@@ -39,8 +39,8 @@ def hold_stuck_ports(
         inverse_mass = ports.inverse_mass[j]
         strength = speed.strength(law, position, inverse_mass)
         limit = speed.holding_limit(law, strength, 0.5 * h)
-        moved = position - port_value(ports.motion_rows, j, state.q)
-        impulse = moved / port_value(ports.motion_rows, j, response[:mode_count])
+        displacement = position - port_value(ports.motion_rows, j, state.q)
+        impulse = displacement / port_value(ports.motion_rows, j, response[:mode_count])
         if abs(impulse) * inverse_mass > limit:
             state.memory[j, STUCK] = 0.0
             workspace.broke_loose[j] = 1.0
@@ -59,14 +59,10 @@ def port_acceleration(
     applied: FloatArray,
     time: float,
 ) -> float:
-    """Return the acceleration of the port of law `j` at a state.
+    """Return the acceleration of the port of law `j`.
 
     Parameters
     ----------
-    steps, ports
-        Arrays of the steps and of the ports.
-    j : int
-        The law.
     q, v : (M,) array
         Modal coordinates and speeds.
     forces : (J,) array
@@ -99,7 +95,11 @@ def correct_reversal(
     strength: float,
     h: float,
 ) -> None:
-    """Correct speed and position of the port of law `j` whose friction reversed in step `k`."""
+    """Correct speed and position of a port whose friction reversed within step `k`.
+
+    In the step the friction of law `j` had its first sign throughout. `strength` is the law's
+    strength, see `laws.speed`, and `h` the duration of the step [s].
+    """
     speed_lost = workspace.speed_lost[j]
     forces = state.memory[:, FORCE]
     # acceleration at both ends, with friction of the first sign

@@ -1,7 +1,7 @@
-"""Formulas that users write: their text is checked to contain only arithmetic, and evaluated.
+"""Formulas that users write, checked to contain only arithmetic, and evaluated.
 
-An expression has one value for one value of each name, or a value at each of many times. NumPy and
-relative imports only: this file is copied into the FMU.
+An expression is evaluated for one value of each name, or at many times at once. NumPy and relative
+imports only: this file is copied into the FMU.
 """
 
 import ast
@@ -27,12 +27,12 @@ NumberOrArray: TypeAlias = float | FloatArray
 
 
 def _smallest(*values: NumberOrArray) -> NumberOrArray:
-    """Return the smallest of numbers or arrays, element by element."""
+    """Return the elementwise minimum of numbers or arrays."""
     return reduce(np.minimum, values)
 
 
 def _largest(*values: NumberOrArray) -> NumberOrArray:
-    """Return the largest of numbers or arrays, element by element."""
+    """Return the elementwise maximum of numbers or arrays."""
     return reduce(np.maximum, values)
 
 
@@ -78,7 +78,7 @@ class _ParsedExpression(NamedTuple):
 
 @lru_cache(maxsize=1024)  # an expression is evaluated at every step of a fit
 def _parse(text: str) -> _ParsedExpression:
-    """Return the parsed expression; raises what `ast.parse` and `compile` raise."""
+    """Parse and compile an expression; raises what `ast.parse` and `compile` raise."""
     tree = ast.parse(text, mode="eval")
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and type(node.value) is int:
@@ -90,20 +90,20 @@ def _parse(text: str) -> _ParsedExpression:
 class Expression:
     """An arithmetic expression such as "0.1 * mass_ratio * modal_mass".
 
-    It holds numbers, names, + - * / **, brackets, and the functions sqrt, exp, log, sin, cos, tan,
-    abs, min, max, step (0 below zero, 1 from zero on).
+    It consists of numbers, names, + - * / **, brackets, and the functions sqrt, exp, log, sin, cos,
+    tan, abs, min, max and step, which is 0 below zero and 1 from zero on.
 
     Attributes
     ----------
     names : collection of str
-        The names that it may use.
+        The names that the expression may use.
     where : str
-        The source of the text, for error messages.
+        The source of the text, as the beginning of error messages.
 
     Raises
     ------
     InvalidPatchError
-        If the text holds anything else.
+        If the text is anything else.
     """
 
     text: str
@@ -120,7 +120,7 @@ class Expression:
         self._check(parsed.tree)
 
     def _check(self, node: ast.expr) -> None:
-        """Raise `InvalidPatchError` where a node of the syntax tree is not plain arithmetic."""
+        """Raise `InvalidPatchError` if a node of the syntax tree is not plain arithmetic."""
         match node:
             case ast.Constant(value=value) if type(value) in (int, float):
                 return
@@ -150,7 +150,7 @@ class Expression:
             )
 
     def _check_call(self, function: str, arguments: list[ast.expr]) -> None:
-        """Raise `InvalidPatchError` where a function has too many arguments, or invalid ones."""
+        """Raise `InvalidPatchError` if a call has too many arguments, or invalid ones."""
         if function not in ("min", "max") and len(arguments) != 1:
             raise self._error(f": {function} takes one argument, but has {len(arguments)}")
         for argument in arguments:
@@ -161,7 +161,7 @@ class Expression:
         return InvalidPatchError(f"{self.where}{fault}.")
 
     def value(self, values: Mapping[str, float]) -> float:
-        """Return the value of the expression for values of its names.
+        """Evaluate the expression for values of its names.
 
         Raises
         ------
@@ -171,7 +171,7 @@ class Expression:
         return float(self._evaluate(values))
 
     def values_over_time(self, time: FloatArray, values: Mapping[str, float]) -> FloatArray:
-        """Return the values (N,) at times (N,), which the expression calls `time`.
+        """Evaluate the expression at times (N,), which it calls `time`.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class Expression:
         return np.array(result_over_time, dtype=np.float64)
 
     def _evaluate(self, values: Mapping[str, NumberOrArray], when: str = "") -> NumberOrArray:
-        """Return the checked result, a number or an array; `when` ends the sentence of an error."""
+        """Evaluate the expression and check the result; `when` ends the error message."""
         try:
             with np.errstate(all="ignore"):
                 # `_check` has found nothing but numbers, known names, functions and operators
@@ -200,11 +200,11 @@ class Expression:
         return result
 
     def used_names(self) -> frozenset[str]:
-        """Return the names that the expression uses, without its functions."""
+        """Return the names in the expression, without its functions."""
         return frozenset(_parse(self.text.strip()).code.co_names) - _FUNCTIONS.keys()
 
     def with_numbers(self, values: Mapping[str, float]) -> str:
-        """Return the text with numbers in the place of names.
+        """Return the text with names replaced by their values.
 
         A negative number is put in brackets: -2 ** 2 would be -(2 ** 2).
         """

@@ -20,11 +20,11 @@ ComplexArray = npt.NDArray[np.complexfloating[Any, Any]]
 _TAYLOR_ORDER = 14
 """Order of the Taylor polynomial of a matrix exponential."""
 LARGEST_CONDITION = 1e4
-"""Condition of the eigenvectors up to which free motion is computed as a sum of them."""
+"""Condition number of the eigenvectors up to which free motion is a sum of them."""
 
 
 def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) -> FloatArray:
-    """Return the damping ratios of modes under V = alpha M + beta K.
+    """Return the damping ratios of modes for the damping matrix V = alpha M + beta K.
 
     Kapteyn et al. 2021, eq. (18): zeta = alpha / (2 omega) + beta omega / 2, omega = 2 pi f.
 
@@ -40,7 +40,7 @@ def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) 
     Returns
     -------
     (M,) array
-        Damping ratios [1]; values of 1 and more mean that the mode does not oscillate.
+        Damping ratios [1]; a mode with a ratio of 1 or more does not oscillate.
     """
     frequencies = np.asarray(frequency, dtype=np.float64)
     omega: FloatArray = 2.0 * math.pi * frequencies
@@ -51,9 +51,9 @@ def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) 
 def rayleigh_coefficients(
     frequency: tuple[float, float], damping_ratio: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the Rayleigh coefficients that give two modes their damping ratios.
+    """Return the Rayleigh coefficients that give two modes certain damping ratios.
 
-    The inverse of Kapteyn et al. 2021, eq. (18), for two modes.
+    This inverts Kapteyn et al. 2021, eq. (18), for two modes.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class ModalSystem:
 
     @cached_property
     def _eigenvectors(self) -> "_Eigenvectors":
-        """The eigenvectors of the motion, in the state (q, v)."""
+        """The eigenvectors of the free motion, of the state (q, v)."""
         zero = np.zeros_like(self.damping)
         speed_unit = np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
         matrix = np.block(
@@ -160,7 +160,7 @@ class ModalSystem:
 
     @cached_property
     def motion_rates(self) -> FloatArray:
-        """Angular frequencies, or magnitudes of the eigenvalues, that are not zero [1/s]."""
+        """Angular frequencies, or magnitudes of the eigenvalues, without zeros [1/s]."""
         if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
             return self.angular_frequency
         # Eigenvalues of zero come out as rounding errors of the largest one.
@@ -169,9 +169,9 @@ class ModalSystem:
 
     @cached_property
     def _free_modes(self) -> "_FreeModes | None":
-        """The free motion as damped oscillations; None if eigenvectors are nearly parallel.
+        """The free motion as damped oscillations, or None if it is inaccurate as such.
 
-        They are nearly parallel close to critical damping.
+        Close to critical damping the eigenvectors are nearly parallel.
         """
         speed_unit, rates, vectors = self._eigenvectors
         if not np.linalg.cond(vectors) < LARGEST_CONDITION:
@@ -204,7 +204,8 @@ class ModalSystem:
         -------
         q, v : (N, M) array
             The motion; None close to critical damping, where such a sum is inaccurate and time
-            steps have to be used.
+            steps
+            are needed.
         """
         if self._free_modes is None:
             return None
@@ -239,14 +240,9 @@ class ModalSystem:
         return motion[:, :coordinate_count], motion[:, coordinate_count:]
 
     def exact_steps(self, lengths: FloatArray) -> "ExactSteps":
-        """Return the exact time steps under forces that are linear in time.
+        """Return exact time steps of lengths (S,) [s] under forces that are linear in time.
 
-        The exponential of one matrix (Van Loan 1978), for all lengths at once.
-
-        Parameters
-        ----------
-        lengths : (S,) array
-            Lengths of the steps [s].
+        All lengths are computed together by matrix exponentials (Van Loan 1978).
         """
         stiffness = self.full_stiffness if self.coupled else self.stiffness
         return _exact_steps(stiffness.tobytes(), self.damping.tobytes(), lengths.tobytes())
@@ -306,18 +302,11 @@ class ExactSteps(NamedTuple):
 
 @lru_cache(maxsize=16)  # the same system is often moved again with other laws
 def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps:
-    """Return the exact time steps of a system of M modes under forces that are linear in time.
+    """Return the exact time steps of M coordinates under forces that are linear in time.
 
-    The arrays are passed as bytes, because the cache needs arguments with a hash.
-
-    Parameters
-    ----------
-    stiffness : bytes of (M, M) or (M,) array
-        The stiffness S, or its diagonal if nothing couples the coordinates [1/s^2].
-    damping : bytes of (M, M) array
-        The damping D [1/s].
-    lengths : bytes of (S,) array
-        Lengths of the steps [s].
+    The arguments are the bytes of float64 arrays, since the cache needs arguments with a hash:
+    the stiffness S (M, M), or its diagonal if nothing couples the coordinates [1/s^2]; the damping
+    D (M, M) [1/s]; and the lengths (S,) [s].
     """
     stiffness_values = np.frombuffer(stiffness)
     duration = np.frombuffer(lengths)
@@ -360,21 +349,9 @@ def _linear_force_exponentials(
 ) -> ExactSteps:
     """Return the exact time steps of B independent systems, each of n coordinates.
 
-    The coordinates q and speeds v of a system are extended by the force f and its change s over the
-    step. So the equation of motion becomes homogeneous, and one matrix exponential solves it (Van
-    Loan 1978).
-
-    Parameters
-    ----------
-    stiffness, damping : (B, n, n) array
-        The stiffness S [1/s^2] and the damping D [1/s].
-    lengths : (S,) array
-        Lengths of the steps [s].
-
-    Returns
-    -------
-    ExactSteps
-        Arrays (S, B, 2n, 2n) and (S, B, 2n, n).
+    The state (q, v) is extended by the force f and its change s over the step. So the equation of
+    motion becomes homogeneous, and one matrix exponential solves it (Van Loan 1978). Stiffness and
+    damping are arrays (B, n, n); the results are arrays (S, B, 2n, 2n) and (S, B, 2n, n).
     """
     count = stiffness.shape[1]
     unity = np.eye(count)
@@ -411,7 +388,7 @@ def _linear_force_exponentials(
 
 
 def exponential(matrix: FloatArray) -> FloatArray:
-    """Return e^A of matrices A (..., n, n), by scaling, a Taylor polynomial and squaring."""
+    """Return e^A of matrices A (..., n, n), by a Taylor polynomial with scaling and squaring."""
     row_sums = np.sum(np.abs(matrix), axis=-1)
     norm = float(np.max(row_sums, initial=0.0))
     # the scaled matrix has a norm of at most 0.5; few squarings, because each doubles the rounding

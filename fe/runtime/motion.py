@@ -1,8 +1,8 @@
-"""Motion of a linear system with laws at its ports, and its static solutions.
+"""Integrate the motion of a linear system with laws at its ports, and solve it at rest.
 
-Without laws the motion is exact between the stamps. The loops run as plain Python here;
-`fe.compilation` has the same functions compiled, to be given as `kernel`. NumPy and relative
-imports only: this file is copied into the FMU.
+Without laws the motion is exact at the stamps. The loops run as plain Python here; `fe.compilation`
+has the same functions compiled, to be given as `kernel`. NumPy and relative imports only: this file
+is copied into the FMU.
 """
 
 from collections.abc import Callable
@@ -60,15 +60,16 @@ def static_solution(
     start: FloatArray | None = None,
     kernel: Kernel | None = None,
 ) -> StaticSolution:
-    """Return the forces of laws in static equilibrium, at successive load levels.
+    """Compute the forces of laws in static equilibrium at successive load levels.
 
     The displacement of the structure is then that of the linear structure under the loads minus
-    that under these forces.
+    that
+    under these forces.
 
     Parameters
     ----------
     laws : PortLaws
-        The internal forces; damping is zero at rest.
+        Laws of speed have no force at rest.
     linear_positions : (L, J) array
         Position of each law's port at each level without internal forces.
     compliance : (J, J) array
@@ -78,7 +79,7 @@ def static_solution(
     start : (J,) array, optional
         Linear positions from which the first level is reached; by default zero.
     kernel : Kernel, optional
-        The compiled loops; by default plain ones.
+        By default the loops in plain Python.
 
     Raises
     ------
@@ -122,7 +123,7 @@ class InitialMotion(NamedTuple):
     q, v : (M,) array
         Modal coordinates and speeds.
     memory : (J, 5 + E) array or None
-        Memory of the laws; None: they are loaded from zero at once.
+        Memory of the laws; None if they are loaded from zero at once.
     """
 
     q: FloatArray
@@ -137,22 +138,25 @@ def integrate_motion(
     begin: InitialMotion,
     kernel: Kernel = PLAIN_KERNEL,
 ) -> ModalMotion:
-    """Return the motion of a system with laws, at the samples of prepared time steps.
+    """Integrate the motion of a system with laws over prepared time steps.
 
-    If a law begins or ends to act at a time, a new section of the motion begins there. Modes keep
-    their state, and so do laws that continue to act. A law that begins to act is loaded from zero
-    to the position of its port. A sample at that time belongs to the new section.
+    Where a law begins or ends to act, a new section of the motion begins. The modes keep their
+    state,
+    and so do laws that continue to act. A law that begins to act is loaded from zero to the
+    position of
+    its port. A sample at the boundary of two sections belongs to the later one.
 
     Parameters
     ----------
-    system : ModalSystem
-        The modes of the structure, without the forces of laws.
     laws : PortLaws
-        The laws at its ports.
+        The laws at the ports of the system.
     steps : StepArrays
         The steps, from `loaded_steps`.
-    begin : InitialMotion
-        The state at the first boundary.
+
+    Returns
+    -------
+    ModalMotion
+        The motion at the samples of the steps.
     """
     mode_count = len(begin.q)
     memory_is_known = begin.memory is not None
@@ -165,10 +169,10 @@ def integrate_motion(
     previously_active = np.ones(len(laws), dtype=bool)
     for first, last in pairwise(_section_boundaries(steps.time, laws)):
         # the laws of this section
-        moment = 0.5 * float(steps.time[first] + steps.time[first + 1])
-        motion_rows = laws.port_rows(system.ports, mode_count, moment)
-        force_rows = laws.port_rows(system.actions or system.ports, mode_count, moment)
-        active = laws.active_at(moment)
+        mid_time = 0.5 * float(steps.time[first] + steps.time[first + 1])
+        motion_rows = laws.port_rows(system.ports, mode_count, mid_time)
+        force_rows = laws.port_rows(system.actions or system.ports, mode_count, mid_time)
+        active = laws.active_at(mid_time)
         for j in np.flatnonzero(active & ~previously_active):
             state.memory[j] = 0.0
             if laws.depends_on_speed[j]:
@@ -194,7 +198,7 @@ def integrate_motion(
 
 
 def _empty_motion(sample_count: int, mode_count: int, memory: FloatArray) -> ModalMotion:
-    """Return arrays for a motion; `memory` (J, 5 + E) is the state's, which changes in place."""
+    """Allocate arrays for a motion; `memory` (J, 5 + E) is the state's, which changes in place."""
     modal = np.empty((2, sample_count, mode_count))
     forces = np.empty((2, sample_count, len(memory)))
     return ModalMotion(
@@ -203,10 +207,12 @@ def _empty_motion(sample_count: int, mode_count: int, memory: FloatArray) -> Mod
 
 
 def _section_boundaries(time: FloatArray, laws: PortLaws) -> list[int]:
-    """Return the boundaries (of K + 1) at which a law begins or ends to act, with both ends."""
+    """Return the boundaries at which a law begins or ends to act, with both ends."""
     begin = time[0]
     end = time[-1]
-    inner_times = [moment for moment in laws.switching_times if begin < moment < end]
+    inner_times = [
+        switching_time for switching_time in laws.switching_times if begin < switching_time < end
+    ]
     inner_boundaries = np.searchsorted(time, inner_times)
     ends = [0, len(time) - 1]
     boundaries = np.unique(np.concatenate((ends, inner_boundaries)))

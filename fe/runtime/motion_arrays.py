@@ -58,7 +58,7 @@ class StepArrays(NamedTuple):
 
 
 class PortArrays(NamedTuple):
-    """J laws with E hysteretic elements at most, and the ports that they act on.
+    """J laws with at most E hysteretic elements, and the ports at which they act.
 
     Attributes
     ----------
@@ -74,16 +74,16 @@ class PortArrays(NamedTuple):
         or `SPEED_LAW`, or `IMMOVABLE`.
     impulse_response : (S, J, 2M) array
         State (q, v) at the end of a step of each length after a unit impulse of the law at its
-        begin.
+        beginning.
     law_number : (J,) array of int
-        Number of each law in `fe.runtime.laws.LAWS`.
+        Index of each law in `fe.runtime.laws.LAWS`.
     depends_on_speed : (J,) array of int
         1 for a law of speed, 0 for a law of position.
     parameters : (J, 5 + E) array
         Parameters of each law, then those of its hysteretic elements.
     flexibility : (J,) array
         R, the residual flexibility: position of each law's port under a unit force there, without
-        the part of the modes.
+        the contribution of the modes.
     relaxation : float
         beta, the time constant of the residual position [s].
     stiffness_rate : float
@@ -162,7 +162,7 @@ class ModalMotion(NamedTuple):
 
 
 def port_value(rows: FloatArray, j: int, q: FloatArray) -> float:
-    """Return position or speed of the port of law `j`: row `j` of `rows` (J, M) times `q` (M,)."""
+    """Return `rows[j] @ q`: the position or speed of the port of law `j`."""
     value = 0.0
     for m in range(len(q)):
         value += rows[j, m] * q[m]

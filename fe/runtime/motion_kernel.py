@@ -54,7 +54,8 @@ def integrate(
 ) -> None:
     """Integrate the motion over some of the steps, and record it at the samples there.
 
-    Records are given by their fields alone: numba takes three times as long for a tuple with names.
+    Records are passed as plain tuples of their fields: numba takes three times as long for named
+    ones.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def first_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes half of the laws' impulse, in step `k` of duration `h` [s]."""
+    """Give the modes the first half of the laws' impulse in step `k` of duration `h` [s]."""
     half = 0.5 * h
     mode_count = len(state.q)
     law_count = len(ports.law_number)
@@ -179,15 +180,13 @@ def first_half_impulse(
 def add_stiffness_drift(steps: StepArrays, state: ModalState, duration_times_change: float) -> None:
     """Give the modes the impulse of a stiffness that has drifted.
 
-    The whole stiffness acts on the coordinates, also where it couples a mode with a drive: a spring
-    between two points pulls by their distance, whatever distance both have gone.
+    The whole stiffness acts, also where it couples a mode with a drive: a spring between two points
+    pulls by their distance, however far both have moved.
 
     Parameters
     ----------
-    steps : StepArrays
-        The steps, with the stiffness S.
     state : ModalState
-        The state, whose speeds are changed.
+        Its speeds are changed in place.
     duration_times_change : float
         The duration of the impulse times the relative change of the stiffness [s].
     """
@@ -199,7 +198,7 @@ def add_stiffness_drift(steps: StepArrays, state: ModalState, duration_times_cha
 def linear_step(
     steps: StepArrays, k: int, state: ModalState, new_state: FloatArray, coupled: bool
 ) -> None:
-    """Move the linear structure through step `k`, exactly; uncoupled modes each by itself."""
+    """Advance the linear structure exactly by step `k`; uncoupled modes each by itself."""
     mode_count = len(state.q)
     transition = steps.transition[steps.length_of_step[k]]
     for m in range(mode_count):
@@ -228,14 +227,14 @@ def update_position_laws(
     fade: float,
     memory_is_known: bool,
 ) -> None:
-    """Carry the laws of ports to boundary `k`, and give the second half of their impulse.
+    """Solve the positions of ports at boundary `k`, and give the second half of impulses there.
 
-    It does so for laws of position, and for laws of speed at ports with residual flexibility.
+    This concerns laws of position, and laws of speed at ports with residual flexibility. The state
+    is
+    changed in place.
 
     Parameters
     ----------
-    steps, ports, state
-        Arrays of the steps and of the ports; the state, changed in place.
     k : int
         The boundary.
     h : float
@@ -287,7 +286,7 @@ def second_half_impulse(
     state: ModalState,
     h: float,
 ) -> None:
-    """Give the modes the other half of the laws' impulse, in step `k` of duration `h` [s].
+    """Give the modes the second half of the impulse of laws of speed, in step `k` of `h` [s].
 
     If the friction at a port has reversed within the step, its impulse is corrected.
     """
@@ -335,7 +334,7 @@ def record_sample(
     sample: int,
     motion: ModalMotion,
 ) -> None:
-    """Record state and forces of boundary `k` as a sample; `applied` (M,) are the modal forces."""
+    """Record state and forces at boundary `k`; `applied` (M,) are the modal forces."""
     for m in range(len(state.q)):
         motion.q[sample, m] = state.q[m]
         motion.v[sample, m] = state.v[m]

@@ -1,7 +1,7 @@
 """Model patches: sets of primitive changes that together represent a missing physical effect.
 
 A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
-primitives; which physical effect a set of them stands for only `discrepancy.catalogue` knows.
+primitives; only `discrepancy.catalogue` knows which physical effect a set of them represents.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -47,7 +47,7 @@ from .sensor_primitives import ThermalStrain as ThermalStrain
 ROOT_TURN = ("root", "rx")
 """Support and motion of the root of a wing or a lumped model: its turn about the flapping axis."""
 FORMER_ROOT_COMPLIANCE = "root_compliance"
-"""Kind of a compliance of the root in files of earlier versions."""
+"""Kind of the root's compliance in files of earlier versions."""
 
 # ---------------------------------------------------------------- mass and stiffness
 
@@ -208,7 +208,7 @@ INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 LOADS = (LoadPlace, LoadOffset, LoadTilt, LoadGain, Washout, InertiaRelief)
 """Primitives that change the known loads."""
 READ_PLACES = (GaugeOffset,)
-"""Primitives that change where the structure is read."""
+"""Primitives that change the positions of gauges."""
 SENSORS = (
     SensorGain,
     SensorSaturation,
@@ -261,17 +261,13 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return the part of the patch that acts in a trial.
+        """Return the part of the patch that acts in the trial with a name.
 
-        A primitive without windows acts always, in all trials; one with windows acts only in these.
-        Of its windows, a primitive keeps those of this trial. If one of them spans the whole trial,
-        the primitive acts always in it, and so is returned without windows. If all windows lie in
-        other trials, the primitive is left out.
-
-        Parameters
-        ----------
-        trial : str
-            Name of the trial.
+        A primitive keeps only its windows in this trial, and is left out if it has windows in other
+        trials
+        only. It is returned without windows, as it acts always, if it has none or if one of them
+        spans the
+        whole trial.
         """
         if not self.has_windows:
             return self
@@ -289,17 +285,17 @@ class ModelPatch:
 
     @property
     def has_windows(self) -> bool:
-        """Whether a primitive acts in windows only."""
+        """Whether any primitive is restricted to windows."""
         return any(primitive.windows for primitive in self.primitives)
 
     def of(self, *kinds: type[Primitive]) -> "ModelPatch":
-        """Return the part of the patch whose primitives are of the given classes."""
+        """Return the part of the patch whose primitives are of given classes."""
         return ModelPatch(
             tuple(primitive for primitive in self.primitives if isinstance(primitive, kinds))
         )
 
     def without(self, *kinds: type[Primitive]) -> "ModelPatch":
-        """Return the part of the patch whose primitives are of no given class."""
+        """Return the part of the patch whose primitives are of none of the given classes."""
         return ModelPatch(
             tuple(primitive for primitive in self.primitives if not isinstance(primitive, kinds))
         )
@@ -317,7 +313,7 @@ class ModelPatch:
         rows : list of mapping
             Kind and values of each primitive.
         where : str
-            The name of the source, for the error message.
+            The name of the source, as the beginning of error messages.
 
         Raises
         ------
@@ -343,14 +339,14 @@ _ACCEPTED_TYPES: dict[type, tuple[type, ...]] = {
     str: (str,),
     tuple: (list, tuple),
 }
-"""The types that a value may have in a file, by the type that it is converted to. A tuple is one of
+"""The types that a value may have in a file, by the type to which it is converted. A tuple holds
 numbers."""
 _NAMES_OF_TYPES = {float: "a number", int: "a number", str: "text", tuple: "a list of numbers"}
 _WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 
 def _primitive_from_row(row: object, where: str) -> Primitive:
-    """Return the primitive of a row of a file; raises `InvalidPatchError` as `from_list` does."""
+    """Build a primitive from a row of a file; raise `InvalidPatchError` as `from_list` does."""
     if isinstance(row, Mapping) and row.get("kind") == FORMER_ROOT_COMPLIANCE:
         support, motion = ROOT_TURN
         row = {**row, "kind": SupportCompliance.kind, "support": support, "motion": motion}
@@ -369,7 +365,7 @@ def _primitive_from_row(row: object, where: str) -> Primitive:
 
 
 def _windows_from_rows(rows: object, where: str) -> tuple[Window, ...]:
-    """Return the windows of a primitive from a file; raises `InvalidPatchError`."""
+    """Build the windows of a primitive from rows of a file; raise `InvalidPatchError`."""
     if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
         raise InvalidPatchError(f"{where}: windows must be a list of tables, but is {rows!r}.")
     windows = []
@@ -383,23 +379,11 @@ def _windows_from_rows(rows: object, where: str) -> tuple[Window, ...]:
 def _checked_values(
     row: Mapping[str, object], types: Mapping[str, type], required: Iterable[str], where: str
 ) -> dict[str, Any]:
-    """Return the values of a row of a file, each converted to its type.
+    """Convert the values of a row to their types.
 
-    Parameters
-    ----------
-    row : mapping of str to object
-        The values as read.
-    types : mapping of str to type
-        The type of every value that the row may have.
-    required : iterable of str
-        Names of the values that the row must have.
-    where : str
-        The name of the row, for the error message.
-
-    Raises
-    ------
-    InvalidPatchError
-        If a value is missing, superfluous or of another type.
+    Raises `InvalidPatchError` if a value is missing, superfluous or of another type; the message
+    begins
+    with `where`.
     """
     checked: dict[str, Any] = {}
     for name, value in row.items():
@@ -420,5 +404,5 @@ def _checked_values(
 
 
 def _is_accepted(value: object, value_type: type) -> bool:
-    """Return whether a value of a file may stand for a value of a type; true and false may not."""
+    """Return whether a value in a file may be converted to a type; true and false may not."""
     return isinstance(value, _ACCEPTED_TYPES[value_type]) and not isinstance(value, bool)

@@ -1,4 +1,4 @@
-"""The stored arrays of a wing for patches; the equations are in `docs/explanation/patches.md`.
+"""The stored arrays of a wing under patches; the equations are in `docs/explanation/patches.md`.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """

@@ -31,21 +31,21 @@ from .state import Losses
 from .wing_rows import NO_PATCH, STATIC_TEST_LOAD, WingRows
 
 ITERATIONS = 3
-"""Steps of the subspace iteration for the modes of a patched wing."""
+"""Number of subspace iterations for the modes of a patched wing."""
 NEGLIGIBLE_REMAINDER = 1e-7
-"""A basis contains a static shape if the remainder outside of the basis is smaller than this
-fraction of the shape."""
+"""A basis contains a static shape if the remainder outside the basis is below this fraction of the
+shape."""
 MODE_COUNT = 6
 """Number of modes with inertia."""
 HOLDING_LOAD = 3
-"""Number of the load that holds the wing before a release."""
+"""Index of the load that holds the wing before a release."""
 
 Solver = Callable[[FloatArray], FloatArray]
 """K^-1 of loads (n,) or (n, k)."""
 
 
 class PatchedModes(NamedTuple):
-    """First M undamped modes of a patched wing.
+    """The M lowest undamped modes of a patched wing.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class PatchedModes(NamedTuple):
     shapes : (n, M) array
         Mass-normalised shapes; the tip moves up in each.
     projection : (M, n) array
-        Modal coordinates of a displacement.
+        Matrix from displacements to modal coordinates.
     """
 
     frequency: FloatArray
@@ -63,7 +63,7 @@ class PatchedModes(NamedTuple):
 
 
 def solver_by_inverse(stiffness: FloatArray) -> Solver:
-    """Return a solver by the inverse of a stiffness (n, n), as NumPy solves no Cholesky factors."""
+    """Return a solver that inverts a stiffness (n, n), as NumPy cannot solve Cholesky factors."""
     inverse = np.linalg.inv(stiffness)
 
     def solve(loads: FloatArray) -> FloatArray:
@@ -75,7 +75,9 @@ def solver_by_inverse(stiffness: FloatArray) -> Solver:
 def motion_basis(
     static: Solver, mass: FloatArray, start: FloatArray, static_shapes: FloatArray
 ) -> FloatArray:
-    """Return a basis of the first modes of a structure, by subspace iteration.
+    """Return an orthonormal basis of the lowest modes and of static shapes.
+
+    The modes are found by subspace iteration.
 
     Parameters
     ----------
@@ -101,20 +103,15 @@ def motion_basis(
         # which matter if the remainder is small
         remainder = shape - basis @ (basis.T @ shape)
         remainder = remainder - basis @ (basis.T @ remainder)
-        size = float(np.linalg.norm(remainder))
+        norm = float(np.linalg.norm(remainder))
         # the remainder of a shape that the basis contains is only rounding, and must not be added
-        if size > NEGLIGIBLE_REMAINDER:
-            basis = np.concatenate((basis, remainder[:, np.newaxis] / size), axis=1)
+        if norm > NEGLIGIBLE_REMAINDER:
+            basis = np.concatenate((basis, remainder[:, np.newaxis] / norm), axis=1)
     return np.asarray(basis)
 
 
 class PatchedWing(WingRows):
-    """The wing in a basis that can hold the changes of `fe.runtime.patch`.
-
-    Parameters
-    ----------
-    arrays : PatchArrays
-        From `fe.reduction.model_cache.patch_arrays`, or read from a file.
+    """The wing in a basis in which patches can change it.
 
     Attributes
     ----------
@@ -128,14 +125,14 @@ class PatchedWing(WingRows):
     def mass(
         self, servo_mass: float, pitot_mass: float, patch: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the mass (n, n) with the point masses of a patch [kg].
+        """Return the mass (n, n) [kg].
 
         Parameters
         ----------
         servo_mass, pitot_mass : float
             Mass of each servo and of the pitot tube [kg].
         patch : ModelPatch
-            The patch whose point masses act.
+            Its point masses are added.
 
         Raises
         ------
@@ -162,21 +159,21 @@ class PatchedWing(WingRows):
         patch: ModelPatch = NO_PATCH,
         temperature_difference: float = 0.0,
     ) -> FloatArray:
-        """Return the stiffness (n, n) at a state under a patch.
+        """Return the stiffness (n, n) in a state under a patch.
 
         Parameters
         ----------
         young_modulus_factor, stiffness_loss
-            Modulus factor and losses, see `fe.runtime.state.DigitalState`.
+            As in `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            The patch whose root compliances, losses and temperature coefficients act.
+            Its root compliances, losses and temperature coefficients act.
         temperature_difference : float
             Temperature minus the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
-            If a change leaves no stiffness, or is of a damage region that the wing does not have.
+            If a change leaves no stiffness, or is in a damage region that the wing does not have.
         """
         factor = young_modulus_factor
         for primitive in patch:
@@ -197,17 +194,9 @@ class PatchedWing(WingRows):
     def _remaining_in_regions(self, stiffness_loss: Losses, patch: ModelPatch) -> list[float]:
         """Return the fraction of its stiffness that each damage region keeps.
 
-        Parameters
-        ----------
-        stiffness_loss : tuple of float
-            Losses of the regions in the state of the wing.
-        patch : ModelPatch
-            The patch whose losses of regions act; all losses of a region multiply.
-
-        Raises
-        ------
-        InvalidPatchError
-            If the wing does not have a region of the patch.
+        Losses of the state and of the patch multiply. Raises `InvalidPatchError` if the wing does
+        not have
+        a region of the patch.
         """
         regions = self.arrays.regions
         remaining = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
@@ -223,7 +212,7 @@ class PatchedWing(WingRows):
         return remaining
 
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
-        """Put the root compliances of a patch in series with the spring at the root, in place.
+        """Put the root compliances of a patch in series with the root spring, in place.
 
         Raises `InvalidPatchError` if no spring remains, or another support is to yield.
         """
@@ -252,7 +241,7 @@ class PatchedWing(WingRows):
     def _add_local_losses(
         self, stiffness: FloatArray, patch: ModelPatch, theta: FloatArray
     ) -> None:
-        """Subtract a patch's local losses, averaged over strips, from a stiffness (n, n), in place.
+        """Subtract a patch's local losses, averaged over strips, from a stiffness, in place.
 
         `theta` (K + 2,) are the coefficients of the stiffness terms.
         """
@@ -274,7 +263,7 @@ class PatchedWing(WingRows):
         patch: ModelPatch = NO_PATCH,
         temperature_difference: float = 0.0,
     ) -> "PatchedStructure":
-        """Return the wing at inputs under a patch, for `fe.runtime.transient.ModalIntegrator`.
+        """Return the wing under a patch, for `fe.runtime.transient.ModalIntegrator`.
 
         Parameters
         ----------
@@ -287,7 +276,7 @@ class PatchedWing(WingRows):
         Raises
         ------
         InvalidPatchError
-            If the wing cannot carry the patch.
+            If the patch cannot be applied to the wing.
         """
         factor, *losses, servo_mass, pitot_mass = vector[:-2].tolist()
         return PatchedStructure(
@@ -313,7 +302,7 @@ class PatchedStructure:
     Attributes
     ----------
     stiffness, mass : (n, n) array
-        The matrices.
+        The same matrices.
     laws : PortLaws
         The laws of the patch at the ports of the wing.
     """
@@ -355,7 +344,7 @@ class PatchedStructure:
         self.acceleration_rows = np.zeros((0, wing.size))
 
     def load_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (4,) of the loads at inputs (V,) of the wing."""
+        """Return the coefficients (4,) of the loads for inputs (V,) of the wing."""
         load_factor, tip_force = vector[-2:].tolist()
         force = tip_force
         for load_gain in self._load_gains:
@@ -373,16 +362,16 @@ class PatchedStructure:
 
     @cached_property
     def unit_responses(self) -> FloatArray:
-        """Displacements (n, 4 + J) at rest under the unit loads."""
+        """Static displacements (n, 4 + J) under the unit loads."""
         return self.static(self.unit_loads)
 
     def lowest_modes(self, count: int, static_shape_rows: FloatArray | None = None) -> PatchedModes:
-        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
+        """Return the lowest undamped modes, Kapteyn et al. 2021, eq. (16).
 
         Parameters
         ----------
         static_shape_rows : (s, n) array, optional
-            Loads as rows, whose static shapes the basis of the modes holds as well.
+            Loads whose static shapes the basis of the modes contains as well.
         """
         if static_shape_rows is None:
             static_shapes = np.zeros((len(self.mass), 0))
@@ -403,10 +392,10 @@ class PatchedStructure:
 
     @property
     def mode_shapes(self) -> FloatArray:
-        """Shapes (n, M) of the modes that move."""
+        """Shapes (n, M) of the modes."""
         return self.modes.shapes
 
     @property
     def modal_projection(self) -> FloatArray:
-        """Modal coordinates (M, n) of a displacement."""
+        """Matrix (M, n) from displacements to modal coordinates."""
         return self.modes.projection

@@ -1,4 +1,4 @@
-"""Plug-ins: what installed packages add to this one, by entry points.
+"""Plug-ins: objects that installed packages provide by entry points.
 
 This is the only module that loads them. Standard library only: this file is copied into the FMU.
 """
@@ -13,16 +13,16 @@ from .errors import PlugInError
 
 @dataclass(frozen=True)
 class PlugIn:
-    """An object that an installed package adds.
+    """An object that an installed package provides.
 
     Attributes
     ----------
     name : str
         The name of the entry point.
     subject : str
-        The entry point, its group and its package as the beginning of a sentence.
+        The entry point, its group and its package, as the beginning of a message.
     value : object
-        The object.
+        The loaded object.
     """
 
     name: str
@@ -36,12 +36,7 @@ def plug_in_names(group: str) -> list[str]:
 
 
 def load_plug_ins(group: str) -> tuple[PlugIn, ...]:
-    """Return what installed packages add in a group of entry points, sorted by name.
-
-    Parameters
-    ----------
-    group : str
-        The group, such as "uav_twin.effects".
+    """Load all plug-ins of a group such as "uav_twin.effects", sorted by name.
 
     Raises
     ------
@@ -52,14 +47,7 @@ def load_plug_ins(group: str) -> tuple[PlugIn, ...]:
 
 
 def find_plug_in(group: str, name: str) -> PlugIn | None:
-    """Return the object that an installed package adds under a name; None if there is none.
-
-    Parameters
-    ----------
-    group : str
-        The group of entry points, such as "uav_twin.estimators".
-    name : str
-        The name of the entry point.
+    """Load the plug-in with a name in a group; None if there is none.
 
     Raises
     ------
@@ -71,7 +59,7 @@ def find_plug_in(group: str, name: str) -> PlugIn | None:
 
 
 def _loaded(points: Iterable[EntryPoint], group: str) -> tuple[PlugIn, ...]:
-    """Return the objects of the entry points of a group, sorted by name."""
+    """Load entry points of a group, sorted by name."""
     sorted_points = sorted(points, key=lambda point: (point.name, _package_of(point)))
     counts = Counter(point.name for point in sorted_points)
     plug_ins = []
@@ -98,5 +86,5 @@ def _loaded(points: Iterable[EntryPoint], group: str) -> tuple[PlugIn, ...]:
 
 
 def _package_of(point: EntryPoint) -> str:
-    """Return the name and version of the distribution that has an entry point."""
+    """Return the name and version of the distribution that provides an entry point."""
     return "(unknown)" if point.dist is None else f"{point.dist.name} {point.dist.version}"

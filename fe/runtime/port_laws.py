@@ -34,19 +34,15 @@ STATION_PORTS = tuple(f"{PLANFORM}[{number}]" for number in range(1, STATION_COU
 
 
 def port_in_patch(port: str) -> str:
-    """Return the name that a patch has for a port: `PLANFORM` for the ports of its stations."""
+    """Return the port's name in a patch: `PLANFORM` for the ports of its stations."""
     return PLANFORM if port in STATION_PORTS else port
 
 
 def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> ModelPatch:
-    """Return a patch with each law at `PLANFORM` replaced by one law at every station.
+    """Replace each law of a patch at `PLANFORM` by one law at every station.
 
-    Parameters
-    ----------
-    patch : ModelPatch
-        A patch; its other primitives are kept, in their order.
-    area_fractions : (S,) array
-        Fraction of the planform's area of each station.
+    `area_fractions` (S,) are the stations' fractions of the planform's area. Other primitives are
+    kept, in their order.
     """
     primitives: list[Primitive] = []
     for primitive in patch:
@@ -103,7 +99,7 @@ class PortLaws:
     def port_rows(
         self, rows: Mapping[str, FloatArray], width: int, time: float | None = None
     ) -> FloatArray:
-        """Return the row of each law's port as one array.
+        """Return the row of each law's port as an array (J, width).
 
         Parameters
         ----------
@@ -112,12 +108,7 @@ class PortLaws:
         width : int
             Number of coordinates.
         time : float, optional
-            A time [s]: rows of laws that do not act then are set to zero.
-
-        Returns
-        -------
-        (J, width) array
-            The rows.
+            A time [s]; rows of laws that do not act then are zero.
         """
         law_rows = np.array([rows[name] for name in self.ports], dtype=np.float64)
         law_rows = law_rows.reshape(len(self), width)
@@ -140,7 +131,7 @@ class PortLaws:
         return active
 
     def has_same_laws(self, other: "PortLaws") -> bool:
-        """Return whether the laws and their ports are the same, so that their memory can stay."""
+        """Return whether kinds, ports and parameter count are equal, so that memory can be kept."""
         return (
             self.ports == other.ports
             and self.parameters.shape == other.parameters.shape
@@ -155,7 +146,7 @@ class PortLaws:
         )
 
     def unloaded_memory(self) -> FloatArray:
-        """Return the memory (J, 5 + E) of J laws that were never loaded, with E >= 1 elements."""
+        """Return the memory (J, 5 + E) of laws that were never loaded, with E >= 1 elements."""
         elements = self.parameters.shape[1] - PARAMETERS
         return np.zeros((len(self), FIRST_ELEMENT + max(1, elements)))
 
@@ -178,7 +169,7 @@ class PortLaws:
         relaxation : float
             Time constant of the residual position [s].
         transition : (S, 2M, 2M) array
-            Linear steps of the S lengths.
+            Transition matrices of the S step lengths.
         """
         modes = motion_rows.shape[1]
         inverse_mass = np.sum(motion_rows * force_rows, axis=1)
@@ -210,7 +201,7 @@ class PortLaws:
         return leader
 
     def port_arrays_at_rest(self) -> PortArrays:
-        """Return the arrays of the laws for static solutions, which have no modes."""
+        """Return the arrays of the laws for static solutions, without modes."""
         no_modes = np.zeros((len(self), 0))
         return self.port_arrays(
             motion_rows=no_modes,
@@ -231,17 +222,17 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
     Parameters
     ----------
     patch : ModelPatch
-        The patch; primitives of other kinds are left out.
+        Primitives of other kinds are ignored.
     ports : collection of str
         Ports that the model has.
     in_windows : bool
-        Whether the model can follow laws that act in windows only, those of its trial.
+        Whether the model supports laws that act in windows only.
 
     Raises
     ------
     InvalidPatchError
         If a law acts on a port that the model does not have, has an impossible number, or acts in a
-        window but the model cannot follow windows.
+        window but the model does not support windows.
     """
     forces = []
     for law in patch.of(PortForce):

@@ -1,4 +1,4 @@
-"""The base class of all primitive changes of a model, and the time windows in which one acts.
+"""The base class of all primitive changes of a model, and the time windows in which they act.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -36,7 +36,7 @@ class Window(NamedTuple):
 
 
 def time_formula(text: str, kind: str) -> Expression:
-    """Return a formula in `time` and `pi` of a primitive of a kind.
+    """Parse a primitive's formula in `time` and `pi`; `kind` is for the error message.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def time_formula(text: str, kind: str) -> Expression:
 
 
 def _type_of_value(declared_type: Any) -> type:
-    """Return the type of a value; that of a number, or of several, may have its unit beside it."""
+    """Return the plain type of a value, without its unit and the types of elements."""
     plain_type = getattr(declared_type, "__origin__", declared_type)
     value_type: type = get_origin(plain_type) or plain_type
     return value_type
@@ -79,7 +79,7 @@ class Primitive:
     """Unit of each real number, from the annotation of its type. At a port "N or N m" and the like:
     the unit for a port that is displaced, then the unit for one that turns."""
     can_act_in_windows: ClassVar[bool] = False
-    """Whether the primitive can act in windows only."""
+    """Whether the primitive may be restricted to windows."""
     formula_fields: ClassVar[tuple[str, ...]] = ()
     """Names of the texts that are formulas in `time`."""
     _types_of_values: ClassVar[Mapping[str, type]] = {}
@@ -114,7 +114,7 @@ class Primitive:
             time_formula(getattr(self, name), self.kind)
 
     def _check_windows(self) -> None:
-        """Raise `InvalidPatchError` if the primitive cannot have windows, or a window is empty."""
+        """Raise `InvalidPatchError` if windows are not allowed, or one is empty."""
         if self.windows and not self.can_act_in_windows:
             raise InvalidPatchError(f"The primitive {self.kind!r} cannot act in a window only.")
         for window in self.windows:
@@ -127,7 +127,7 @@ class Primitive:
                 )
 
     def acts_at(self, time: FloatArray) -> BoolArray:
-        """Return whether the primitive acts at times (N,) [s] of the trial of its windows."""
+        """Return whether the primitive acts at each time (N,) [s] of its windows' trial."""
         acts = np.full(len(time), not self.windows)
         for window in self.windows:
             begin, end = window.span

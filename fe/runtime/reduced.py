@@ -1,4 +1,4 @@
-"""The reduced model of a structure: its statics with error bounds, its modes, and its motion.
+"""The reduced model of a structure: statics with error bounds, modes, and motion.
 
 Everything here is evaluated online, with NumPy alone. The equations are in
 `docs/explanation/reduced_model.md`; `fe.reduction.reduced_basis` makes reduced models. NumPy and
@@ -27,16 +27,18 @@ InputValues = Mapping[str, float] | FloatArray
 
 
 class ReducedStructure:
-    """A reduced structure at fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
+    """A reduced structure with fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
 
-    The first Nm coordinates belong to the modal basis, the others to the static basis. Motion
-    happens in the modal basis; the static basis represents displacements that the modes leave out,
-    and is solved on its own.
+    The first Nm coordinates belong to the modal basis, the others to the static basis. The
+    structure
+    moves in the modal basis; the static basis represents displacements that the modes leave out,
+    and
+    is solved on its own.
 
     Parameters
     ----------
     vector : (V,) array
-        Values of its inputs.
+        Values of the inputs.
     """
 
     laws = None
@@ -69,7 +71,7 @@ class ReducedStructure:
         self.modal_projection = self.mode_shapes.T @ self.mass
 
     def static(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 f of loads (Nm + N,) or (Nm + N, k), displacements in the static basis."""
+        """Return K^-1 f for loads f (Nm + N,) or (Nm + N, k), in the static basis."""
         modal = len(loads) - len(self._static_stiffness)
         static_part = solve(self._static_stiffness, loads[modal:])
         return np.concatenate((np.zeros_like(loads[:modal]), static_part))
@@ -77,7 +79,7 @@ class ReducedStructure:
 
 @dataclass(frozen=True, repr=False)
 class ReducedModel(ReducedArrays):
-    """The reduced model of a structure: `ReducedArrays`, with what is computed from them.
+    """The reduced model of a structure: `ReducedArrays` with the methods that evaluate them.
 
     `fe.reduction.model_cache` makes one; `load` and `from_bytes` read one. Inputs are given by
     name, as a mapping or as keywords, and the losses also together as `stiffness_loss`. An input
@@ -92,41 +94,38 @@ class ReducedModel(ReducedArrays):
 
     @cached_property
     def validity(self) -> Mapping[str, tuple[float, float]]:
-        """Least and largest value of each input of the model, by name (SI units)."""
+        """Least and largest value of each input by name, in SI units."""
         limits = [(low, high) for low, high in self.validity_box.tolist()]
         return dict(zip(self.input_names, limits, strict=True))
 
     @cached_property
     def _loss_inputs(self) -> slice:
-        """The losses of the regions among the inputs."""
+        """The slice of the inputs that are losses of regions."""
         first_loss = len(self.parameters)
         return slice(first_loss, first_loss + len(self.regions))
 
     def vector(
         self, values: InputValues | None = None, stiffness_loss: LossValues = (), **named: float
     ) -> FloatArray:
-        """Return the values of all inputs; those that are not given are nominal.
+        """Return the values (V,) of all inputs, in the order of `input_names`.
+
+        Inputs that are not given have their nominal values.
 
         Parameters
         ----------
         values : mapping of str to float, or (V,) array, optional
             Values by name; an array is returned as it is, with NaN where it is masked.
         stiffness_loss : mapping or iterable of float
-            Losses of the damage regions together, see `fe.runtime.state.losses_of`.
+            Losses of all damage regions, see `fe.runtime.state.losses_of`.
         **named : float
             More values by name.
-
-        Returns
-        -------
-        (V,) array
-            The values in the order of `input_names`.
 
         Raises
         ------
         OutsideModelError
             If a name is unknown.
         InvalidStateError
-            If the losses are not those of the regions.
+            If the losses do not fit the regions.
         """
         if isinstance(values, np.ndarray):
             return nan_where_masked(values)
@@ -137,18 +136,13 @@ class ReducedModel(ReducedArrays):
         return vector
 
     def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
-        """Return the values of all V inputs of the model in B cases, as one row for each case.
+        """Return the values (B, V) of all inputs in B cases, in the order of `input_names`.
 
         Parameters
         ----------
         columns : mapping of str to (B,) array_like or float
             Values by the name of the input. A single number holds in all cases. Inputs that are
             left out have their nominal values.
-
-        Returns
-        -------
-        (B, V) array
-            The values of the inputs, in the order of `input_names`.
 
         Raises
         ------
@@ -164,7 +158,7 @@ class ReducedModel(ReducedArrays):
         return vectors
 
     def _input_number(self, name: str) -> int:
-        """Return the number of an input; raise `OutsideModelError` for an unknown name."""
+        """Return the index of an input; raise `OutsideModelError` for an unknown name."""
         if name not in self.input_names:
             raise OutsideModelError(
                 f"The structure {self.name} has no parameter, region, mass or control named "
@@ -173,12 +167,12 @@ class ReducedModel(ReducedArrays):
         return self.input_names.index(name)
 
     def check_validity(self, values: Sequence[float]) -> None:
-        """Check that each of the inputs (V,) lies in the validity box; NaN and infinity do not.
+        """Check that inputs (V,) lie in the validity box; NaN and infinity do not.
 
         Raises
         ------
         OutsideModelError
-            If one lies outside; the sentence names it and its range.
+            If one lies outside; the message names it and its range.
         """
         for (name, (low, high)), value in zip(self.validity.items(), values, strict=True):
             if not low <= value <= high:
@@ -213,22 +207,15 @@ class ReducedModel(ReducedArrays):
     def _factor_columns(factors: IntArray, first: int, second: int) -> IntArray:
         """Return the columns (2, k) of the two factors of each of k terms, see `_products`.
 
-        Parameters
-        ----------
-        factors : (k, 2) array of int
-            The two factors of each term, each counted from one within its kind; zero for none.
-        first, second : int
-            Number of columns before those of the kind of the first, and of the second factor.
-
-        Returns
-        -------
-        (2, k) array of int
-            The columns. A factor that is none has column zero, whose values are one.
+        `factors` (k, 2) count names of two kinds from one, and are zero for none; `first` and
+        `second` are
+        the numbers of columns before those of each kind. A factor of zero gets column 0, which is
+        one.
         """
         return np.where(factors > 0, factors + np.array((first, second)), 0).T
 
     def _products(self, vectors: FloatArray, columns: IntArray) -> FloatArray:
-        """Return the coefficients (..., k) of k terms at inputs (..., V): products of two factors.
+        """Return the coefficients (..., k) of k terms for inputs (..., V): products of two factors.
 
         The factors are taken from columns of values: column 0 is one, then come the V inputs, then
         the healthy fractions 1 - loss of the damage regions.
@@ -244,15 +231,15 @@ class ReducedModel(ReducedArrays):
         return np.asarray(values.take(first, axis=-1) * values.take(second, axis=-1))
 
     def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients of the T stiffness terms at values of the V inputs: (..., T)."""
+        """Return the coefficients (..., T) of the stiffness terms for inputs (..., V)."""
         return self._products(vectors, self._stiffness_factor_columns)
 
     def load_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients of the L loads at values of the V inputs: (..., L)."""
+        """Return the coefficients (..., L) of the loads for inputs (..., V)."""
         return self._products(vectors, self._load_factor_columns)
 
     def mass_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients of structure and P free masses at V inputs: (1 + P,)."""
+        """Return the coefficients (1 + P,) of the mass terms for inputs (V,)."""
         first_mass = self._loss_inputs.stop
         return np.concatenate(([1.0], vector[first_mass : first_mass + len(self.masses)]))
 
@@ -276,7 +263,7 @@ class ReducedModel(ReducedArrays):
         return np.pad(modal_output, ((0, 0), (0, self.static_output.shape[1])))
 
     def structure_at(self, vector: FloatArray) -> ReducedStructure:
-        """Return the structure at inputs (V,), for `fe.runtime.transient.ModalIntegrator`.
+        """Return the structure for inputs (V,), for `fe.runtime.transient.ModalIntegrator`.
 
         Raises
         ------
@@ -295,7 +282,9 @@ class ReducedModel(ReducedArrays):
         load: FloatArray | None = None,
         **named: float,
     ) -> ReducedResponse:
-        """Return the static response with certified bounds, Kapteyn et al. 2021, eqs. (13), (15).
+        """Return the static response with certified error bounds.
+
+        Kapteyn et al. 2021, eqs. (13) and (15).
 
         Parameters
         ----------
@@ -332,11 +321,11 @@ class ReducedModel(ReducedArrays):
         )
 
     def _bound_with_rounding(self, bounds: list[float], outputs: FloatArray) -> float:
-        """Return the largest of the bounds of outputs, with the allowance for rounding."""
+        """Return the largest of the outputs' bounds plus the allowance for rounding."""
         return max(bounds, default=0.0) + self.rounding_allowance * sqrt(outputs @ outputs)
 
     def static_outputs(self, vectors: FloatArray) -> FloatArray:
-        """Return gauges and displacements (B, O') at many inputs (B, V) at once.
+        """Return gauges and displacements (B, O') for many inputs (B, V) at once.
 
         Raises
         ------
@@ -358,9 +347,9 @@ class ReducedModel(ReducedArrays):
         return np.asarray(coordinates @ self.static_output.T)
 
     def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: LossValues = ()) -> float:
-        """Return the tip stiffness of a wing, tip force over displacement of its point [N/m].
+        """Return the tip stiffness of a wing [N/m]: tip force over displacement of its point.
 
-        It is a straight line in the modulus factor e, Kapteyn et al. 2021, eq. (14).
+        It is linear in the modulus factor e, Kapteyn et al. 2021, eq. (14).
 
         Parameters
         ----------
@@ -389,10 +378,11 @@ class ReducedModel(ReducedArrays):
         stiffness_loss: LossValues = (),
         **named: float,
     ) -> ReducedModes:
-        """Return the lowest undamped modes of the structure: Kapteyn et al. 2021, eq. (16).
+        """Return the lowest undamped modes, Kapteyn et al. 2021, eq. (16).
 
-        Each tracked shape, such as the first flapwise bending, is assigned to the mode that it
-        resembles most, by the modal assurance criterion.
+        Each tracked shape, such as the first flapwise bending, is assigned to the mode with the
+        largest
+        modal assurance criterion.
 
         Parameters
         ----------

@@ -158,10 +158,7 @@ class ReducedArrays(StoredArrays):
             raise self._error("has terms or units that are not those of its names")
 
     def _check_factors(self, name: str, factors: IntArray, counts: tuple[int, int]) -> None:
-        """Raise `ReducedModelFileError` where factors (k, 2) are not numbers of two kinds of names.
-
-        `counts` are the numbers of names of each kind.
-        """
+        """Raise `ReducedModelFileError` if factors (k, 2) exceed the counts of their names."""
         if factors.min(initial=0) < 0 or np.any(factors > counts):
             raise self._error(f"has an array {name} that names something that does not exist")
 
@@ -192,7 +189,7 @@ class ReducedArrays(StoredArrays):
 
 
 class CertifiedSolution(NamedTuple):
-    """A static solution in N basis vectors, with certified bounds of its errors.
+    """A static solution in N basis vectors, with certified error bounds.
 
     Attributes
     ----------
@@ -201,7 +198,7 @@ class CertifiedSolution(NamedTuple):
     outputs : (O,) array
         Gauges [1] and displacements [m].
     bounds : (O,) array
-        Bounds of the errors of the outputs, without rounding.
+        Error bounds of the outputs, without rounding.
     """
 
     coordinates: FloatArray
@@ -256,7 +253,7 @@ class CertifiedSolver:
     Attributes
     ----------
     square : tuple of int
-        Shape (N, N) of a matrix.
+        The shape (N, N).
     stiffness : (T, N N) array
         Stiffness terms, flat.
     """
@@ -296,16 +293,11 @@ class CertifiedSolver:
         self._latest_dual: tuple[tuple[bytes, Losses], _DualSolution] | None = None
 
     def _dual_solution(self, theta: FloatArray, losses: Losses) -> _DualSolution:
-        """Return the Galerkin solutions of the outputs' dual problems, by the nearest anchor.
+        """Return the Galerkin solutions of the outputs' dual problems from the nearest anchor.
 
-        Parameters
-        ----------
-        theta : (T,) array
-            Coefficients of the stiffness terms.
-        losses : tuple of float
-            Stiffness losses of the damage regions.
+        The last solution is kept, since successive loads often act on a structure in the same
+        state.
         """
-        # successive loads often act on a structure in the same state: the latest solution is kept
         key = (theta.tobytes(), losses)
         if self._latest_dual is not None and self._latest_dual[0] == key:
             return self._latest_dual[1]
@@ -333,8 +325,7 @@ class CertifiedSolver:
         load : (L,) array
             Coefficients of the loads.
         losses : tuple of float
-            Stiffness losses of the damage regions, by which the anchor of the dual functions is
-            chosen.
+            Stiffness losses of the damage regions, which select the anchor of the dual functions.
         """
         stiffness = (theta @ self.stiffness).reshape(self.square)
         right_hand_side = load @ self._load
@@ -356,7 +347,7 @@ class CertifiedSolver:
 
 
 def _one_dual_function(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
-    """Return the dual solutions in one function for each output, without stacks of matrices."""
+    """Return the dual solutions if each output has one function, without stacked matrices."""
     stiffness = (theta @ anchor.stiffness)[:, np.newaxis]
     weights = anchor.output[:, 0] / stiffness
     residual = anchor.output_residual - weights * (anchor.term_residual @ theta)
@@ -366,7 +357,7 @@ def _one_dual_function(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
 
 
 def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
-    """Return the dual solutions as Galerkin combinations of the functions of each output."""
+    """Return the dual solutions as Galerkin combinations of each output's functions."""
     outputs, functions, _ = anchor.output.shape
     # Galerkin's equations of each output
     stiffness = (theta @ anchor.stiffness).reshape(outputs, functions, functions)

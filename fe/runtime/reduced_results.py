@@ -10,17 +10,16 @@ from .arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class ReducedResponse:
-    """Static response of a reduced structure.
+    """The static response of a reduced structure.
 
     Attributes
     ----------
     strain : (G,) array
-        Gauge strains [1]; of a wing positive where the upper skin is compressed.
+        Gauge strains [1]; for a wing positive where the upper skin is compressed.
     displacement : (D,) array
-        Displacement outputs [m]; of a wing that of the tip, upwards.
+        Displacement outputs [m]; for a wing the upward displacement of the tip.
     strain_error_bound, displacement_error_bound : float
-        Certified: no gauge, and no displacement output, differs from the full model by more than
-        this.
+        Certified: no gauge, and no displacement output, differs from the full model by more.
     coordinates : (N,) array
         Coefficients of the static basis vectors, from which a field can be reconstructed.
     """
@@ -33,7 +32,7 @@ class ReducedResponse:
 
     @property
     def outputs_with_bounds(self) -> tuple[tuple[FloatArray, float], tuple[FloatArray, float]]:
-        """Strains and displacements, each with their error bound."""
+        """Strains and displacements, each with its error bound."""
         return (
             (self.strain, self.strain_error_bound),
             (self.displacement, self.displacement_error_bound),
@@ -42,14 +41,14 @@ class ReducedResponse:
 
 @dataclass(frozen=True, slots=True)
 class ReducedModes:
-    """First M undamped modes of a reduced structure, Kapteyn et al. 2021, eq. (16).
+    """The M lowest undamped modes of a reduced structure, Kapteyn et al. 2021, eq. (16).
 
     Attributes
     ----------
     frequency : (M,) array
         Natural frequencies, ascending [Hz].
     shape : (Nm, M) array
-        Coefficients of the modal basis vectors; mass-normalised, the last output of a mode is
+        Coefficients of the modal basis vectors, mass-normalised; the last output of a mode is
         positive.
     output : (O, M) array
         Gauges, displacements and accelerations (as displacements) per unit of modal coordinate.
@@ -58,10 +57,9 @@ class ReducedModes:
     mass : (Nm, Nm) array
         The mass in the modal basis [kg].
     followed : tuple of int
-        The mode that is most like each of the tracked shapes; of a wing those of the first and
-        second flapwise bending, found by their shape, never by their rank.
+        Index of the mode most like each tracked shape; for a wing, the first two flapwise bendings.
     followed_mac : tuple of float
-        Modal assurance criterion (mass-weighted) of these modes against the tracked shapes.
+        Modal assurance criterion (mass-weighted) of these modes with the tracked shapes.
     """
 
     frequency: FloatArray

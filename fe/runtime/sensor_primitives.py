@@ -1,4 +1,4 @@
-"""Primitives of sensors: faults of sensors and recorders, and the record that they show.
+"""Faults of sensors and recorders, and the record on which they act.
 
 `fe.runtime.sensors` applies them to a response. NumPy and relative imports only: this file is
 copied into the FMU.
@@ -28,7 +28,7 @@ PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
 
 @dataclass(frozen=True)
 class SensorRecord:
-    """The record of a trial that sensors show.
+    """The record of a trial that sensors read.
 
     Attributes
     ----------
@@ -94,12 +94,10 @@ class Sensor(Primitive):
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the readings of a perfect sensor with the fault of this one.
+        """Add the fault to readings.
 
         Parameters
         ----------
-        record : SensorRecord
-            The record of N samples.
         values : (N, C) array
             The readings without the fault, in the units of the channels.
         rates : (N, C) array
@@ -260,11 +258,13 @@ class SensorLag(Sensor):
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the readings (N, C) delayed by `lag`, and their rates; see `Sensor.readings`.
+        """Delay readings (N, C) and their rates by `lag`.
 
-        Outside of the record, the readings are extrapolated linearly. Before the first sample the
-        rate is zero if the structure was at rest at the beginning (`record.settled`), else the rate
-        at the first sample; after the last sample it is the rate at the last one.
+        Outside the record, the readings are extrapolated linearly. Before the first sample the rate
+        is zero
+        if the structure was at rest at the beginning (`record.settled`), else the rate at the first
+        sample;
+        after the last sample it is the rate at the last one.
         """
         # only forced and driven trials have a recorded input that a reading can lag behind; a
         # single sample has no interval to interpolate in
@@ -293,8 +293,6 @@ def interpolated_by_cubics(
 ) -> tuple[FloatArray, FloatArray]:
     """Interpolate signals and their time derivatives by cubic Hermite polynomials.
 
-    The cubic between two samples has the given values and time derivatives at both samples.
-
     Parameters
     ----------
     time : (N,) array
@@ -302,8 +300,7 @@ def interpolated_by_cubics(
     values, rates : (N, C) array
         C signals at these times, and their time derivatives.
     new_time : (M,) array
-        The times at which the signals are wanted [s]. Before the first sample the first cubic is
-        continued, after the last sample the last cubic.
+        The times to interpolate at [s]. Outside the samples, the first or last cubic is continued.
 
     Returns
     -------

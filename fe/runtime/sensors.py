@@ -1,8 +1,8 @@
 """Readings of faulty sensors: the primitives of `fe.runtime.patch.SENSORS` applied to a response.
 
-Pure functions on arrays. Clocks are not here, because they say when the response is taken and so
-belong to whoever computes it. A high-pass needs the whole record; for a record that is read row
-after row it needs the filter states of the previous row (`FilterMemory`).
+Pure functions on arrays. Clocks are not applied here: they say at which times the response is
+needed, so they belong to the code that computes it. A high-pass needs the whole record; for a
+record that is read row by row it needs the filter states of the previous row (`FilterMemory`).
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -36,7 +36,7 @@ RATES = frozenset({"velocity", "acceleration", "angular_velocity", "angular_acce
 """Quantities that are zero at rest."""
 
 LARGEST_ORDER = 4
-"""Largest number of stages of a high-pass that is read row by row."""
+"""Largest number of stages of a high-pass filter that works row by row."""
 
 
 class ClockError(NamedTuple):
@@ -47,7 +47,7 @@ class ClockError(NamedTuple):
 
 
 def needs_structure(patch: ModelPatch) -> bool:
-    """Return whether a patch changes more than the readings of the unchanged structure.
+    """Return whether a patch changes more than the readings of the existing channels.
 
     Rotated gauges need strains of the structure that no gauge reads.
     """
@@ -58,7 +58,7 @@ def needs_structure(patch: ModelPatch) -> bool:
 
 
 def clock_of(patch: ModelPatch) -> ClockError:
-    """Return the sum of the clock primitives of a patch."""
+    """Return the sum of the clock errors of a patch."""
     clocks = [primitive for primitive in patch if isinstance(primitive, Clock)]
     return ClockError(
         rate=sum(clock.rate for clock in clocks), zero=sum(clock.zero for clock in clocks)
@@ -66,12 +66,12 @@ def clock_of(patch: ModelPatch) -> ClockError:
 
 
 def check_channels(patch: ModelPatch, channels: Channels) -> None:
-    """Check that the channels which sensor primitives name exist and have the right quantity.
+    """Check that sensor primitives name channels that exist and have the right quantity.
 
     Raises
     ------
     InvalidPatchError
-        If one does not; the sentence names it and the channels that exist.
+        If a channel does not; the message names it and the channels that exist.
     """
     quantities = dict(channels)
     for primitive in patch:
@@ -100,18 +100,19 @@ def apply_sensors(
     *,
     high_pass: HighPassFilter,
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return the readings of the channels and their time derivatives, given perfect readings.
+    """Apply the sensor faults of a patch to perfect readings.
 
     Rotations come first, because a gauge senses the strain of the skin before anything else happens
     to it; several rotations of one gauge add up. The other primitives follow in the order of the
     patch. A primitive whose channel is not in the record changes nothing; `check_channels` finds
     names that exist nowhere. High-pass filters and lines act in dynamic trials only: rows of static
-    trials and of flights are settled readings. Without sensors the input is returned as it is.
+    trials and of flights are settled readings. Without sensor faults the input is returned as it
+    is.
 
     Parameters
     ----------
     patch : ModelPatch
-        The patch; only its sensors act, without clocks.
+        Only its sensor primitives act, without clocks.
     values : (N, C) array
         Readings of perfect sensors, in the units of the channels.
     rates : (N, C) array, optional
@@ -125,9 +126,9 @@ def apply_sensors(
     Returns
     -------
     values : (N, C) array
-        The readings.
+        The readings with the faults.
     rates : (N, C) array or None
-        The time derivatives of the readings, if those of the perfect readings were given.
+        Their time derivatives, if `rates` was given.
 
     Raises
     ------
@@ -173,7 +174,9 @@ def _rotate_gauges(
 ) -> None:
     """Turn strain gauges in the plane of the skin; readings and rates (N, C) change in place.
 
-    The strain in a direction at the angle a is eps cos^2 a + eps_t sin^2 a + gamma sin a cos a.
+    The strain in a direction at the angle a is eps cos^2 a + eps_t sin^2 a + gamma sin a cos a. If
+    the
+    transverse or shear strains are missing, `InvalidPatchError` is raised.
     """
     angles = np.zeros(len(record.channels))
     for sensor in sensors:
@@ -200,12 +203,12 @@ def _rotate_gauges(
 
 
 def _channel_name(primitive: Primitive) -> str:
-    """Return the channel of a primitive; a primitive without a channel means all of them."""
+    """Return the channel of a primitive; without one it acts on every channel."""
     return str(getattr(primitive, "channel", EVERY_CHANNEL))
 
 
 def _is_for_strain(primitive: Primitive) -> bool:
-    """Return whether a primitive is for strain gauges alone."""
+    """Return whether a primitive acts on strain gauges only."""
     return isinstance(primitive, Sensor) and primitive.strain_only
 
 
@@ -231,7 +234,7 @@ def columns_of(primitive: Primitive, channels: Channels) -> NDArray[np.intp]:
 def levels_before_record(
     high_pass: HighPass, record: SensorRecord, first_row: FloatArray
 ) -> FloatArray:
-    """Return the constant inputs (C,) of a high-pass before a record, from the record's first row.
+    """Return the constant inputs (C,) of a high-pass filter before the first row of a record.
 
     If the structure was at rest before, the input was the first reading, or zero for a channel that
     measures a rate. If it moved already, the input is taken as zero, the middle of its motion.
@@ -244,7 +247,7 @@ def levels_before_record(
 
 
 class FilterMemory:
-    """States of high-pass filters between two rows of a record that is read row by row.
+    """The states of high-pass filters between two rows of a record that is read row by row.
 
     The signal is taken as linear between the rows.
 
@@ -270,7 +273,7 @@ class FilterMemory:
     def filter_row(
         self, high_pass: HighPass, record: SensorRecord, row: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return one filtered row (1, C), and zeros for its rates, as a `HighPassFilter`.
+        """Filter one row (1, C), and return zeros for its rates, as a `HighPassFilter`.
 
         Raises
         ------
@@ -302,18 +305,23 @@ class FilterMemory:
 
 
 def high_pass_step(stages: FloatArray, increment: float, ratio: float) -> FloatArray:
-    """Return the outputs of a chain of equal first-order high-pass stages after one time step.
+    """Advance a chain of equal first-order high-pass stages by one time step.
 
     The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau; the input x changes linearly.
 
     Parameters
     ----------
     stages : (n,) array
-        Outputs of the stages before the step.
+        Outputs y of the stages before the step.
     increment : float
         Change of the input.
     ratio : float
         Duration of the step over tau.
+
+    Returns
+    -------
+    (n,) array
+        Outputs of the stages after the step.
     """
     count = len(stages)
     # the increment is one more state, which stays constant

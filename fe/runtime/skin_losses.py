@@ -1,4 +1,4 @@
-"""Stiffness of a wing's skin that remains under local losses; see `docs/explanation/patches.md`.
+"""The stiffness that a wing's skin keeps under local losses; see `docs/explanation/patches.md`.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -12,8 +12,8 @@ from .errors import InvalidPatchError
 from .patch import LocalStiffnessLoss, ModelPatch
 
 ZERO_WEIGHT_STATION = 1.02
-"""Station at which the weight of a part of the skin is zero, in semi-spans; slightly beyond the
-tip, so that all parts have a weight."""
+"""Station at which a piece of skin has zero weight, in semi-spans; slightly beyond the tip, so that
+all pieces have a weight."""
 
 
 class RemainingSkin(NamedTuple):
@@ -38,10 +38,11 @@ class RemainingSkin(NamedTuple):
 
 
 def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin | None:
-    """Return the fraction of stiffness that each part of the skin keeps under local losses.
+    """Return the fraction of its stiffness that each part of the skin keeps under local losses.
 
     Overlapping losses multiply: (1 - loss_1) (1 - loss_2). Pieces of a strip bend in series, so
-    that the strip keeps the harmonic mean of their fractions. The weight is the square of the
+    that the strip keeps the weighted harmonic mean of their fractions. The weight is the square of
+    the
     distance from the tip: the moment of a tip force is proportional to the distance, and so is the
     displacement of the tip by a curvature.
 

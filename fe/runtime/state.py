@@ -29,7 +29,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 def default_region_names(count: int) -> tuple[str, ...]:
-    """Return names for damage regions that the design does not name: z1, z2 and so on."""
+    """Return names for damage regions without a name in the design: z1, z2 and so on."""
     return tuple(f"z{number}" for number in range(1, count + 1))
 
 
@@ -53,8 +53,6 @@ def losses_of(stiffness_loss: LossValues, regions: tuple[str, ...]) -> Losses:
     stiffness_loss : mapping of str to float, or iterable of float
         Lost fractions of stiffness [1]. By name, a region that is left out is healthy; in the
         order of the regions, an empty sequence means that all regions are healthy.
-    regions : tuple of str
-        Names of the regions.
 
     Raises
     ------

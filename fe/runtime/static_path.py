@@ -1,6 +1,6 @@
-"""Positions of ports with laws: in equilibrium along a load path, or of one port in motion.
+"""Solve the positions of ports with laws: at rest along a load path, or of one port in motion.
 
-In equilibrium x + C F(x) = x_linear: C F are the displacements by the forces F of the laws, which
+At rest x + C F(x) = x_linear: C F are the displacements by the forces F of the laws, which
 act against the motion, and x_linear is the position of the linear structure. Written in the subset
 of Python that numba compiles too. NumPy and relative imports only: this file is copied into the
 FMU.
@@ -14,17 +14,17 @@ from .laws import speed
 from .motion_arrays import FloatArray, PortArrays, RecordFields
 
 _SMALLEST_PART = 1.0 / 256.0
-"""A load level that cannot be approached in parts of this size counts as without a solution."""
+"""Fraction of a load level below which it is not divided further: it has no solution."""
 _MOST_STATIC_STEPS = 60
-"""Largest number of steps of Newton's method for an equilibrium of all ports."""
+"""Largest number of Newton steps for an equilibrium of all ports."""
 _SMALLEST_FRACTION = 4e-4
-"""A step of Newton's method is not shortened below about this fraction."""
+"""Fraction below which a Newton step is not shortened."""
 _ACCURATE = 1e-12
-"""Residual over scale at which an equilibrium counts as exact."""
+"""Relative residual at which an equilibrium counts as exact."""
 _MOST_MOTION_STEPS = 80
 """Largest number of iterations for the position of one port in motion."""
 _UNKNOWN_END = 1e300
-"""Distance of an end of the bracket that is not known yet."""
+"""Distance to an end of the bracket that is not known yet."""
 
 
 def static_path(
@@ -38,7 +38,8 @@ def static_path(
 ) -> int:
     """Solve x + C F(x) = x_linear for load levels that follow one another.
 
-    A level that Newton's method does not reach from the previous one is approached in parts.
+    A level that Newton's method does not reach from the previous one is approached in smaller
+    steps.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def static_path(
     Returns
     -------
     int
-        -1, or the number of the level that has no solution.
+        -1, or the index of the level that has no solution.
     """
     ports = PortArrays(*port_fields)
     count = len(start)
@@ -68,19 +69,19 @@ def static_path(
     for level in range(len(linear_positions)):
         # approach the level in parts; a part is halved if Newton's method fails, else doubled
         fraction_done = 0.0
-        part = 1.0
+        step = 1.0
         while fraction_done < 1.0:
-            fraction = min(fraction_done + part, 1.0)
+            fraction = min(fraction_done + step, 1.0)
             goal = previous_level + (linear_positions[level] - previous_level) * fraction
             solved, solution, x_forces = solve_static_position(goal, x, ports, memory, compliance)
             if solved:
                 x = solution
                 update_memory(ports, memory, x, x_forces)
                 fraction_done = fraction
-                part *= 2.0
+                step *= 2.0
             else:
-                part *= 0.5
-                if part < _SMALLEST_PART:
+                step *= 0.5
+                if step < _SMALLEST_PART:
                     return level
         previous_level = linear_positions[level]
         for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
@@ -96,14 +97,12 @@ def solve_static_position(
     memory: FloatArray,
     compliance: FloatArray,
 ) -> tuple[bool, FloatArray, FloatArray]:
-    """Solve x + C F(x) = goal by Newton's method, halving a step that does not reduce the residual.
+    """Solve x + C F(x) = goal by Newton's method with step halving.
 
     Parameters
     ----------
     goal, start : (J,) array
         Linear positions of the ports, and the positions from which to begin.
-    ports : PortArrays
-        The laws of forces at the ports.
     memory : (J, 5 + E) array
         The memory of the laws; not changed.
     compliance : (J, J) array
@@ -112,7 +111,7 @@ def solve_static_position(
     Returns
     -------
     solved : bool
-        Whether the positions are a solution, and a stable one.
+        Whether the positions are a stable solution.
     x, forces : (J,) array
         Positions of the ports and forces of the laws.
     """
@@ -123,40 +122,40 @@ def solve_static_position(
     # The residual is judged by the largest displacement; the last term avoids a scale of zero.
     scale = np.max(np.abs(goal)) + np.max(np.abs(start)) + np.max(np.abs(displaced)) + 1e-300
     residual = x + displaced - goal
-    size = np.max(np.abs(residual))
+    residual_norm = np.max(np.abs(residual))
     for _ in range(_MOST_STATIC_STEPS):
-        if size <= _ACCURATE * scale:
+        if residual_norm <= _ACCURATE * scale:
             break
         # The Jacobian is I + C dF/dx. The tiny multiple of I keeps a singular one invertible. `inv`
         # and not `solve`, which takes numba five seconds longer to compile.
         step = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
         fraction = 1.0
-        previous_size = size
-        while size == previous_size and fraction > _SMALLEST_FRACTION:
+        previous_norm = residual_norm
+        while residual_norm == previous_norm and fraction > _SMALLEST_FRACTION:
             candidate = x - fraction * step
             candidate_forces, candidate_slopes = static_forces(candidate, ports, memory)
             candidate_residual = candidate + compliance @ candidate_forces - goal
-            candidate_size = np.max(np.abs(candidate_residual))
-            if candidate_size < size:
+            candidate_norm = np.max(np.abs(candidate_residual))
+            if candidate_norm < residual_norm:
                 x = candidate
                 forces = candidate_forces
                 slopes = candidate_slopes
                 residual = candidate_residual
-                size = candidate_size
+                residual_norm = candidate_norm
             fraction *= 0.5
-        if size == previous_size:
+        if residual_norm == previous_norm:
             break
     # Near 1e-9 the remaining residual may be rounding, or that of a kink of a law. A negative
     # determinant means an unstable equilibrium, on another branch, which snap-through separates
     # from this one.
-    solved = size <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9
+    solved = residual_norm <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9
     return solved, x, forces
 
 
 def static_forces(
     x: FloatArray, ports: PortArrays, memory: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the forces of the laws and their slopes dF/dx (J,) at rest, at port positions x (J,).
+    """Return the forces of the laws and their slopes dF/dx (J,) at rest, at positions x (J,).
 
     Laws of speed have no force at rest. The memory describes the point from which the positions
     are reached; it is not changed.
@@ -172,7 +171,7 @@ def static_forces(
 
 
 def update_memory(ports: PortArrays, memory: FloatArray, x: FloatArray, forces: FloatArray) -> None:
-    """Carry the memory of the laws to positions `x` (J,) at rest under `forces` (J,), in place."""
+    """Update the memory of the laws to positions `x` (J,) at rest under `forces` (J,), in place."""
     for j in range(len(x)):
         if ports.depends_on_speed[j] == 0:
             laws.advance(ports.law_number[j], ports.parameters[j], memory[j], x[j])
@@ -185,7 +184,7 @@ def update_memory(ports: PortArrays, memory: FloatArray, x: FloatArray, forces: 
 def solve_port_position(
     port: int, ports: PortArrays, memory: FloatArray, y: float, r: float, h: float
 ) -> float:
-    """Return the position x of a port in motion at the end of a step, where x + r sum F(x) = y.
+    """Solve x + r sum F(x) = y for the position x of a port in motion at the end of a step.
 
     The sum is over the laws that act at the port. The equation is solved by Newton's method within
     a bracket. If dry friction is strong enough to hold the port, the position does not change.
@@ -193,9 +192,7 @@ def solve_port_position(
     Parameters
     ----------
     port : int
-        The number of the leading law among the laws at the port.
-    ports : PortArrays
-        The laws of forces at the ports.
+        Index of the leading law among the laws at the port.
     memory : (J, 5 + E) array
         The memory of the laws; that of a law of position has the force at the last position. Only
         the new forces of the port's laws are written to it.
@@ -253,7 +250,7 @@ def solve_port_position(
 def forces_at_last_position(
     port: int, ports: PortArrays, memory: FloatArray, h: float
 ) -> tuple[float, float, float]:
-    """Return the forces of the laws at a port in its last position, before the port moves.
+    """Return the forces of a port's laws before the port moves.
 
     The forces of laws of speed are set to zero in the memory, unless the duration `h` is zero.
 
@@ -294,16 +291,16 @@ def share_friction(
     friction: float,
     h: float,
 ) -> None:
-    """Share a force among the laws of dry friction of a port, by their largest forces.
+    """Share a force among a port's laws of dry friction, in proportion to their largest forces.
 
     Parameters
     ----------
-    port, ports, memory, h
-        The port, its laws, their memory and the duration of the step, see `solve_port_position`.
     force : float
         The force that holds the port.
     friction : float
         Sum of the largest forces.
+    h : float
+        Duration of the step [s].
     """
     last_position = memory[port, POSITION]
     for j in range(len(ports.law_number)):
@@ -325,15 +322,14 @@ def port_forces(
     sign: float,
     steepest: int,
 ) -> tuple[float, float, int]:
-    """Return the forces of a port's laws at position `x`; each force is written to the memory.
+    """Return the total force of a port's laws at `x`, and write each force to the memory.
 
     Parameters
     ----------
-    port, ports, memory, r, h
-        The port, its laws, their memory, its flexibility and the duration of the step, see
-        `solve_port_position`.
-    x : float
-        Position of the port.
+    r : float
+        Flexibility of the port, see `solve_port_position`.
+    h : float
+        Duration of the step [s].
     sign : float
         Sign of the motion, for dry friction.
     steepest : int

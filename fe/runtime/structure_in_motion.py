@@ -1,4 +1,4 @@
-"""The interface of structures for the integrator of motion.
+"""The interface between structures and the integrator of motion.
 
 Standard library, NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -42,15 +42,15 @@ class StructureInMotion(Protocol):
 
     @property
     def unit_responses(self) -> FloatArray:
-        """Displacements (n, L + J) at rest under the unit loads."""
+        """Static displacements (n, L + J) under the unit loads."""
         ...
 
     @property
     def holding_load(self) -> int | None:
-        """Number of the load that holds the structure before a release, and never acts later.
+        """Index of the load that holds the structure before a release, and never acts later.
 
         When it ends, the displacement in the left-out modes decays with the same lag with which
-        they follow forces of laws. None: the structure has no such load.
+        they follow forces of laws. None if the structure has no such load.
         """
         ...
 
@@ -66,7 +66,7 @@ class StructureInMotion(Protocol):
 
     @property
     def modal_projection(self) -> FloatArray:
-        """Modal coordinates (M, n) of a displacement."""
+        """Matrix (M, n) from displacements to modal coordinates."""
         ...
 
     @property
@@ -86,9 +86,9 @@ class StructureInMotion(Protocol):
 
     @property
     def strain_component_rows(self) -> FloatArray:
-        """Rows (2, G, n) of the strains across the gauges and of shear; without gauges if none."""
+        """Rows (2, G, n) of transverse and shear strains at G gauges, or none if unknown."""
         ...
 
     def load_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (L,) of the loads at inputs (V,)."""
+        """Return the coefficients (L,) of the loads for inputs (V,)."""
         ...

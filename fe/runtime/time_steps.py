@@ -1,8 +1,8 @@
-"""Time steps between any stamps, as short as laws need them, and their applied forces.
+"""Time steps between stamps, short enough for laws, and the forces applied in them.
 
 An exact step of the linear system is computed once for each length; lengths that differ by less
-than `LENGTH_TOLERANCE` of the usual length count as one. NumPy and relative imports only: this file
-is copied into the FMU.
+than `LENGTH_TOLERANCE` of the median length count as one. NumPy and relative imports only: this
+file is copied into the FMU.
 """
 
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ from .motion_arrays import StepArrays
 from .port_laws import PortLaws
 
 SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
-"""Longest substep with laws: the phase of the slowest and of the fastest mode in it [rad]."""
+"""Largest phase of the slowest and of the fastest mode within a substep with laws [rad]."""
 LENGTH_TOLERANCE = 1e-9
-"""Lengths of steps that differ by less than this fraction of the usual one count as one length."""
+"""Steps whose lengths differ by less than this fraction of the median count as equally long."""
 LEAST_SUBSTEPS = 8
 """Substeps of an interval with laws if the structure has no frequency of its own."""
 
 
 class DistinctLengths(NamedTuple):
-    """The S distinct lengths [s] of steps, and the number of its length for each of K steps."""
+    """The S distinct step lengths [s], and the index of the length of each of K steps."""
 
     length: FloatArray
     length_of_step: IntArray
@@ -53,15 +53,15 @@ class Boundaries:
     @cached_property
     def distinct_lengths(self) -> DistinctLengths:
         """The distinct lengths of the steps; an exact step is computed once for each."""
-        usual = float(np.median(self.lengths))
-        if np.ptp(self.lengths) <= LENGTH_TOLERANCE * usual:
-            same_number = np.zeros(len(self.lengths), dtype=np.int64)
-            return DistinctLengths(self.lengths[:1], same_number)
-        rounded = np.round(self.lengths / (LENGTH_TOLERANCE * usual))
-        _, first_of_length, number = np.unique(rounded, return_index=True, return_inverse=True)
+        median_length = float(np.median(self.lengths))
+        if np.ptp(self.lengths) <= LENGTH_TOLERANCE * median_length:
+            zeros = np.zeros(len(self.lengths), dtype=np.int64)
+            return DistinctLengths(self.lengths[:1], zeros)
+        rounded = np.round(self.lengths / (LENGTH_TOLERANCE * median_length))
+        _, first_of_length, index = np.unique(rounded, return_index=True, return_inverse=True)
         return DistinctLengths(
             length=np.ascontiguousarray(self.lengths[first_of_length]),
-            length_of_step=np.asarray(number, dtype=np.int64).ravel(),
+            length_of_step=np.asarray(index, dtype=np.int64).ravel(),
         )
 
 
@@ -73,12 +73,10 @@ def step_boundaries(
     least: int = 1,
     switching_times: Sequence[float] | FloatArray = (),
 ) -> Boundaries:
-    """Return time steps between stamps that are short enough for the laws.
+    """Divide the intervals between stamps into steps that are short enough for the laws.
 
     Parameters
     ----------
-    system : ModalSystem
-        The modes of the structure, without the forces of laws.
     time : (N,) array
         The time stamps [s].
     refinement : int
@@ -86,12 +84,12 @@ def step_boundaries(
     least : int
         Least number of steps in each interval, before refinement.
     switching_times : sequence or array of float
-        Times at which a load or a law begins or ends, so that a step has to end there [s].
+        Times at which a load or a law begins or ends, where a step has to end, too [s].
     """
-    moments = np.asarray(switching_times, dtype=np.float64)
-    moments = moments[(moments > time[0]) & (moments < time[-1])]
+    inner_times = np.asarray(switching_times, dtype=np.float64)
+    inner_times = inner_times[(inner_times > time[0]) & (inner_times < time[-1])]
     # most are stamps, as a sampled load has a corner at each of its samples
-    between_stamps = moments[time[np.searchsorted(time, moments)] != moments]
+    between_stamps = inner_times[time[np.searchsorted(time, inner_times)] != inner_times]
     if len(between_stamps):
         all_times = np.union1d(time, between_stamps)
         boundaries = step_boundaries(system, laws, all_times, refinement, least)
@@ -114,19 +112,19 @@ def step_boundaries(
 
 @lru_cache(maxsize=16)
 def _divided_intervals(stamps: bytes, counts: bytes) -> Boundaries:
-    """Return the steps that divide each interval between stamps (N,) into equal parts (N - 1,).
+    """Divide each interval between stamps (N,) into equal steps, as many as `counts` (N - 1,).
 
-    The arrays of float64 are given by their bytes, so that the results can be cached.
+    The arguments are the bytes of float64 arrays, since the cache needs arguments with a hash.
     """
     time = np.frombuffer(stamps)
-    parts = np.frombuffer(counts).astype(np.int64)
-    sample_boundary = np.concatenate(([0], np.cumsum(parts))).astype(np.int64)
+    step_counts = np.frombuffer(counts).astype(np.int64)
+    sample_boundary = np.concatenate(([0], np.cumsum(step_counts))).astype(np.int64)
     # the interval of each step, and the number of the step in it, from one
-    interval = np.repeat(np.arange(len(parts)), parts)
+    interval = np.repeat(np.arange(len(step_counts)), step_counts)
     steps_before_interval = sample_boundary[:-1][interval]
     number_in_interval = np.arange(1, len(interval) + 1) - steps_before_interval
-    part_length = np.diff(time) / parts
-    lengths = np.repeat(part_length, parts)
+    step_length = np.diff(time) / step_counts
+    lengths = np.repeat(step_length, step_counts)
     # the ends of the steps; at a sample exactly the time of the sample
     end_times = time[interval] + number_in_interval * lengths
     boundary_times = np.concatenate((time[:1], end_times))
@@ -141,12 +139,10 @@ def loaded_steps(
     end_force: FloatArray,
     residual_position: FloatArray,
 ) -> StepArrays:
-    """Return the time steps of a system under applied forces that are linear in time in each step.
+    """Return time steps with applied forces that are linear in time in each step.
 
     Parameters
     ----------
-    system : ModalSystem
-        The modes of the structure, without the forces of laws.
     boundaries : Boundaries
         Boundaries of the K steps.
     begin_force, end_force : (K, M) array

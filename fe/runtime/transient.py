@@ -1,10 +1,10 @@
-"""A structure in time: at rest, or its first modes moving, with or without laws at its ports.
+"""A structure at rest, or moving in its lowest modes, with or without laws at its ports.
 
 Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f,
-one equation for each mode, because Rayleigh damping (17) does not couple the modes. It is exact for
-loads that are held. The modes that are left out follow the loads without delay (static correction).
-Laws at ports couple the modes: `fe.runtime.motion` makes the steps then, and the modes that are
-left out follow the forces of the laws with the lag of the damping.
+one equation for each mode, because Rayleigh damping (17) does not couple the modes. It is solved
+exactly for constant loads. The modes that are left out follow the loads without delay (static
+correction). Laws at ports couple the modes: `fe.runtime.motion` makes the steps then, and the modes
+that are left out follow the forces of the laws with the lag of the damping.
 
 NumPy and relative imports only: this file is copied into the FMU. The modules of laws are imported
 only where there are laws.
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 INSTANT = 1e-6
-"""Duration of a step from which only the state at its beginning is used [s]."""
+"""Duration of a step of which only the state at its beginning is used [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,7 @@ class TransientState:
     velocity : (M,) array
         Modal velocities [m kg^1/2 / s].
     load : (L,) array
-        Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force
-        [N].
+        Present coefficients of the loads; for a wing the load factor [1] and the tip force [N].
     memory : (J, 5 + E) array
         Memory of the laws, among it the lagged forces that the left-out modes follow.
     """
@@ -55,7 +54,7 @@ class TransientState:
 
     @property
     def moves(self) -> bool:
-        """Whether the state has a motion, even one of zero speed."""
+        """Whether the state has modal coordinates, even with zero speed."""
         return len(self.displacement) > 0
 
 
@@ -68,14 +67,12 @@ class ModalIntegrator:
     Parameters
     ----------
     structure : StructureInMotion
-        The structure, from `structure_at` of a `ReducedModel` or a `PatchedWing`.
+        From `structure_at` of a `ReducedModel` or a `PatchedWing`.
     damping_alpha, damping_beta : float
         Rayleigh damping [1/s], [s].
 
     Attributes
     ----------
-    structure : StructureInMotion
-        The structure whose motion is integrated.
     damping_ratio : (M,) array
         Damping ratios of the modes, eq. (18).
 
@@ -147,16 +144,11 @@ class ModalIntegrator:
         memory: FloatArray,
         start: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the forces (J,) of the laws at rest, and their memory (J, 5 + E).
+        """Return the forces (J,) of the laws at rest, and their new memory (J, 5 + E).
 
-        Parameters
-        ----------
-        linear_positions, start : (J,) array
-            Positions of the laws' ports without internal forces, now and before.
-        compliance : (J, J) array
-            Positions of the ports under unit forces at them.
-        memory : (J, 5 + E) array
-            Memory of the laws before.
+        `linear_positions` and `start` (J,) are the positions of the ports without internal forces,
+        now and
+        before; `compliance` (J, J) are the positions under unit forces.
         """
         from .motion import static_solution
 
@@ -179,7 +171,7 @@ class ModalIntegrator:
     def _with_still_modes(
         self, equilibrium: TransientState, holding: FloatArray | float = 0.0
     ) -> TransientState:
-        """Return an equilibrium as a state of resting modes, displaced by `holding` (M,)."""
+        """Give an equilibrium resting modes, displaced by `holding` (M,)."""
         q = self._responses.modal_coordinates @ self._static_loads(equilibrium) + holding
         return replace(equilibrium, displacement=q, velocity=np.zeros_like(q))
 
@@ -203,7 +195,7 @@ class ModalIntegrator:
         load : (L,) array_like
             Coefficients of the loads that stay.
         holding_load : int
-            Number of the load that held it.
+            Index of the holding load.
 
         Raises
         ------
@@ -231,21 +223,12 @@ class ModalIntegrator:
     def _held_by_force(
         self, rest_state: TransientState, force: float, holding_load: int
     ) -> tuple[TransientState, float]:
-        """Return the equilibrium of a structure that a force holds displaced, and the force.
+        """Return the equilibrium of a structure that a force holds displaced, and the force [N].
 
         The point is held at the displacement that the given force would cause without laws. The
         laws change the force that is needed for this displacement. With the forces F of the laws,
         the compliance C of the ports, the response a of the ports to a unit force at the point, and
         the response a_0 of the point itself, the ports are at x = x_linear - (C - a a^T / a_0) F.
-
-        Parameters
-        ----------
-        rest_state : TransientState
-            The equilibrium before the structure is held.
-        force : float
-            The holding force that would be needed without laws [N].
-        holding_load : int
-            The number of the load that holds the structure.
         """
         response = self.structure.unit_responses[:, holding_load]
         ports = self._responses.port_positions[:, holding_load]
@@ -268,21 +251,20 @@ class ModalIntegrator:
     def advance(
         self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
     ) -> TransientState:
-        """Return the state after a time step under loads that are held.
+        """Return the state after a time step under constant loads.
 
-        Without laws the step is exact for the kept modes. If the loads differ from those
-        of the state, they jump at once, and the structure overshoots.
+        Without laws the step is exact for the kept modes. If the loads differ from those of the
+        state, they
+        jump at the beginning of the step.
 
         Parameters
         ----------
-        state : TransientState
-            The state at the beginning.
         duration : float
             Duration of the step [s], positive.
         load : (L,) array_like
             Coefficients of the loads.
         time : float
-            Begin of the step since the start [s], for a stiffness that drifts.
+            Time at the beginning of the step [s], for a stiffness that drifts.
 
         Raises
         ------
@@ -312,9 +294,9 @@ class ModalIntegrator:
     def _linear_step(
         self, state: TransientState, loads: FloatArray, duration: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return modal coordinates and velocities (M,) after a step without laws, exactly.
+        """Return modal coordinates and velocities (M,) after an exact step without laws.
 
-        They move freely about the equilibrium under the loads (L,).
+        The modes move freely about the equilibrium under the loads (L,).
         """
         transition = self._responses.system.exact_steps(np.array([duration])).transition[0]
         equilibrium = self._responses.modal_coordinates[:, : self._responses.load_count] @ loads
@@ -327,17 +309,7 @@ class ModalIntegrator:
     def _motion_with_laws(
         self, state: TransientState, loads: FloatArray, duration: float, time: float
     ) -> "ModalMotion":
-        """Return the motion of the modes with laws, at the beginning and the end of a time step.
-
-        Parameters
-        ----------
-        state : TransientState
-            The state at the beginning.
-        loads : (L,) array
-            Coefficients of the loads, which are held.
-        duration, time : float
-            Duration of the step, and its beginning after the start [s].
-        """
+        """Return the motion with laws at both ends of a step under constant loads."""
         from .motion import InitialMotion, integrate_motion
         from .time_steps import loaded_steps, step_boundaries
 
@@ -364,7 +336,7 @@ class ModalIntegrator:
     # ------------------------------------------------------------ outputs
 
     def displacement(self, state: TransientState) -> FloatArray:
-        """Return the displacement (n,) at a state, in the coordinates of the structure.
+        """Return the displacement (n,) in a state, in the coordinates of the structure.
 
         The modes that are left out follow the loads at once.
         """
@@ -377,10 +349,11 @@ class ModalIntegrator:
         )
 
     def outputs(self, state: TransientState) -> FloatArray:
-        """Return gauges [1], displacements [m] and accelerations [m/s^2] (O + A,) at a state.
+        """Return gauges [1], displacements [m] and accelerations [m/s^2] (O + A,) in a state.
 
-        An acceleration is that of the kept modes, because the others follow loads that are held
-        without inertia. A state without motion has no accelerations.
+        Accelerations are those of the kept modes, because the others have no inertia. A state
+        without
+        motion has no accelerations: the result is (O,).
         """
         if not state.moves:
             return np.asarray(self.structure.output_rows @ self.displacement(state))
@@ -401,7 +374,7 @@ class ModalIntegrator:
         return np.concatenate((outputs, rows @ (self.structure.mode_shapes @ acceleration)))
 
     def point_displacement(self, state: TransientState, load_number: int) -> float:
-        """Return the displacement of the point of a load, along the load [m]."""
+        """Return the displacement of a load's point along the load [m]."""
         return float(self.structure.unit_loads[:, load_number] @ self.displacement(state))
 
     # ------------------------------------------------------------ change of health
@@ -409,17 +382,18 @@ class ModalIntegrator:
     def take_over(
         self, state: TransientState, previous_integrator: "ModalIntegrator"
     ) -> TransientState:
-        """Return the state of another integrator in the modes of this one, if health changes.
+        """Project a state of another integrator on the modes of this one, after a change of health.
 
-        Displacement and velocity of the structure stay what they were; they are projected on the
-        new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
-        cannot represent follows the load without delay, as always. The memory of laws is kept if
-        they are the same at the same ports; other laws are loaded from zero to their positions.
+        Displacement and velocity of the structure stay what they were: they are projected on the
+        new modes
+        with the new mass matrix, exactly in reduced coordinates. What the new modes cannot
+        represent
+        follows the load without delay, as always. The memory of laws is kept if their kinds and
+        ports are
+        the same; other laws start unloaded.
 
         Parameters
         ----------
-        state : TransientState
-            A state of the other integrator.
         previous_integrator : ModalIntegrator
             The other integrator, of the same model.
         """
@@ -442,5 +416,5 @@ class ModalIntegrator:
 
 
 def _has_same_laws(laws: "PortLaws", other_laws: "PortLaws | None") -> bool:
-    """Return whether two structures have the same laws at the same ports."""
+    """Return whether two structures have laws of the same kinds at the same ports."""
     return other_laws is not None and laws.has_same_laws(other_laws)

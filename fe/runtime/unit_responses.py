@@ -1,4 +1,4 @@
-"""Responses of a structure to unit loads: of its modes, and of the modes that are left out.
+"""Responses of a structure to unit loads, split into its modes and the modes that are left out.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -18,7 +18,7 @@ class UnitResponses:
     Parameters
     ----------
     structure : StructureInMotion
-        The structure, with M modes.
+        The structure, with M modes and n coordinates.
     damping_alpha, damping_beta : float
         Rayleigh damping [1/s], [s].
     """
@@ -44,28 +44,28 @@ class UnitResponses:
 
     @cached_property
     def participation(self) -> FloatArray:
-        """Modal forces (M, L + J) of the unit loads: L loads, and forces at the ports of J laws."""
+        """Modal forces (M, L + J) of the unit loads."""
         return np.asarray(self.structure.mode_shapes.T @ self.structure.unit_loads)
 
     @cached_property
     def modal_coordinates(self) -> FloatArray:
-        """Modal coordinates (M, L + J) at rest under the unit loads."""
+        """Static modal coordinates (M, L + J) under the unit loads."""
         return np.asarray(self.participation / self.omega[:, np.newaxis] ** 2)
 
     @cached_property
     def residual_displacements(self) -> FloatArray:
-        """Displacements (n, L + J) under the unit loads, of the modes that are left out."""
+        """Static displacements (n, L + J) under the unit loads in the modes that are left out."""
         modal_displacements = self.structure.mode_shapes @ self.modal_coordinates
         return np.asarray(self.structure.unit_responses - modal_displacements)
 
     @cached_property
     def modal_outputs(self) -> FloatArray:
-        """Outputs (O, M) by modal coordinates."""
+        """Outputs (O, M) per unit of modal coordinate."""
         return np.asarray(self.structure.output_rows @ self.structure.mode_shapes)
 
     @cached_property
     def residual_outputs(self) -> FloatArray:
-        """Outputs (O, L + J) under the unit loads, of the modes that are left out."""
+        """Static outputs (O, L + J) under the unit loads in the modes that are left out."""
         return np.asarray(self.structure.output_rows @ self.residual_displacements)
 
     @property
@@ -75,22 +75,22 @@ class UnitResponses:
 
     @cached_property
     def port_positions(self) -> FloatArray:
-        """Positions (J, L + J) of the laws' ports at rest under the unit loads."""
+        """Static positions (J, L + J) of the laws' ports under the unit loads."""
         return np.asarray(self.law_loads.T @ self.structure.unit_responses)
 
     @property
     def port_positions_by_loads(self) -> FloatArray:
-        """Positions (J, L) of the laws' ports at rest under unit loads that are not at ports."""
+        """Static positions (J, L) of the laws' ports under the first L unit loads."""
         return self.port_positions[:, : self.load_count]
 
     @property
     def port_compliance(self) -> FloatArray:
-        """Positions (J, J) of the laws' ports at rest under unit forces at them."""
+        """Static positions (J, J) of the laws' ports under unit forces at them."""
         return self.port_positions[:, self.load_count :]
 
     @cached_property
     def system(self) -> ModalSystem:
-        """The modes with the ports of the laws."""
+        """The modes as a damped system, with the ports at which laws act."""
         damping = np.diag(self.alpha + self.beta * self.omega**2)
         if self.structure.laws is None:
             return ModalSystem(self.omega, damping)

@@ -1,4 +1,4 @@
-"""Rows of a wing for patches: its displacements, loads, ports and outputs.
+"""Rows of a wing under patches: displacements, loads, ports and outputs.
 
 NumPy and relative imports only: this file is copied into the FMU. The equations are in
 `docs/explanation/patches.md`.
@@ -26,9 +26,9 @@ STATIC_TEST_LOAD = "tip_load"
 OVERHANG = 0.15
 """How far beyond the tip a force may act, as a fraction of the semi-span."""
 PORTS = ("root", "tip", "span")
-"""Ports of the wing where a law acts on one motion."""
+"""Ports of the wing other than those of the planform."""
 LEAST_GAUGE_LENGTH = 1e-3
-"""Length over which a gauge without a length averages [m]."""
+"""Averaging length of a gauge that has no length [m]."""
 NO_PATCH = ModelPatch()
 
 _ARM_ROOT = 0.97
@@ -40,7 +40,7 @@ _STRAIN_COMPONENTS = (None, ".transverse", ".shear")
 
 
 def strain_gauge(output: str) -> int:
-    """Return the number of an output's gauge, counted from 0, or -1 if the output is not a strain.
+    """Return the index from 0 of an output's gauge, or -1 if the output is not a strain.
 
     In the names strain[k], strain[k].transverse and strain[k].shear k counts from 1.
     """
@@ -49,7 +49,7 @@ def strain_gauge(output: str) -> int:
 
 
 class PlanformStations(NamedTuple):
-    """The stations of an integral over the planform.
+    """The integration points on a planform.
 
     Attributes
     ----------
@@ -64,13 +64,7 @@ class PlanformStations(NamedTuple):
 
 
 def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> PlanformStations:
-    """Return the points of Gauss-Legendre integration over a planform of linear taper.
-
-    Parameters
-    ----------
-    semi_span, root_chord, tip_chord : float
-        Semi-span and chords [m].
-    """
+    """Return the points of Gauss-Legendre integration over a tapered planform, in metres."""
     abscissa, weight = np.polynomial.legendre.leggauss(STATION_COUNT)
     eta = 0.5 * (1.0 + abscissa)
     area = weight * (root_chord + (tip_chord - root_chord) * eta)
@@ -94,14 +88,11 @@ class WingRows:
     def _station_weights(self, y: float) -> FloatArray:
         """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
 
-        The stations are the ends and the middles of the cells along the span. Within a cell, a
-        value is interpolated by the parabola through both ends and the middle. Beyond the tip, up
-        to `OVERHANG` of the span, it is extrapolated linearly, as on a rigid arm.
-
-        Raises
-        ------
-        InvalidPatchError
-            If `y` lies off the wing.
+        The stations are the ends and the middles of the cells along the span; a value is
+        interpolated by a
+        parabola in each cell. Beyond the tip, up to `OVERHANG` of the span, it is extrapolated
+        linearly, as
+        on a rigid arm. Raises `InvalidPatchError` if `y` lies off the wing.
         """
         stations = self.arrays.stations
         if not 0.0 <= y <= (1.0 + OVERHANG) * self.span:
@@ -140,7 +131,7 @@ class WingRows:
     ) -> FloatArray:
         """Return the row (n,) of the upward displacement of a section at a chord fraction.
 
-        The section moves as the straight line through two neighbouring lines along the span.
+        The displacement is linear between two neighbouring lines along the span.
 
         Parameters
         ----------
@@ -178,7 +169,7 @@ class WingRows:
         location : str or tuple of float
             "tip_load", or distance from the root [m] and chord fraction.
         patch : ModelPatch
-            The patch whose load places move the force.
+            Its load places move the force.
 
         Raises
         ------
@@ -216,7 +207,7 @@ class WingRows:
         return row + moved_row - self.displacement_row(y, chord)
 
     def _chord_at(self, y: float) -> float:
-        """Return the chord of the wing at `y` [m from the root]."""
+        """Return the chord of the wing [m] at `y` [m from the root]."""
         arrays = self.arrays
         taper = arrays.tip_chord - arrays.root_chord
         return arrays.root_chord + taper * y / arrays.semi_span
@@ -224,10 +215,7 @@ class WingRows:
     def manoeuvre_loads(self, patch: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the loads (2, n) in a turn per unit load factor, and per unit of its square [N].
 
-        Parameters
-        ----------
-        patch : ModelPatch
-            The patch whose washout, relief by weight and point masses act.
+        Washout, relief by weight and point masses of the patch act.
 
         Raises
         ------
@@ -283,11 +271,11 @@ class WingRows:
 
     @cached_property
     def static_shape_rows(self) -> FloatArray:
-        """Rows (s, n) of the load point and of `PORTS`: a basis of motion has their shapes."""
+        """Loads (s, n) whose static shapes a basis of motion contains: load point and `PORTS`."""
         return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
     def output_row(self, name: str) -> FloatArray | None:
-        """Return the row (n,) of an output, None if there is no such output.
+        """Return the row (n,) of an output; None if there is no such output.
 
         Parameters
         ----------
@@ -331,7 +319,7 @@ class WingRows:
         return np.asarray((1.0 - ratio) / (1.0 - soft_skin[0]))
 
     def _strain_under_lift(self, theta: FloatArray) -> FloatArray:
-        """Return the strains of the G gauges under lift, given a coefficient of each stiffness."""
+        """Return the strains (G,) under lift for coefficients of the stiffness terms."""
         stiffness = np.tensordot(theta, self.arrays.stiffness, 1)
         displacement = np.linalg.solve(stiffness, self.arrays.load_lift)
         return np.asarray(self.arrays.strain_rows[0] @ displacement)
@@ -369,14 +357,10 @@ class WingRows:
         return np.asarray(strain_with_local_losses / strain_with_averaged_losses)
 
     def _mean_strain(self, covered: FloatArray, remaining: FloatArray) -> FloatArray:
-        """Return relative strains (G,) of gauges over pieces of the skin.
+        """Return relative mean strains (G,) of gauges over pieces of the skin.
 
-        Parameters
-        ----------
-        covered : (G, m) array
-            Length of each piece under each gauge [m].
-        remaining : (m,) array
-            Fraction of its stiffness that each piece keeps.
+        `covered` (G, m) is the length of each piece under each gauge [m]; `remaining` (m,) is the
+        fraction of its stiffness that each piece keeps.
         """
         relative_stiffness = 1.0 - self._skin_fraction[:, None] * (1.0 - remaining)
         return np.asarray((covered / relative_stiffness).sum(axis=1))

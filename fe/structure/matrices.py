@@ -36,7 +36,7 @@ from .tables import MOTIONS
 _ROUNDING = 1e-12
 """Entries of a difference of matrices below this fraction of the diagonal are rounding."""
 _INDEFINITE = 1e-3
-"""Fraction of the whole stiffness by which a part may be negative, as matrices in files are rounded."""
+"""Fraction of the whole by which a part may be negative, as matrices in files are rounded."""
 _FREE = 1e-10
 """A mode is free if its stiffness, scaled to a unit diagonal, is below this."""
 _MOST_FREE_MOTIONS = 7

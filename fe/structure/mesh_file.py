@@ -75,8 +75,8 @@ def _check_edges(mesh: StructureMesh) -> None:
             node = mesh.node_numbers[mesh.cells[cell, corner_count + edge]]
             raise MeshError(
                 f"{mesh.source}: node {node} of element {mesh.describe_cell(cell)} lies far from "
-                "the middle of its edge; the nodes of the element are in another order, or the edge "
-                "is bent too much."
+                "the middle of its edge; the nodes of the element are in another order, or the "
+                "edge is bent too much."
             )
 
 
@@ -128,8 +128,9 @@ def _check_connected(mesh: StructureMesh) -> None:
     first_cell = int((part_of_cell == smallest_part).argmax())
     raise MeshError(
         f"{mesh.source}: the mesh falls into {part_count} parts that share no node; the smallest, "
-        f"of {cell_counts.min()} elements, is around {mesh.describe_point(mesh.centres[first_cell])}"
-        ". Merge the nodes where the parts touch, or leave parts out."
+        f"of {cell_counts.min()} elements, is around "
+        f"{mesh.describe_point(mesh.centres[first_cell])}. Merge the nodes where the parts touch, "
+        "or leave parts out."
     )
 
 

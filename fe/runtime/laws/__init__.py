@@ -27,10 +27,7 @@ _OWN_LAWS = sorted(PortForce.__subclasses__(), key=lambda law: law.kind)
 def _installed_laws() -> list[type[PortForce]]:
     """Return the laws of installed packages, sorted by kind.
 
-    Raises
-    ------
-    PlugInError
-        If an entry point fails, is not a law, or has the name of another law.
+    Raises `PlugInError` if an entry point fails, is not a law, or has the name of another law.
     """
     laws = []
     own_kinds = [law.kind for law in _OWN_LAWS]
@@ -64,17 +61,17 @@ LAWS = (*_OWN_LAWS, *INSTALLED_LAWS)
 
 
 def functions_by_law(name: str) -> tuple[Callable[..., object], ...]:
-    """Return one function of the interface for each law, by the number of the law."""
+    """Return the function with a name from each law, by the number of the law."""
     return tuple(getattr(law, name) for law in LAWS)
 
 
 def advance(number: int, law: FloatArray, memory: FloatArray, x: float) -> None:
-    """Carry the memory of a law's hysteretic elements to the position `x`, in place.
+    """Update the memory of a law's hysteretic elements to the position `x`, in place.
 
     Parameters
     ----------
     number : int
-        Number of the law in `LAWS`.
+        Index of the law in `LAWS`.
     law : (5 + E,) array
         Parameters of the law, then those of its hysteretic elements.
     memory : (5 + E,) array
@@ -88,24 +85,19 @@ def advance(number: int, law: FloatArray, memory: FloatArray, x: float) -> None:
 def force_and_slope(
     number: int, law: FloatArray, memory: FloatArray, x: float, duration: float
 ) -> tuple[float, float]:
-    """Return the force of a law at a position or speed, and its derivative by that.
+    """Return the force of a law [N or N m], and its derivative by `x`.
 
     Parameters
     ----------
     number : int
-        Number of the law in `LAWS`.
+        Index of the law in `LAWS`.
     law : (5 + E,) array
         Parameters of the law, then those of its hysteretic elements.
     memory : (5 + E,) array
-        Memory of the law; it is not changed.
+        Memory of the law; not changed.
     x : float
-        Position [m or rad] of the law's port, or its speed for a law of speed.
+        Position of the law's port [m or rad].
     duration : float
-        Time since the last position [s].
-
-    Returns
-    -------
-    force, slope : float
-        The force [N or N m] and its derivative.
+        Time since the last position [s], from which a law of speed gets the speed.
     """
     return LAWS[number].force_and_slope(law, memory, x, duration)

@@ -39,7 +39,7 @@ POSITIVE, NOT_NEGATIVE = "be positive", "not be negative"
 
 
 class PortForce(Primitive):
-    """A primitive that is an internal force at a port, given by the parameters of a law."""
+    """A primitive that is an internal force at a port, given by a law."""
 
     can_act_in_windows: ClassVar[bool] = True
     depends_on_speed: ClassVar[bool] = False
@@ -51,7 +51,7 @@ class PortForce(Primitive):
 
     @property
     def proportional(self) -> tuple[str, ...]:
-        """Names of the parameters that scale the force; without the first one there is no force."""
+        """Names of the parameters that scale the force; it is zero if the first is zero."""
         first_number = next(iter(self.units))
         return (first_number,)
 
@@ -59,16 +59,16 @@ class PortForce(Primitive):
         """Return the law with its force multiplied by a factor."""
         changes: dict[str, Any] = {}
         for name in self.proportional:
-            size = getattr(self, name)
-            if isinstance(size, tuple):
-                changes[name] = tuple(factor * force for force in size)
+            value = getattr(self, name)
+            if isinstance(value, tuple):
+                changes[name] = tuple(factor * force for force in value)
             else:
-                changes[name] = factor * size
+                changes[name] = factor * value
         return replace(self, **changes)
 
     @property
     def parameter_row(self) -> FloatArray:
-        """The parameters for `force_and_slope`: the numbers in their order, then zeros."""
+        """The `law` parameters of `force_and_slope`, padded with zeros."""
         numbers = [
             float(getattr(self, name))
             for name, value_type in self.value_types().items()
@@ -82,13 +82,7 @@ class PortForce(Primitive):
         return float(getattr(self, self.proportional[0]))
 
     def check(self) -> None:
-        """Check that each number meets its requirement.
-
-        Raises
-        ------
-        InvalidPatchError
-            If one does not.
-        """
+        """Raise `InvalidPatchError` unless each number meets its requirement."""
         for name, hint in get_annotations(type(self)).items():
             for requirement in getattr(hint, "__metadata__", ())[1:]:
                 self.require(name, getattr(self, name), requirement)
@@ -102,7 +96,7 @@ class PortForce(Primitive):
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
-        """Carry the states of the hysteretic elements from the last position to `x`, in place."""
+        """Update the states of the hysteretic elements to the position `x`, in place."""
 
     @staticmethod
     def force_and_slope(
@@ -110,7 +104,7 @@ class PortForce(Primitive):
     ) -> tuple[float, float]:
         """Return the force at `x` and its derivative by `x`; the memory is not changed.
 
-        For dry friction it is the largest force, with the sign for a forward motion.
+        Dry friction returns its largest force, with the sign for a forward motion.
         """
         return 0.0, 0.0
 

@@ -45,8 +45,8 @@ class PowerStiffness(PortForce):
         if side * x < 0.0 or x == 0.0:
             slope = coefficient / reference if exponent == 1.0 and side == 0.0 else 0.0
             return 0.0, slope
-        size = coefficient * power(abs(x / reference), exponent)
-        return (size if x > 0.0 else -size), exponent * size / abs(x)
+        magnitude = coefficient * power(abs(x / reference), exponent)
+        return (magnitude if x > 0.0 else -magnitude), exponent * magnitude / abs(x)
 
 
 class FreePlay(PortForce):
@@ -138,7 +138,7 @@ class BoucWen(PortForce):
 
 
 def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return z of a Bouc-Wen law at `x`, along the straight path from the last position."""
+    """Return z of a Bouc-Wen law at `x`, reached from the last position in a straight line."""
     yield_displacement = law[1]
     order = law[2]
     # all displacements in units of the yield displacement
@@ -151,17 +151,19 @@ def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> fl
         remaining -= unloaded
     # loading: dz/dx = 1 - |z|^order by the Runge-Kutta method of order four; the last step is short
     if remaining != 0.0:
-        size = abs(z)
+        magnitude = abs(z)
         distance = min(abs(remaining), 2.0 + 40.0 / order)  # beyond it, z = 1 exactly
         while distance > 0.0:
             step = min(distance, LONGEST_STEP / max(order, 1.0))
             distance -= step
-            slope_1 = 1.0 - power(size, order)
-            slope_2 = 1.0 - power(size + 0.5 * step * slope_1, order)
-            slope_3 = 1.0 - power(size + 0.5 * step * slope_2, order)
-            slope_4 = 1.0 - power(size + step * slope_3, order)
-            size = min(size + step / 6.0 * (slope_1 + 2.0 * (slope_2 + slope_3) + slope_4), 1.0)
-        z = size if remaining > 0.0 else -size
+            slope_1 = 1.0 - power(magnitude, order)
+            slope_2 = 1.0 - power(magnitude + 0.5 * step * slope_1, order)
+            slope_3 = 1.0 - power(magnitude + 0.5 * step * slope_2, order)
+            slope_4 = 1.0 - power(magnitude + step * slope_3, order)
+            magnitude = min(
+                magnitude + step / 6.0 * (slope_1 + 2.0 * (slope_2 + slope_3) + slope_4), 1.0
+            )
+        z = magnitude if remaining > 0.0 else -magnitude
     return float(z * yield_displacement)
 
 
@@ -213,7 +215,7 @@ class MicroSlip(PortForce):
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
-        """Stretch the elements from the last position to `x`, each up to its slip, in place."""
+        """Stretch the elements to the position `x`, each up to its slip, in place."""
         for i in range(int(law[1])):
             slip = law[PARAMETERS + i]
             stretch = memory[FIRST_ELEMENT + i] + (x - memory[POSITION])

@@ -1,10 +1,12 @@
 """Laws of speed: F = k |x|^a |v - l|^p sgn(v - l), on both sides of the level l or above it.
 
-Alone at a port of speed s a law gives s' = -strength |s - l|^p sgn(s - l) with the strength w k
-|x|^a, w the inverse mass of the port: its speed after a unit impulse. The functions below solve
-that in closed form. A law may also be a table of forces at speeds, with straight lines in between,
-along which the solution is closed, too. NumPy and relative imports only: this file is copied into
-the FMU.
+If only the law acts, the speed s of its port obeys s' = -strength |s - l|^p sgn(s - l). The
+strength
+is w k |x|^a, where w is the port's inverse mass: its speed after a unit impulse. The functions
+below
+solve this in closed form. A law may also be a table of forces over speeds with linear
+interpolation, which has a closed solution, too. NumPy and relative imports only: this file is
+copied into the FMU.
 """
 
 from typing import Annotated, ClassVar
@@ -27,28 +29,29 @@ def force_of_mean_speed(
 ) -> tuple[float, float]:
     """Return the force of a law of speed at `x`, and its derivative by `x`.
 
-    The speed is the mean speed (x - last position) / duration. For dry friction the force is the
-    largest one, with the sign for a forward motion.
+    The speed is the mean speed since the last position, (x - last position) / duration. Dry
+    friction
+    returns its largest force, with the sign for a forward motion.
     """
     exponent = law[EXPONENT]
     if law[ONE_SIDED] == TABLE:
-        size, slope = table_force_and_slope(law, (x - memory[POSITION]) / duration)
-        return size, slope / duration
-    size = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
+        force, slope = table_force_and_slope(law, (x - memory[POSITION]) / duration)
+        return force, slope / duration
+    force = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
     above_level = (x - memory[POSITION]) / duration - law[LEVEL]
     if law[ONE_SIDED] == 1.0 and above_level <= 0.0:
         return 0.0, 0.0
     if exponent == 0.0:
-        return size, (size * law[POSITION_EXPONENT] / x if x != 0.0 else 0.0)
+        return force, (force * law[POSITION_EXPONENT] / x if x != 0.0 else 0.0)
     if above_level == 0.0:
         if exponent == 1.0:
-            return 0.0, size / duration
+            return 0.0, force / duration
         return 0.0, (1e300 if exponent < 1.0 else 0.0)  # the force rises vertically, or not at all
-    size *= power(abs(above_level), exponent)
-    slope = size * exponent / (duration * abs(above_level))
+    force *= power(abs(above_level), exponent)
+    slope = force * exponent / (duration * abs(above_level))
     if above_level < 0.0:
-        size = -size
-    return size, (slope + size * law[POSITION_EXPONENT] / x if x != 0.0 else slope)
+        force = -force
+    return force, (slope + force * law[POSITION_EXPONENT] / x if x != 0.0 else slope)
 
 
 class PowerDamping(PortForce):
@@ -124,7 +127,7 @@ class TableDamping(TabulatedForce, PortForce):
 
 
 def table_force_and_slope(law: FloatArray, speed: float) -> tuple[float, float]:
-    """Return the force of a table at a speed, and its derivative by the speed."""
+    """Interpolate the force in a table at a speed; return it and its derivative."""
     count = int(law[PARAMETERS])
     speeds = law[PARAMETERS + 1 : PARAMETERS + 1 + count]
     forces = law[PARAMETERS + 1 + count : PARAMETERS + 1 + 2 * count]
@@ -139,7 +142,7 @@ def table_force_and_slope(law: FloatArray, speed: float) -> tuple[float, float]:
 
 
 def table_integral(law: FloatArray, speed: float) -> float:
-    """Return the integral of the force of a table over the speed, from its first point on."""
+    """Return the integral of a table's force over the speed, from its first point on."""
     count = int(law[PARAMETERS])
     speeds = law[PARAMETERS + 1 : PARAMETERS + 1 + count]
     forces = law[PARAMETERS + 1 + count : PARAMETERS + 1 + 2 * count]
@@ -152,9 +155,10 @@ def table_integral(law: FloatArray, speed: float) -> float:
 
 
 def speed_after_table(law: FloatArray, speed: float, strength: float, duration: float) -> float:
-    """Return the speed of a port after the force of a table has acted on it alone.
+    """Return the speed of a port on which only the force of a table has acted.
 
-    Along each straight line of the table the speed follows an exponential function. Where the force
+    Along each linear piece of the table the speed is an exponential function of time. Where the
+    force
     is zero, the speed stays.
 
     Parameters
@@ -205,12 +209,12 @@ def speed_after_table(law: FloatArray, speed: float, strength: float, duration: 
 
 
 def can_hold(law: FloatArray) -> bool:
-    """Return whether the force can bring a port to rest in finite time, and hold it there."""
+    """Return whether the force can stop a port in finite time and hold it."""
     return bool(law[EXPONENT] < 1.0 and law[ONE_SIDED] == 0.0)
 
 
 def is_dry_friction(law: FloatArray) -> bool:
-    """Return whether the size of the force does not depend on the speed."""
+    """Return whether the magnitude of the force is independent of the speed."""
     return bool(law[EXPONENT] == 0.0)
 
 
@@ -220,24 +224,24 @@ def strength(law: FloatArray, x: float, inverse_mass: float) -> float:
 
 
 def steady_force(law: FloatArray, x: float, speed: float) -> float:
-    """Return the force at a position and a speed."""
+    """Return the force of a law at a position and a speed."""
     if law[ONE_SIDED] == TABLE:
         return float(table_force_and_slope(law, speed)[0])
     above_level = speed - law[LEVEL]
     if above_level == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0):
         return 0.0
-    size = (
+    magnitude = (
         law[COEFFICIENT]
         * power(abs(x), law[POSITION_EXPONENT])
         * power(abs(above_level), law[EXPONENT])
     )
-    return float(size if above_level > 0.0 else -size)
+    return float(magnitude if above_level > 0.0 else -magnitude)
 
 
 def speed_after(
     law: FloatArray, speed: float, strength: float, duration: float, passes_zero: bool
 ) -> float:
-    """Return the speed of a port after the law has acted on it alone for a duration [s].
+    """Return the speed of a port on which only the law has acted for a duration [s].
 
     With the level l and the exponent p of the law, the speed s obeys s' = -strength |s - l|^p
     sgn(s - l), which has a closed solution for each exponent. With `passes_zero`, dry friction
@@ -247,26 +251,26 @@ def speed_after(
         return speed_after_table(law, speed, strength, duration)
     exponent = law[EXPONENT]
     above_level = speed - law[LEVEL]
-    size = abs(above_level)
+    distance = abs(above_level)
     impulse = strength * duration
-    is_inactive = size == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0)
+    is_inactive = distance == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0)
     # The power of a tiny speed would overflow; its change is negligible.
-    if is_inactive or (exponent > 1.0 and size < 1e-60):
+    if is_inactive or (exponent > 1.0 and distance < 1e-60):
         return speed
     if exponent == 0.0:
-        size = size - impulse if passes_zero else max(size - impulse, 0.0)
+        distance = distance - impulse if passes_zero else max(distance - impulse, 0.0)
     elif exponent == 1.0:
-        size *= np.exp(-impulse)
+        distance *= np.exp(-impulse)
     elif exponent == 2.0:
-        size /= 1.0 + impulse * size
+        distance /= 1.0 + impulse * distance
     else:
-        base = size ** (1.0 - exponent) - (1.0 - exponent) * impulse
-        size = base ** (1.0 / (1.0 - exponent)) if base > 0.0 else 0.0
-    return float(law[LEVEL] + size if above_level > 0.0 else law[LEVEL] - size)
+        base = distance ** (1.0 - exponent) - (1.0 - exponent) * impulse
+        distance = base ** (1.0 / (1.0 - exponent)) if base > 0.0 else 0.0
+    return float(law[LEVEL] + distance if above_level > 0.0 else law[LEVEL] - distance)
 
 
 def holding_limit(law: FloatArray, strength: float, duration: float) -> float:
-    """Return the largest speed that a law which `can_hold` brings to rest within `duration` [s]."""
+    """Return the largest speed that a law which `can_hold` stops within `duration` [s]."""
     one_minus_exponent = 1.0 - law[EXPONENT]
     return power(one_minus_exponent * strength * duration, 1.0 / one_minus_exponent)
 
@@ -321,27 +325,32 @@ def reversal_correction(
     low = 0.0
     high = 1.0
     for _ in range(40):
-        u = 0.5 * (low + high)
-        if sign * (begin + u * (linear + u * (square + u * cubic))) > 0.0:
-            low = u
+        fraction = 0.5 * (low + high)
+        if sign * (begin + fraction * (linear + fraction * (square + fraction * cubic))) > 0.0:
+            low = fraction
         else:
-            high = u
-    u = 0.5 * (low + high)
-    slope = (linear + u * (2.0 * square + 3.0 * u * cubic)) / duration
+            high = fraction
+    fraction = 0.5 * (low + high)
+    slope = (linear + fraction * (2.0 * square + 3.0 * fraction * cubic)) / duration
     deceleration = max(-sign * slope, 0.0)
     # acceleration towards the other side, without friction
     free_acceleration = -sign * (slope + 2.0 * speed_lost / duration)
     limit = holding_limit(law, strength, 0.5 * duration)
     if free_acceleration <= 0.0 or 0.5 * duration * free_acceleration <= limit:
         distance = (
-            duration * u * (begin + u * (linear / 2.0 + u * (square / 3.0 + u * cubic / 4.0)))
+            duration
+            * fraction
+            * (
+                begin
+                + fraction * (linear / 2.0 + fraction * (square / 3.0 + fraction * cubic / 4.0))
+            )
         )
         if power_plus_one == 1.0:
             distance -= sign * strength * duration * duration / 12.0
         return 0.0, distance, 1.0
     # impulses and first moment of friction before and after the reversal
-    time_before = u * duration
-    time_after = (1.0 - u) * duration
+    time_before = fraction * duration
+    time_after = (1.0 - fraction) * duration
     impulse_before = (
         -sign
         * strength
@@ -356,8 +365,8 @@ def reversal_correction(
         * time_after**power_plus_one
         / power_plus_one
     )
-    arm_before = time_after + time_before * power_plus_one / (power_plus_one + 1.0)
-    moment = impulse_before * arm_before - impulse_after * time_after / (power_plus_one + 1.0)
+    lever_arm = time_after + time_before * power_plus_one / (power_plus_one + 1.0)
+    moment = impulse_before * lever_arm - impulse_after * time_after / (power_plus_one + 1.0)
     if power_plus_one == 1.0:
         # Half impulses at both ends of a step shift the position by force h^2 / 12. The shift is
         # undone when the force ends, but here the next force begins, of the other sign.

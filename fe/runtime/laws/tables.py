@@ -1,4 +1,4 @@
-"""Laws given by tables, and the spring among them: a force at each of some displacements.
+"""Laws given by tables: a force at each of some displacements or speeds.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -11,11 +11,11 @@ from ..errors import InvalidPatchError
 from .interface import PARAMETERS, FloatArray, PortForce
 
 LEAST_DIVISOR = 1e-300
-"""In place of the largest force of a table of zeros."""
+"""Divisor instead of the largest force if that is zero."""
 
 
 class TabulatedForce:
-    """What laws by tables have in common: `forces`, of which each stands at a rising position."""
+    """The common part of laws by tables: `forces`, one at each of ascending positions."""
 
     kind: ClassVar[str]
     forces: tuple[float, ...]
@@ -32,18 +32,13 @@ class TabulatedForce:
 
     @property
     def relative_forces(self) -> FloatArray:
-        """The forces over the largest one; zeros if there is no force."""
+        """The forces divided by the largest one; zeros if all are zero."""
         return np.array(self.forces) / max(self.magnitude, LEAST_DIVISOR)
 
     def check_positions(self, name: str, positions: tuple[float, ...]) -> None:
-        """Raise `InvalidPatchError` unless there are two positions or more, in rising order.
+        """Raise `InvalidPatchError` unless there are two or more points in ascending order.
 
-        Parameters
-        ----------
-        name : str
-            Name of the positions, for the message.
-        positions : tuple of float
-            The displacements or speeds of the table.
+        `name` is the name of the displacements or speeds, for the message.
         """
         count = len(positions)
         if count < 2 or len(self.forces) != count or np.any(np.diff(positions) <= 0.0):
@@ -102,5 +97,5 @@ class TableStiffness(TabulatedForce, PortForce):
         square = 3.0 * secant - 2.0 * slope - slopes[left + 1]
         cubic = slope + slopes[left + 1] - 2.0 * secant
         force = forces[left] + width * u * (slope + u * (square + u * cubic))
-        slope_here = slope + u * (2.0 * square + 3.0 * u * cubic)
-        return largest_force * force, largest_force * slope_here
+        slope_at_x = slope + u * (2.0 * square + 3.0 * u * cubic)
+        return largest_force * force, largest_force * slope_at_x
