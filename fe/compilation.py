@@ -1,4 +1,4 @@
-"""Numerical loops compiled by numba, with the machine code kept on disk between processes.
+"""Compile numerical loops by numba, and keep the machine code on disk.
 
 Without numba (extra `uav-twin[fast]`) the same functions run as plain Python.
 """
@@ -62,27 +62,28 @@ def compiled(
     *,
     reorders_sums: bool = False,
 ) -> Callable[Parameters, Result]:
-    """Return a function that numba compiles at the first call, and that runs without Python's lock.
+    """Return a function that numba compiles at the first call, and that releases the GIL.
 
-    The first time in a process that something is compiled, or runs as plain Python, the user gets a
-    note.
+    The first time in a process that something is compiled, or runs as plain Python, a note is
+    printed.
 
     The machine code is kept in the folder `NUMBA_CACHE_DIR`, else beside the function's file, else
-    in the folder of what is kept between runs, under a hash of the sources. If none can be written,
-    the function is compiled anew in every process.
+    in the cache folder, under a hash of the sources. If none is writable, the function is compiled
+    anew
+    in every process.
 
     Parameters
     ----------
     function : callable
-        The function, in the subset of Python that numba knows.
+        In the subset of Python that numba knows.
     calls : iterable of callable
-        Plain functions of other files that it calls: numba by itself sees changes of its own file
-        only. The files of compiled functions that its module names, and of those that their
+        Plain functions of other files that it calls, since numba itself detects changes of its own
+        file only. The files of compiled functions that its module names, and of those that their
         modules name, are found without them.
     reorders_sums : bool
-        Whether the compiler may add in another order than the one that is written, which vector
-        instructions need. Results then repeat to the last bit on one processor; between
-        processors, and from plain Python, they differ by rounding errors.
+        Whether the compiler may reorder sums, which vector instructions need. Results then repeat
+        to the last bit on one processor; between processors, and from plain Python, they differ by
+        rounding errors.
     """
     if numba is None:
         return _plain_with_note(function)
@@ -113,12 +114,12 @@ def _compiled_callees(function: NumericalFunction) -> list[NumericalFunction]:
 def compiled_with_reordered_sums(
     function: Callable[Parameters, Result],
 ) -> Callable[Parameters, Result]:
-    """Return what `compiled` returns, where the compiler may reorder sums: as a decorator."""
+    """Compile a function as `compiled` does, with reordered sums; a decorator."""
     return compiled(function, reorders_sums=True)
 
 
 def _plain_with_note(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Return a function as plain Python that tells once that numba is missing."""
+    """Return a plain Python function that once prints that numba is missing."""
     with_silent_divisions = np.errstate(all="ignore")(function)
 
     @functools.wraps(function)
@@ -178,12 +179,9 @@ if numba is not None:
 
 @contextmanager
 def _cache_named_by_sources(functions: Sequence[NumericalFunction]) -> Iterator[None]:
-    """Set numba's cache folder, meanwhile, to one that is named by the content of source files.
+    """Set numba's cache folder, within the context, to one named by a hash of source files.
 
-    Parameters
-    ----------
-    functions : sequence of callable
-        Functions of the source files, the compiled function first.
+    The sources are those of the functions, of which the compiled one comes first.
     """
     digest = hashlib.sha256()
     files = [inspect.getfile(function) for function in functions]
@@ -221,17 +219,17 @@ def callable_when_compiled(
     makes_arrays: bool = True,
     inline: bool = False,
 ) -> _Function:
-    """Let compiled functions call a plain one; return the function, which stays plain itself.
+    """Let compiled functions call a plain one; return the function, which stays plain.
 
     Parameters
     ----------
     function : callable
-        The function, in the subset of Python that numba knows.
+        In the subset of Python that numba knows.
     makes_arrays : bool
-        If neither the function nor what it calls makes an array, numba need not count the
-        references to arrays that are handed on, which takes longer than a short function itself.
+        If neither the function nor what it calls makes an array, numba need not count references to
+        arrays, which takes longer than a short function itself.
     inline : bool
-        Whether the function becomes part of its callers.
+        Whether the function is inlined into its callers.
     """
     if numba is not None:
         register_jitable(**OPTIONS, _nrt=makes_arrays, forceinline=inline)(function)
@@ -239,14 +237,14 @@ def callable_when_compiled(
 
 
 def _functions_of(module: ModuleType) -> list[NumericalFunction]:
-    """Return the functions that a module defines itself."""
+    """Return the functions that a module itself defines."""
     functions = [function for _, function in inspect.getmembers(module, inspect.isfunction)]
     return [function for function in functions if function.__module__ == module.__name__]
 
 
 @functools.cache
 def law_functions() -> tuple[NumericalFunction, ...]:
-    """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
+    """Return the functions of `fe.runtime.laws`, and let compiled functions call them."""
     from fe.runtime import laws  # most compiled functions know no laws
 
     implementations = {
@@ -270,17 +268,11 @@ def law_functions() -> tuple[NumericalFunction, ...]:
 def _choose_when_compiled(
     choice: NumericalFunction, functions: tuple[NumericalFunction, ...]
 ) -> None:
-    """Let compiled functions call `choice(number, ...)`, which calls one of several functions.
+    """Let compiled functions call `choice(number, ...)`, which calls `functions[number]`.
 
-    The function is written out as source text with one line for each number: a chain of functions
-    would be compiled link by link.
-
-    Parameters
-    ----------
-    choice : callable
-        The plain function whose first argument is a number.
-    functions : tuple of callable
-        The function that it calls for each number from 0 on.
+    The choice is generated as source text with one line for each number: a chain of functions would
+    be
+    compiled link by link.
     """
     namespace: dict[str, object] = {}
     for number, function in enumerate(functions):
@@ -302,9 +294,9 @@ def _choose_when_compiled(
 
 @functools.cache
 def compiled_kernel() -> "Kernel":
-    """Return the compiled loops for the argument `kernel` of `advance` and `static_solution`.
+    """Return the compiled loops, for `integrate_motion` and `static_solution`.
 
-    The functions of `fe.runtime` stay plain; compiled functions can call them from then on.
+    The functions of `fe.runtime` stay plain, but compiled functions can call them from then on.
     """
     from fe.runtime import dry_friction, motion_arrays, motion_kernel, static_path
     from fe.runtime.motion import Kernel

@@ -13,7 +13,7 @@ from fe.runtime.patch import HighPass
 from fe.runtime.sensors import SensorRecord, levels_before_record
 
 _ASYMPTOTIC_FROM = 700.0
-"""Above this u the asymptotic series of 1F1 is used: exp(-u) is nothing beside powers of u."""
+"""Above this u the asymptotic series of 1F1 is used: exp(-u) is negligible beside powers of u."""
 
 _ASYMPTOTIC_TERMS = 10
 """Terms of the series, which is then exact to rounding."""
@@ -25,16 +25,14 @@ _UNEVEN_SAMPLING = 2e-3
 def filtered_record(
     high_pass_filter: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the channels of a record, and their rates, after a high-pass filter.
+    """Apply a high-pass filter to the channels of a record and to their rates.
 
-    The filter needs an even grid of times; the channels are interpolated to one and back.
+    The filter needs evenly spaced times; the channels are interpolated to such a grid and back.
 
     Parameters
     ----------
-    high_pass_filter : HighPass
-        The filter: order and time constant.
     record : SensorRecord
-        The times of the record.
+        Its times and channels, and whether it was settled, are used.
     signal, slope : (N, C) array
         The channels before the filter, and their rates [1/s].
 
@@ -75,7 +73,7 @@ def filtered_record(
 
 
 def _interpolated(times: FloatArray, known_times: FloatArray, values: FloatArray) -> FloatArray:
-    """Return columns (N, C) at new times, by linear interpolation between the known times."""
+    """Interpolate columns (N, C) linearly at new times."""
     columns = [np.interp(times, known_times, column) for column in values.T]
     return np.stack(columns, axis=1)
 
@@ -156,26 +154,18 @@ class _Responses(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _filter_responses(count: int, ratio: float, order: float) -> _Responses:
-    """Return the responses of a filter at `count` samples; the ratio is the interval over tau."""
+    """Return the responses of a filter at `count` samples; `ratio` is the interval over tau."""
     u: FloatArray = ratio * np.arange(count + 1, dtype=np.float64)
     integral = u * _confluent(order, 2, u)
     return _Responses(step=_confluent(order, 1, u[:-1]), increment=np.diff(integral) / ratio)
 
 
 def _confluent(order: float, second: int, u: FloatArray) -> FloatArray:
-    """Return the confluent hypergeometric function 1F1(order; second; -u).
+    """Return the confluent hypergeometric function 1F1(order; second; -u) for u (N,) >= 0.
 
-    For large u by its asymptotic series, Abramowitz and Stegun 1964, 13.5.1: SciPy's function is
+    For large u its asymptotic series is used, Abramowitz and Stegun 1964, 13.5.1: SciPy's function
+    is
     infinite from about u = 1418 on.
-
-    Parameters
-    ----------
-    order : float
-        The first parameter.
-    second : {1, 2}
-        The second parameter.
-    u : (N,) array
-        The negative argument, from 0 on.
     """
     exact = hyp1f1(order, second, -np.minimum(u, _ASYMPTOTIC_FROM))
     large_u = np.maximum(u, _ASYMPTOTIC_FROM)

@@ -1,4 +1,4 @@
-"""Cells of one kind between nodes: element arrays and their sums.
+"""Element arrays of cells of one kind, and their sums.
 
 Element arrays are contracted for many cells at once, an order of magnitude faster than one bilinear
 form after the other. Strains are in the order of `fe.elements.elasticity`.
@@ -19,7 +19,7 @@ from .elasticity import VOIGT
 from .kinds import HEXAHEDRA_20, ElementKind, Rule
 
 BATCH = 512
-"""Cells whose arrays are contracted at once."""
+"""Number of cells whose arrays are contracted at once."""
 AXES = 3
 STRAINS = len(VOIGT)
 _MOST_FACE_CORNERS = 4
@@ -27,21 +27,14 @@ _SUMMED_ENTRIES = 4_000_000  # entries of element arrays that are summed at once
 
 
 def jacobians(kind: ElementKind, nodes: FloatArray, local_positions: FloatArray) -> FloatArray:
-    """Return the Jacobians dx_i/dX_j of cells.
+    """Return the Jacobians dx_i/dX_j (n, q, 3, 3) of cells.
 
     Parameters
     ----------
-    kind : ElementKind
-        The kind of the cells, with k nodes.
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
     local_positions : (q, 3) array
-        Local positions.
-
-    Returns
-    -------
-    (n, q, 3, 3) array
-        The Jacobians.
+        Positions in the reference cell.
     """
     _, local_gradients = kind.shape_functions(local_positions)
     return np.asarray(np.einsum("nai,qaj->nqij", nodes, local_gradients, optimize=True))
@@ -50,16 +43,14 @@ def jacobians(kind: ElementKind, nodes: FloatArray, local_positions: FloatArray)
 def gradients(
     kind: ElementKind, nodes: FloatArray, local_positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gradients of the shape functions in space, and the Jacobian determinants.
+    """Return the spatial gradients of the shape functions, and the Jacobian determinants.
 
     Parameters
     ----------
-    kind : ElementKind
-        The kind of the cells, with k nodes.
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
     local_positions : (q, 3) array
-        Local positions.
+        Positions in the reference cell.
 
     Returns
     -------
@@ -77,17 +68,9 @@ def gradients(
 
 
 def strain_matrix(gradients: FloatArray) -> FloatArray:
-    """Return the strain matrix B of shape functions; the unknowns of a node are consecutive.
+    """Return the strain matrix B (..., 6, 3 k) [1/m] from gradients (..., k, 3) [1/m].
 
-    Parameters
-    ----------
-    gradients : (..., k, 3) array
-        Gradients of the shape functions [1/m].
-
-    Returns
-    -------
-    (..., 6, 3 k) array
-        The strains per nodal displacement [1/m].
+    The three displacements of a node are consecutive columns.
     """
     *points_shape, node_count, _ = gradients.shape
     B = np.zeros((*points_shape, STRAINS, node_count, AXES))
@@ -104,7 +87,7 @@ def stiffness_blocks(
     elasticity: FloatArray,
     factor: FloatArray | float = 1.0,
 ) -> FloatArray:
-    """Return the element stiffness of cells.
+    """Return the element stiffness matrices of cells.
 
     Parameters
     ----------
@@ -113,14 +96,14 @@ def stiffness_blocks(
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
     elasticity : (6, 6) or (n, 6, 6) array
-        Elasticity in space [Pa].
+        Elasticity in global axes [Pa].
     factor : (n, q) array, optional
         Factor on the elasticity at the points of the stiffness rule.
 
     Returns
     -------
     (n, 3 k, 3 k) array
-        The element stiffness [N/m].
+        The matrices [N/m].
     """
     rule = kind.stiffness_rule
     spatial_gradients, determinant = gradients(kind, nodes, rule.points)
@@ -140,23 +123,21 @@ def stiffness_blocks(
 
 
 def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: Rule) -> FloatArray:
-    """Return the element mass of one component of the displacement.
+    """Return the element mass matrices of cells for one displacement component.
 
     Parameters
     ----------
-    kind : ElementKind
-        The kind of the cells, with k nodes.
     nodes : (n, k, 3) array
         Positions of the nodes of each cell [m].
     density : (n,) array
         Density of each cell [kg/m^3].
     rule : Rule
-        The points and weights of the integration in the reference cell.
+        The integration rule in the reference cell.
 
     Returns
     -------
     (n, k, k) array
-        The element mass [kg].
+        The matrices [kg].
     """
     values, _ = kind.shape_functions(rule.points)
     jacobian = jacobians(kind, nodes, rule.points)
@@ -168,14 +149,14 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
 
 
 class OuterFaces(NamedTuple):
-    """The m faces that belong to one cell alone.
+    """The m faces that belong to one cell only.
 
     Attributes
     ----------
     cell : (m,) array of int
         The cell of each face.
     number : (m,) array of int
-        The number of the face in its cell.
+        The index of the face in its cell.
     corners : (m, 4) array of int
         The corner nodes, ascending; the first one of a triangle is -1.
     """
@@ -191,12 +172,10 @@ class CellMesh:
 
     Attributes
     ----------
-    kind : ElementKind
-        The kind of the cells, with k nodes.
     points : (nn, 3) array
         Positions of the nodes [m].
     cells : (nc, k) array of int
-        Nodes of each cell, by their numbers in `points`.
+        Nodes of each cell, by their index in `points`.
     """
 
     kind: ElementKind
@@ -205,7 +184,7 @@ class CellMesh:
 
     @property
     def unknowns(self) -> int:
-        """Number of displacements; that of a node along an axis has the number 3 node + axis."""
+        """Number of displacements; that of a node along an axis has the index 3 node + axis."""
         return AXES * len(self.points)
 
     @cached_property
@@ -225,7 +204,7 @@ class CellMesh:
 
     @cached_property
     def outer_faces(self) -> OuterFaces:
-        """The faces that belong to one cell alone."""
+        """The faces that belong to one cell only."""
         faces = []
         for face in self.kind.faces:
             corners_of_cells = self.cells[:, list(face)]
@@ -267,19 +246,16 @@ class CellMesh:
     def strains(
         self, displacement: FloatArray, local_positions: FloatArray | None = None
     ) -> FloatArray:
-        """Return the strains of all cells.
+        """Return the strains (nc, q, 6) of all cells: xx, yy, zz, yz, xz, xy.
+
+        Shear strains are engineering strains.
 
         Parameters
         ----------
         displacement : (nn, 3) array
             Displacements of all nodes [m].
         local_positions : (q, 3) array, optional
-            Local positions in the cells; by default their centre.
-
-        Returns
-        -------
-        (nc, q, 6) array
-            Strains xx, yy, zz, yz, xz, xy, with engineering shear strains.
+            Positions in the reference cell; by default its centre.
         """
         if local_positions is None:
             local_positions = self.kind.centre[np.newaxis]
@@ -296,29 +272,25 @@ class CellMesh:
         local_positions: FloatArray,
         direction: FloatArray,
     ) -> sparse.csr_array:
-        """Return the matrix that maps nodal displacements to weighted sums of normal strains.
+        """Return the matrix (rows, 3 nn) from displacements to sums of normal strains.
 
         The strain at a point in the direction d is d . grad(u . d): the sum over the nodes a of a
-        cell of (grad N_a . d) (d . u_a), with the gradients in space dN_a/dX dX/dx.
+        cell of (grad N_a . d) (d . u_a), with the spatial gradients dN_a/dX dX/dx.
 
         Parameters
         ----------
         row : (p,) array of int
-            The row of the result that each of p strains is added to; all rows from 0 to the
-            largest one occur.
+            The row of the result to which each of p strains is added; all rows from 0 to the
+            largest
+            one occur.
         weight : (p,) array
             The weight of each strain in the sum.
         cells : (p,) array of int
             The cell that contains each point.
         local_positions : (p, 3) array
-            The local position of each point in its cell.
+            The position of each point in the reference cell.
         direction : (p, 3) array
             The direction of each normal strain, a unit vector.
-
-        Returns
-        -------
-        csr (rows, 3 nn)
-            The sums per displacement [1/m].
         """
         _, local_gradients = self.kind.shape_functions(local_positions)
         jacobians_at_points = self.jacobians_at(cells, local_positions)
@@ -341,21 +313,14 @@ class CellMesh:
     def stiffness(
         self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
     ) -> sparse.csr_array:
-        """Return the stiffness of some cells on all unknowns.
+        """Return the stiffness (3 nn, 3 nn) [N/m] of cells (n,), on all unknowns.
 
         Parameters
         ----------
-        cells : (n,) array of int
-            The numbers of the cells.
         elasticity : (6, 6) or (n, 6, 6) array
-            Elasticity in space [Pa].
+            Elasticity in global axes [Pa].
         factor : (n, q) array, optional
             Factor on the elasticity at the points of the stiffness rule.
-
-        Returns
-        -------
-        csr (3 nn, 3 nn)
-            The stiffness [N/m].
         """
         point_count = len(self.kind.stiffness_rule.weights)
         elasticities = np.broadcast_to(elasticity, (len(cells), STRAINS, STRAINS))
@@ -370,21 +335,14 @@ class CellMesh:
     def mass(
         self, cells: IntArray, density: ArrayLike, rule: Rule | None = None
     ) -> sparse.csr_array:
-        """Return the mass matrix of some cells for one component of the displacement.
+        """Return the mass matrix (nn, nn) [kg] of cells (n,), for one displacement component.
 
         Parameters
         ----------
-        cells : (n,) array of int
-            The numbers of the cells.
         density : (n,) array or float
             The density of the cells [kg/m^3].
         rule : Rule, optional
             Integration rule; by default the mass rule of the kind.
-
-        Returns
-        -------
-        csr (nn, nn)
-            The mass [kg].
         """
         densities = np.broadcast_to(density, len(cells))
         mass_rule = rule or self.kind.mass_rule
@@ -398,21 +356,9 @@ class CellMesh:
     def _assembled(
         self, cells: IntArray, blocks: Callable[[slice], FloatArray], components: int
     ) -> sparse.csr_array:
-        """Return the sparse sum of element matrices, in batches that limit the memory.
+        """Assemble element matrices of cells (n,), in batches that limit the memory.
 
-        Parameters
-        ----------
-        cells : (n,) array of int
-            The numbers of the cells.
-        blocks : callable
-            Returns the element matrices of a slice of the cells.
-        components : int
-            Number of unknowns of a node, 1 or 3.
-
-        Returns
-        -------
-        csr (components nn, components nn)
-            The assembled matrix.
+        `blocks` returns the element matrices of a slice of the cells; a node has 1 or 3 components.
         """
         size = components * len(self.points)
         total = sparse.csr_array((size, size))
@@ -440,7 +386,9 @@ class CellMesh:
 
 
 def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:
-    """Return 20-node hexahedra with straight edges.
+    """Return a mesh of 20-node hexahedra with straight edges.
+
+    The mid-edge nodes follow the vertices.
 
     Parameters
     ----------
@@ -448,11 +396,6 @@ def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:
         Positions of the vertices [m].
     cells : (nc, 8) array of int
         Vertices of each cell.
-
-    Returns
-    -------
-    CellMesh
-        The mesh; the mid-edge nodes follow the vertices.
     """
     ends_in_cell = np.array(HEXAHEDRA_20.edges)
     edge_ends = np.sort(cells[:, ends_in_cell], axis=2)

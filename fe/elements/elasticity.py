@@ -1,4 +1,4 @@
-"""Compliance and elasticity of materials, and their axes.
+"""Compliance and elasticity of materials in their axes and in global axes.
 
 Strains are in Voigt order 11, 22, 33, 23, 13, 12 with engineering shear strains.
 """
@@ -25,7 +25,7 @@ _VOIGT_NUMBER = np.array(
 def orthotropic_compliance(
     moduli: ArrayLike, ratios: ArrayLike, shear_moduli: ArrayLike
 ) -> FloatArray:
-    """Return the compliance of an orthotropic material in its axes.
+    """Return the compliance (6, 6) [1/Pa] of an orthotropic material in its axes.
 
     Parameters
     ----------
@@ -35,11 +35,6 @@ def orthotropic_compliance(
         Poisson's ratios 12, 13, 23; ratio ij is the contraction along j under tension along i.
     shear_moduli : (3,) array or float
         Shear moduli 12, 13, 23 [Pa].
-
-    Returns
-    -------
-    (6, 6) array
-        The compliance [1/Pa].
     """
     young = np.broadcast_to(moduli, 3)
     # The shear moduli are 12, 13, 23, and Voigt order is 23, 13, 12.
@@ -61,23 +56,15 @@ def isotropic_compliance(young_modulus: float, poisson_ratio: float) -> FloatArr
 
 
 def unit_vector(vectors: ArrayLike) -> FloatArray:
-    """Return vectors (..., 3) of length one along vectors (..., 3)."""
+    """Scale vectors (..., 3) to length one."""
     values = np.asarray(vectors, dtype=np.float64)
     return np.asarray(values / np.linalg.norm(values, axis=-1, keepdims=True))
 
 
 def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """Return orthonormal axes from two vectors that span a plane.
+    """Return orthonormal axes (3, 3) from two vectors (3,) that span a plane.
 
-    Parameters
-    ----------
-    first, second : (3,) array
-        The vectors.
-
-    Returns
-    -------
-    (3, 3) array
-        Rows: along the first vector, at right angles to it in the plane, normal to the plane.
+    The rows are: along the first vector, at right angles to it in the plane, normal to the plane.
     """
     along = np.asarray(first, dtype=np.float64)
     in_plane = np.asarray(second, dtype=np.float64)
@@ -87,19 +74,9 @@ def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 
 def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
-    """Return elasticity in space from elasticity in local axes.
+    """Rotate elasticities (n, 6, 6) [Pa] from local to global axes.
 
-    Parameters
-    ----------
-    elasticity : (n, 6, 6) array
-        Elasticity in the local axes [Pa].
-    axes : (n, 3, 3) array
-        The local axes, as rows.
-
-    Returns
-    -------
-    (n, 6, 6) array
-        Elasticity in space [Pa].
+    The local axes (n, 3, 3) are given as rows.
     """
     first_pair = _VOIGT_NUMBER[:, :, np.newaxis, np.newaxis]
     tensor = elasticity[:, first_pair, _VOIGT_NUMBER]

@@ -1,10 +1,10 @@
 """Kinds of finite elements: nodes, faces, shape functions, integration.
 
 Shape functions are the polynomials of scikit-fem's elements of the same name, evaluated at many
-points at once. Nodes stand in the order of the mesh file, which is that of VTK and, for these
-kinds, of Abaqus and CalculiX. All kinds are isoparametric: the mid-edge nodes of a file bend the
-edges and faces. Stiffness is integrated as CalculiX integrates C3D4, C3D8, C3D10 and C3D20. Mass is
-integrated exactly on straight cells, while CalculiX integrates it at the points of the stiffness.
+points at once. The order of nodes is that of the mesh file, VTK and, for these kinds, Abaqus and
+CalculiX. All kinds are isoparametric: the mid-edge nodes of a file bend the edges and faces.
+Stiffness is integrated as CalculiX integrates C3D4, C3D8, C3D10 and C3D20. Mass is integrated
+exactly on straight cells, while CalculiX integrates it at the points of the stiffness.
 """
 
 import itertools
@@ -134,15 +134,7 @@ _PRISMATIC_QUADRATIC = tuple((i, j, k) for i, j, k in _POWERS if i + j + k // 2 
 
 
 def gauss_points(order: int, dimensions: int = 3) -> Rule:
-    """Return the tensor-product Gauss rule on the unit cube.
-
-    Parameters
-    ----------
-    order : int
-        The number of points along each axis.
-    dimensions : int
-        The dimensions of the cube.
-    """
+    """Return the tensor-product Gauss rule on the unit cube, `order` points along each axis."""
     roots, root_weights = np.polynomial.legendre.leggauss(order)
     line_points = 0.5 * (roots + 1.0)
     line_weights = 0.5 * root_weights
@@ -153,7 +145,7 @@ def gauss_points(order: int, dimensions: int = 3) -> Rule:
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
-    """Return scikit-fem's rule on a simplex, exact for polynomials of an order."""
+    """Return scikit-fem's rule on a simplex that is exact for polynomials of an order."""
     points, weights = get_quadrature(cell, order)
     return Rule(np.ascontiguousarray(points.T), np.asarray(weights))
 
@@ -172,12 +164,9 @@ def _wedge_rule(triangle_order: int, line_order: int) -> Rule:
 def _powers_and_slopes(
     coordinate: FloatArray, exponents: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return powers of a coordinate (q,) with exponents (k,) of at most two, and their derivatives.
+    """Return powers (q, k) of a coordinate (q,), and their derivatives.
 
-    Returns
-    -------
-    powers, slopes : (q, k) array
-        The powers and their derivatives by the coordinate.
+    The exponents (k,) are at most two.
     """
     zero = np.zeros_like(coordinate)
     one = np.ones_like(coordinate)
@@ -261,7 +250,7 @@ class ElementKind:
         return tuple(nodes_of_faces)
 
     def _mid_edge_nodes(self, face: tuple[int, ...]) -> list[int]:
-        """Return the mid-edge nodes of a face with the given corners."""
+        """Return the mid-edge nodes of the face with some corners."""
         corners_of_face = set(face)
         nodes = []
         for node, edge in enumerate(self.edges, start=len(self.corners)):
@@ -288,19 +277,14 @@ class ElementKind:
         return np.asarray((distance <= tolerance).all(axis=1))
 
     def shape_functions(self, local_positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Evaluate the shape functions.
-
-        Parameters
-        ----------
-        local_positions : (q, 3) array
-            Local positions.
+        """Evaluate the shape functions at positions (q, 3) in the reference cell.
 
         Returns
         -------
         values : (q, k) array
             Values of the shape functions.
         gradients : (q, k, 3) array
-            The gradients of the shape functions by the local coordinates.
+            Their gradients by the local coordinates.
         """
         # the monomials x^i y^j z^k are products of a power of each coordinate
         coordinates = np.transpose(local_positions)
@@ -426,7 +410,7 @@ The names of meshio are of cells only, not of their integration.
 
 
 def meshio_with_wedges() -> ModuleType:
-    """Return meshio, where 15-node wedges have three dimensions, which version 5.3 forgets."""
+    """Return meshio with the dimension of 15-node wedges, which version 5.3 lacks."""
     import meshio
     from meshio._mesh import topological_dimension
 

@@ -39,7 +39,7 @@ class Cuts(NamedTuple):
     side : (n,) array of bool
         The side of the separator on which any other vertex lies.
     is_cut : (parts,) array of bool
-        Whether a part was cut; the others are too closely connected.
+        Whether a part was cut; the others have no cut with balanced halves.
     """
 
     separator: BoolArray
@@ -48,15 +48,16 @@ class Cuts(NamedTuple):
 
 
 def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
-    """Find for each part of a graph the cut into two halves that costs least.
+    """Find for each part of a graph the cheapest cut into two halves.
 
-    A cut is made at a value of one coordinate of the vertices. The values at which a part is tried
-    leave fixed fractions of its weight on either side.
+    A part is cut at a value of one coordinate of its vertices. The values that are tried leave
+    fixed
+    fractions of its weight on either side.
 
     Parameters
     ----------
     part : (n,) array of int
-        Number of the part of each vertex.
+        Index of the part of each vertex.
     weight : (n,) array
         Weight of each vertex.
     edges : (2, m) array of int
@@ -99,21 +100,12 @@ def _cut_costs(
     on_cut: BoolArray,
     is_above: BoolArray,
 ) -> FloatArray:
-    """Return the cost of a cut of each part, infinite if its halves are too uneven.
+    """Return the cost (parts,) of a cut of each part, infinite if its halves are too uneven.
 
-    Parameters
-    ----------
-    part, weight : (n,) array
-        Part and weight of each vertex.
-    total : (parts,) array
-        Weight of each part.
-    on_cut, is_above : (n,) array of bool
-        Whether a vertex is on the cut, and on which side of it.
-
-    Returns
-    -------
-    (parts,) array
-        The weight of the separator, increased if the halves are uneven.
+    The cost is the weight of the separator, increased if the halves are uneven. `on_cut` and
+    `is_above`
+    (n,) say whether a vertex is on the cut, and on which side of it; `total` is the weight of each
+    part.
     """
     in_upper_half = is_above & ~on_cut
     separator_weight = np.bincount(part, weights=weight * on_cut)
@@ -128,7 +120,7 @@ def _cut_costs(
 
 
 def _coordinates(part: IntArray, edges: IntArray) -> list[FloatArray]:
-    """Return coordinates (n,) of the vertices, at values of which parts may be cut.
+    """Return the coordinates (n,) of the vertices along which parts may be cut.
 
     Each part has two distant ends. The coordinates of a vertex are the difference of its distances
     from the two ends, and each distance by itself, counted in edges.
@@ -246,16 +238,9 @@ def _heavy_parts(parts: _Parts, weight: FloatArray, leaf_weight: float) -> _Part
 
 
 def _halves(parts: _Parts, cuts: Cuts, position: IntArray) -> _Parts:
-    """Return the halves of the parts that were cut, and set the positions of their vertices.
+    """Return the halves of the parts that were cut, and set the block of each vertex.
 
-    Parameters
-    ----------
-    parts : _Parts
-        The parts.
-    cuts : Cuts
-        The cuts of the parts.
-    position : (n,) array of int
-        The first position of the block of each vertex; changed in place.
+    The blocks are set in `position` (n,), in place.
     """
     # each part that was cut becomes three blocks: two halves (0 and 1) and a separator (2)
     in_cut_part = cuts.is_cut[parts.part]

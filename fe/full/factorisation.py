@@ -1,4 +1,4 @@
-"""Sparse Cholesky factors by the multifrontal method; solutions and modes by them.
+"""Sparse Cholesky factors by the multifrontal method, and solutions and modes from them.
 
 The unknowns are eliminated front by front, see `fe.full.fronts`. A front is a small dense matrix,
 which LAPACK factorises. The Schur complement of its pivots, on its boundary, is added to a
@@ -43,14 +43,9 @@ Thin cells make the condition number about 1e10, so that double precision reache
 def _analysed_pattern(
     size: int, row_starts: bytes, columns: bytes
 ) -> tuple[IntArray, tuple[Front, ...]]:
-    """Analyse the pattern of a matrix; cached, since damage changes only the values of a matrix.
+    """Analyse the pattern of a matrix; cached, since damage changes only the values.
 
-    Parameters
-    ----------
-    size : int
-        The number of rows.
-    row_starts, columns : bytes
-        The arrays `indptr` and `indices` of a csr array, of int32.
+    The pattern is given by the bytes of `indptr` and `indices` of a csr array, of int32.
     """
     indptr = np.frombuffer(row_starts, dtype=np.int32)
     indices = np.frombuffer(columns, dtype=np.int32)
@@ -102,11 +97,6 @@ class Factorisation:
     stiffness : sparse (n, n)
         The matrix X. Only one half is factorised; the whole is kept for residuals.
 
-    Attributes
-    ----------
-    stiffness : csr (n, n)
-        The matrix X.
-
     Raises
     ------
     SolutionError
@@ -141,7 +131,7 @@ class Factorisation:
         )
 
     def _eliminate(self) -> None:
-        """Factorise front by front, and hand each Schur complement to the parent front."""
+        """Factorise front by front, and pass each Schur complement to the parent front."""
         size = self.stiffness.shape[0]
         position = np.empty(size, dtype=np.int64)
         position[self._order] = np.arange(size)
@@ -173,7 +163,7 @@ class Factorisation:
             self._factors.append(_FrontFactor(lower, below))
 
     def _factorise_pivots(self, front: Front, pivot_block: FloatArray) -> FloatArray:
-        """Return the Cholesky factor (p, p) of the pivots of a front; overwrites their block."""
+        """Return the Cholesky factor (p, p) of a front's pivots; their block is overwritten."""
         lower, failed = lapack.dpotrf(
             pivot_block.T,
             lower=1,
@@ -187,21 +177,13 @@ class Factorisation:
         return np.asarray(lower)
 
     def riesz(self, right_hand_side: FloatArray) -> FloatArray:
-        """Return the Riesz representative X^-1 f (n,) or (n, k), its residual unchecked."""
+        """Return X^-1 f for f (n,) or (n, k), without checking the residual."""
         return self.unwhitened(self.whitened(right_hand_side))
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
-        """Return loads in whitened coordinates, in which their length is the dual norm.
+        """Return L^-1 f for loads f (n,) or (n, k), in the order of elimination.
 
-        Parameters
-        ----------
-        right_hand_side : (n,) or (n, k) array
-            The loads f.
-
-        Returns
-        -------
-        (n,) or (n, k) array
-            L^-1 f in the order of elimination.
+        In these coordinates the length of a load is its dual norm.
         """
         ordered_loads = right_hand_side[self._order]
         solution = np.array(ordered_loads, dtype=np.float64, order="C")
@@ -215,18 +197,7 @@ class Factorisation:
         return solution
 
     def unwhitened(self, whitened: FloatArray) -> FloatArray:
-        """Return displacements from whitened coordinates.
-
-        Parameters
-        ----------
-        whitened : (n,) or (n, k) array
-            Whitened coordinates y in the order of elimination.
-
-        Returns
-        -------
-        (n,) or (n, k) array
-            L'^-1 y in the order of the unknowns.
-        """
+        """Return the displacements L'^-1 y for whitened coordinates y (n,) or (n, k)."""
         ordered_values = np.array(whitened, dtype=np.float64, order="C")
         values = ordered_values.reshape(len(ordered_values), -1)
         last_fronts_first = self._fronts[::-1]
@@ -248,11 +219,6 @@ class Factorisation:
         ----------
         right_hand_side : (n,) or (n, k) array
             The loads f.
-
-        Returns
-        -------
-        (n,) or (n, k) array
-            The solution u.
 
         Raises
         ------
@@ -279,7 +245,7 @@ class Factorisation:
         return solution
 
     def backward_error(self, solution: FloatArray, right_hand_side: FloatArray) -> float:
-        """Return the backward error max|b - K u| / (|K| max|u| + max|b|), zero for a zero load."""
+        """Return max|b - K u| / (|K| max|u| + max|b|), or max|b - K u| if the divisor is zero."""
         largest_row = float(norm(self.stiffness, np.inf))
         largest_load = float(np.abs(right_hand_side).max())
         largest_displacement = float(np.abs(solution).max())
@@ -296,17 +262,9 @@ def _assembled_pivot_rows(
 ) -> FloatArray:
     """Return the rows (p, p + b) of a front's pivots, from the diagonal to the right.
 
-    Parameters
-    ----------
-    front : Front
-        The front, of p pivots and b boundary positions.
-    rows : csr (n, n)
-        The matrix, its rows in the order of elimination.
-    columns : (nnz,) array of int
-        The position of the column of each entry.
-    row_in_front : (n,) array of int
-        The number of each position in the front, which counts its rows and its columns. Only the
-        entries at positions of the front are used.
+    The rows of the matrix (n, n) are in the order of elimination; `columns` (nnz,) are the
+    positions of
+    its columns, and `row_in_front` (n,) the indices of positions in the front.
     """
     pivots = front.end - front.start
     pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))
@@ -322,19 +280,9 @@ def _assembled_pivot_rows(
 
 
 def _below_pivots(lower: FloatArray, coupling: FloatArray) -> FloatArray:
-    """Return the rows below the pivots in a Cholesky factor: B with B L' = A.
+    """Return the rows B (b, p) below the pivots in a Cholesky factor, with B L' = A.
 
-    Parameters
-    ----------
-    lower : (p, p) array
-        The factor L of the pivots, in its lower triangle.
-    coupling : (p, b) array
-        The coupling A' of the pivots with the boundary; it is overwritten.
-
-    Returns
-    -------
-    (b, p) array
-        The rows B.
+    `lower` is L, `coupling` is A' (p, b), which is overwritten.
     """
     below = blas.dtrsm(
         1.0,
@@ -349,19 +297,10 @@ def _below_pivots(lower: FloatArray, coupling: FloatArray) -> FloatArray:
 
 
 def _schur_complement(remaining: FloatArray, below: FloatArray) -> FloatArray:
-    """Return the Schur complement S - B B' on the boundary of a front, right of its diagonal.
+    """Return the Schur complement S - B B' on a front's boundary, right of its diagonal.
 
-    Parameters
-    ----------
-    remaining : (b, b) array
-        The block S of the boundary before the elimination; it is overwritten.
-    below : (b, p) array
-        The rows B of the boundary in the Cholesky factor.
-
-    Returns
-    -------
-    (b, b) array
-        The complement.
+    `remaining` is the block S (b, b) before the elimination, which is overwritten; `below` is B (b,
+    p).
     """
     complement = blas.dsyrk(
         -1.0,
@@ -411,21 +350,16 @@ def _extend_add(
 
 
 def most_compliant_modes(load: FloatArray, squares: FloatArray, shapes: FloatArray) -> IntArray:
-    """Find the two modes that contribute most to the compliance under a load.
+    """Return the indices of the two modes that add most to the compliance under a load.
 
     Parameters
     ----------
     load : (n,) array
-        The load [N] whose compliance ranks the modes.
+        The load [N].
     squares : (m,) array
         Squared angular frequencies [rad^2/s^2].
     shapes : (n, m) array
         Mass-normalised shapes.
-
-    Returns
-    -------
-    (2,) array of int
-        Numbers of the modes, ascending.
     """
     modal_force = load @ shapes
     compliance = modal_force**2 / squares

@@ -1,7 +1,7 @@
 """Symbolic analysis of a sparse matrix: the order of elimination, and the fronts.
 
-A front is a small dense matrix of two kinds of unknowns: those that a leaf or separator of a nested
-dissection holds (its pivots), and those that the pivots are coupled to later (its boundary).
+A front is a small dense matrix of two kinds of unknowns: those of a leaf or separator of a nested
+dissection (its pivots), and later unknowns to which the pivots are coupled (its boundary).
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from fe.runtime.arrays import IntArray
 from .dissection import elimination_blocks
 
 LEAF_UNKNOWNS = 120
-"""Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
+"""Largest number of unknowns in a part of the mesh that is eliminated as one dense front."""
 
 
 class Front(NamedTuple):
@@ -26,9 +26,9 @@ class Front(NamedTuple):
     start, end : int
         The pivots are at positions start to end - 1.
     boundary : (b,) array of int
-        Later positions that the pivots are coupled to, ascending.
+        Later positions to which the pivots are coupled, ascending.
     parent : int
-        Number of the front that receives the Schur complement; -1 if the boundary is empty.
+        Index of the front that receives the Schur complement; -1 if the boundary is empty.
     """
 
     start: int
@@ -81,15 +81,11 @@ def analyse(matrix: sparse.csr_array) -> tuple[IntArray, tuple[Front, ...]]:
 def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]:
     """Group the unknowns that are coupled to the same unknowns.
 
-    Rows are compared by the sum of random 64-bit keys of their columns. If two different rows ever
-    had the same sum, the order of elimination would still be valid, only less efficient.
-
-    Returns
-    -------
-    representatives : (g,) array of int
-        The first unknown of each group.
-    group : (n,) array of int
-        The group of each unknown.
+    Returns the first unknown of each group, and the group (n,) of each unknown. Rows are compared
+    by the
+    sum of random 64-bit keys of their columns. If two different rows ever had the same sum, the
+    order
+    of elimination would still be valid, only less efficient.
     """
     random_numbers = np.random.default_rng(1973)
     column_keys = random_numbers.integers(2**63, size=matrix.shape[0], dtype=np.int64)
@@ -107,16 +103,10 @@ def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]
 def _fronts_of_groups(
     graph: sparse.csr_array, position: IntArray, starts: IntArray
 ) -> Iterator[Front]:
-    """Yield the fronts in positions of the groups of unknowns.
+    """Yield the fronts in positions of groups of unknowns.
 
-    Parameters
-    ----------
-    graph : csr (g, g)
-        The graph of groups, its rows in the order of elimination.
-    position : (g,) array of int
-        The position of each group.
-    starts : (f,) array of int
-        The first position of each front.
+    The rows of the graph (g, g) are in the order of elimination; `position` (g,) is the position of
+    each group, `starts` (f,) the first position of each front.
     """
     ends = np.append(starts[1:], graph.shape[0])
     front_numbers = np.arange(len(starts))
@@ -144,14 +134,7 @@ def _fronts_of_groups(
 def _positions_of_unknowns(groups: IntArray, sizes: IntArray, offsets: IntArray) -> IntArray:
     """Return the positions of all unknowns of some groups.
 
-    Parameters
-    ----------
-    groups : (b,) array of int
-        Positions of the groups.
-    sizes : (g,) array of int
-        The number of unknowns of each group.
-    offsets : (g + 1,) array of int
-        The position of the first unknown of each group.
+    `sizes` and `offsets` are the number of unknowns and the first unknown of each group.
     """
     counts = sizes[groups]
     counts_before = np.cumsum(counts) - counts

@@ -1,6 +1,6 @@
 """Bases that are orthonormal in the energy norm of a stiffness X = L L', and nearby solutions.
 
-Everything is held in whitened coordinates, in which X is the identity: a displacement u as L' u, a
+All vectors are in whitened coordinates, in which X is the identity: a displacement u as L' u, a
 load f as L^-1 f. Both are equal if u = X^-1 f. The energy norm of a displacement, and the dual norm
 of a load, is then the Euclidean length. Orthogonality in these coordinates suffers from the square
 root of the condition number of X, about 1e5, and not from the condition number itself.
@@ -19,27 +19,15 @@ from fe.runtime.errors import SolutionError
 from .factorisation import Factorisation
 
 MOST_ITERATIONS = 100
-"""Limit of conjugate gradients."""
+"""Largest number of iterations of conjugate gradients."""
 
 
 def affine_product(
     terms: Sequence[sparse.csr_array], coefficients: FloatArray, vectors: FloatArray
 ) -> FloatArray:
-    """Return the product of an affine sum of sparse terms with vectors.
+    """Return the product (n, k) of an affine sum of sparse terms with vectors (n, k).
 
-    Parameters
-    ----------
-    terms : sequence of csr (n, n)
-        The T terms.
-    coefficients : (T,) or (T, k) array
-        A coefficient for each term, or for each term and each vector.
-    vectors : (n, k) array
-        The vectors.
-
-    Returns
-    -------
-    (n, k) array
-        The products.
+    `coefficients` are (T,), one for each term, or (T, k), one for each term and vector.
     """
     total: FloatArray = np.zeros_like(vectors)
     for term, coefficient in zip(terms, coefficients, strict=True):
@@ -71,22 +59,17 @@ def solve_near(
     Parameters
     ----------
     factors : Factorisation
-        The factors of a matrix to which all systems are spectrally equivalent.
+        The preconditioner: a matrix to which all systems are spectrally equivalent.
     terms : sequence of csr (n, n)
         The T terms of the systems.
     coefficients : (T, k) array
         The coefficients of the terms, a column for each system.
     right_hand_sides : (n, k) array
-        The right-hand sides.
+        A column for each system.
     start : (n, k) array
         The starting values.
     tolerance : float
-        The largest residual, relative to the right-hand side.
-
-    Returns
-    -------
-    (n, k) array
-        The solutions.
+        The largest residual, relative to the right-hand sides.
 
     Raises
     ------
@@ -120,12 +103,10 @@ def solve_near(
 
 
 class OrthonormalBasis:
-    """A growing orthonormal basis.
+    """A growing orthonormal basis of vectors of length `size`.
 
     Parameters
     ----------
-    size : int
-        The length n of the vectors.
     drop : float
         A direction is dropped if it is shorter than this fraction of every vector of its block.
 
@@ -134,7 +115,7 @@ class OrthonormalBasis:
     vectors : (n, k) array
         The basis.
     dropped_square : float
-        A bound of the sum of squared lengths of all that was dropped.
+        A bound of the sum of squared lengths of all dropped components.
     """
 
     def __init__(self, size: int, *, drop: float) -> None:
@@ -212,12 +193,7 @@ class ProjectedBasis(OrthonormalBasis):
         self._mass_terms = mass_terms
 
     def add(self, block: FloatArray) -> FloatArray:
-        """Add vectors to the basis, and project the terms on the new basis vectors.
-
-        Parameters
-        ----------
-        block : (n, m) array
-            The vectors, in whitened coordinates.
+        """Add whitened vectors (n, m) to the basis, and project the terms on the new ones.
 
         Returns
         -------
@@ -236,7 +212,7 @@ class ProjectedBasis(OrthonormalBasis):
         return images
 
     def _extended_projection(self, projected: FloatArray, images: FloatArray) -> FloatArray:
-        """Return the terms on the extended basis, from those on the previous one and new images."""
+        """Extend projected terms by the new basis vectors, given their images."""
         previous_count = projected.shape[1]
         new_columns = self.displacements.T @ images
         coupling = new_columns[:, :previous_count]

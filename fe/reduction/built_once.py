@@ -1,4 +1,4 @@
-"""Results that are built once and kept in files: one process builds, the others wait for it."""
+"""Build a result once and keep it in a file; other processes wait for the one that builds it."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -29,9 +29,9 @@ def built_once(
     build: Callable[[], Result],
     keep: Callable[[Result], object],
 ) -> Result:
-    """Return the result stored in a file, or build it and write the file.
+    """Load a result from its file, or build it and write the file.
 
-    Of several processes that need the same result one builds it, and the others wait.
+    If several processes need the same result, one builds it and the others wait.
 
     Parameters
     ----------
@@ -43,11 +43,6 @@ def built_once(
     keep : callable
         Writes the result to the file. If it raises `FileNotWrittenError`, a warning is logged and
         the result is returned all the same.
-
-    Returns
-    -------
-    Result
-        The result that was read or built.
     """
     with suppress(OSError):  # the file is missing or cannot be read
         try:
@@ -71,7 +66,7 @@ def built_once(
 
 @contextmanager
 def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
-    """Hold a lock while a result is built; without a writable folder nothing is locked."""
+    """Hold a lock while a result is built; if the folder is not writable, do not lock."""
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         descriptor = open_descriptor(lock_file, os.O_RDWR | os.O_CREAT, 0o644)
@@ -86,7 +81,7 @@ def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
 
 
 def _acquire_lock(descriptor: int, result_file: Path) -> None:
-    """Acquire a lock that ends with this process; log a warning while another process holds it."""
+    """Acquire a lock that ends with this process; log a warning if another process holds it."""
     try:
         lock_descriptor(descriptor, wait=False)
     except BlockingIOError:

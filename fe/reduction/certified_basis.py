@@ -1,4 +1,4 @@
-"""The static part of a reduced model: a greedy search with a certified error bound.
+"""The static part of a reduced model, by a greedy search with a certified error bound.
 
 `docs/explanation/reduced_model.md` describes the method and its accuracy. Displacements and loads
 are whitened, see `fe.full.subspace`.
@@ -27,10 +27,10 @@ from .terms import ReductionTerms, State
 STATES_PER_ROUND = 4
 """Full solutions in a round of the search, and states whose modes are refined together."""
 SEARCH_MARGIN = 0.5
-"""The search goes on to this fraction of the tolerance, so that the basis can be compressed."""
+"""The search continues to this fraction of the tolerance, so that the basis can be compressed."""
 INSPECTED_ONE_OF = 6
-"""In each round the bound is evaluated at one of this many training states, those with the largest
-latest bounds; in the last round at all states."""
+"""In each round the bound is evaluated at one in this many training states, those with the largest
+previous bounds; in the last round at all states."""
 SOLUTION_TOLERANCE = 1e-6
 """Relative residual of full solutions."""
 FIRST_SOLUTION_TOLERANCE = 1e-10
@@ -44,7 +44,7 @@ RESIDUAL_ROUNDING = 1e-7
 BASIS_DROP = 1e-7
 """Directions shorter than this fraction of the solutions of their round are dropped."""
 RESIDUAL_DROP = 1e-8
-"""The same for the images of the basis under the stiffness terms, which span the residuals."""
+"""The same for images of the basis vectors under the stiffness terms, which span the residuals."""
 LEAST_SINGULAR_VALUE = 1e-7
 """Singular directions below this fraction of the largest singular value are not used."""
 
@@ -52,14 +52,14 @@ LEAST_SINGULAR_VALUE = 1e-7
 def fewest_directions(
     snapshots: FloatArray, least: int, is_accurate: Callable[[FloatArray], bool]
 ) -> FloatArray:
-    """Return the fewest singular directions of snapshots that are accurate.
+    """Return the fewest leading singular directions of snapshots that are accurate.
 
-    The search bisects: accuracy is taken to improve with the number of directions.
+    The search bisects, so accuracy has to improve with the number of directions.
 
     Parameters
     ----------
     snapshots : (N, S) array
-        The snapshots; their lengths do not count.
+        The snapshots, which are scaled to unit length.
     least : int
         The least number of directions.
     is_accurate : callable
@@ -83,7 +83,7 @@ def fewest_directions(
 
 
 class _ResidualFactors(NamedTuple):
-    """Loads and images of the basis in an orthonormal basis of R residuals.
+    """Loads and images of the basis vectors in an orthonormal basis of R residuals.
 
     Attributes
     ----------
@@ -101,14 +101,14 @@ class _ResidualFactors(NamedTuple):
 
 
 class StaticReduction:
-    """The greedy search: bases that the full solutions span, and the reduced model on them.
+    """The greedy search, its bases, and the reduced model on them.
 
     Parameters
     ----------
     terms : ReductionTerms
         The full model, with n free unknowns.
     design_fields : DesignFields
-        The fields of the reduced model that no basis changes.
+        The fields of the reduced model that do not depend on a basis.
     modal : ModalReduction
         The modal basis of the structure.
     stage : Stage
@@ -154,7 +154,7 @@ class StaticReduction:
         Returns
         -------
         bool
-            Whether the basis has grown; if not, rounding is reached.
+            Whether the basis has grown. If not, the new solutions differ by rounding only.
         """
         thetas = [self.terms.theta(state) for state in states]
         solutions = self._solve_full(thetas)
@@ -169,7 +169,7 @@ class StaticReduction:
         return True
 
     def _solve_full(self, thetas: list[FloatArray]) -> FloatArray:
-        """Return the full solutions for L loads at S coefficient vectors: an (n, S L) array."""
+        """Return the full solutions (n, S L) for L loads and S coefficient vectors."""
         count = self.loads.shape[1]
         # Solutions for the basis may be rough, since residuals bound the errors; only the first
         # ones, which measure rounding, must be accurate.
@@ -202,7 +202,7 @@ class StaticReduction:
         self.residual_stiffness = np.concatenate((previous_stiffness, new_stiffness), axis=2)
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
-        """Return the Galerkin solutions (n, L) in the present basis at coefficients (T,)."""
+        """Return the Galerkin solutions (n, L) in the present basis for coefficients (T,)."""
         basis = self.basis.vectors
         stiffness = np.tensordot(theta, self.basis.stiffness, 1)
         return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.loads))
@@ -254,16 +254,13 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return the loads and the stiffness terms that form the residuals, with few coordinates.
+        """Return the loads and stiffness terms that form the residuals, in few coordinates.
 
         A residual of the reduced model is the load minus the stiffness times the displacement. All
-        residuals lie in the span of the loads and of the images of the basis under the terms of the
-        stiffness; the factors are coordinates in an orthonormal basis of this span.
-
-        Parameters
-        ----------
-        directions : (N, K) array
-            Combinations of the N basis vectors that span the reduced model.
+        residuals lie in the span of the loads and of the images of the basis under the stiffness
+        terms;
+        the factors are coordinates in an orthonormal basis of this span. The reduced model uses the
+        combinations `directions` (N, K) of the basis vectors.
         """
         # Images of the K basis vectors under each term of the stiffness
         images = self.residual_stiffness @ directions
@@ -314,19 +311,19 @@ class StaticReduction:
         return float(dropped) + RESIDUAL_ROUNDING
 
     def responses(self, model: ReducedModel, state: State) -> list[ReducedResponse]:
-        """Return the responses of a reduced model at a state to each load alone."""
+        """Return the responses of a reduced model in a state to each load alone."""
         values = model.nominal.copy()
         values[: len(state)] = state
         unit_loads = np.eye(len(self.terms.load_factors))
         return [model.static_response(values, load=load) for load in unit_loads]
 
     def bound(self, model: ReducedModel, state: State) -> float:
-        """Return the certified relative bound of a reduced model at a state.
+        """Return the certified relative error bound of a reduced model in a state.
 
         The result is the largest bound of all loads. The bound of a load is relative to the largest
         strain or displacement under the load, or to `least_outputs` if that is larger.
         """
-        worst = 0.0
+        largest_bound = 0.0
         for number, response in enumerate(self.responses(model, state)):
             groups = [
                 (outputs, bound) for outputs, bound in response.outputs_with_bounds if outputs.size
@@ -334,11 +331,11 @@ class StaticReduction:
             least_outputs = self.least_outputs[:, number]
             for (outputs, bound), least in zip(groups, least_outputs, strict=True):
                 largest = max(float(np.abs(outputs).max()), least)
-                worst = max(worst, bound / largest)
-        return worst
+                largest_bound = max(largest_bound, bound / largest)
+        return largest_bound
 
     def search(self, settings: StructureSettings) -> tuple[float, ...]:
-        """Run the weak greedy search with the certified bound as its surrogate.
+        """Run the weak greedy search, with the certified bound as surrogate of the error.
 
         Parameters
         ----------
@@ -383,23 +380,10 @@ class StaticReduction:
     def _training_bounds(
         self, states: list[State], latest: FloatArray, target: float, *, inspect_all: bool
     ) -> FloatArray:
-        """Evaluate the bounds of the present model, first at the states with the largest ones.
+        """Return the bounds (B,) of the present model; zero for states not evaluated.
 
-        Parameters
-        ----------
-        states : list of State
-            The B training states.
-        latest : (B,) array
-            The latest bound of each state; updated for the states that are evaluated.
-        target : float
-            The evaluation stops early only if a bound is larger than this.
-        inspect_all : bool
-            Evaluate all states.
-
-        Returns
-        -------
-        (B,) array
-            The bounds; zero for states that were not evaluated.
+        States are evaluated in the order of their `latest` bounds (B,), which are updated. Unless
+        `inspect_all` is set, the evaluation may stop once a bound exceeds `target`.
         """
         model = self.model()
         bounds = np.zeros(len(states))
@@ -425,7 +409,7 @@ class StaticReduction:
         )
 
     def compressed(self, tolerance: float) -> FloatArray:
-        """Return as few combinations (N, K) of the basis as keep the bound within a tolerance."""
+        """Return the fewest combinations (N, K) of the basis with a bound within a tolerance."""
         model = self.model()
         states = self.terms.training_states()
         coordinates: list[FloatArray] = []
@@ -440,7 +424,7 @@ class StaticReduction:
 
 
 def _most_central(states: list[State]) -> State:
-    """Return the state closest to the mean of all states, at which the search begins."""
+    """Return the state closest to the mean of all states, where the search begins."""
     points = np.array(states)
     from_mean = points - points.mean(axis=0)
     squared_distance = (from_mean**2).sum(axis=1)
@@ -449,7 +433,10 @@ def _most_central(states: list[State]) -> State:
 
 
 def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
-    """Return the states for the next full solutions: with large bounds, and far from each other.
+    """Choose the states of the next full solutions: with large bounds, and far from each other.
+
+    The first is the state with the largest bound. Each further state has the largest product of its
+    bound and its distance from the nearest chosen state, and a bound above `least`.
 
     Parameters
     ----------
@@ -460,13 +447,7 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
     count : int
         The largest number of states.
     least : float
-        A state after the first is taken only if its bound is larger than this.
-
-    Returns
-    -------
-    list of State
-        First the state with the largest bound. Each further state has the largest product of its
-        bound and its distance from the nearest state chosen before.
+        Bound below which further states are not chosen.
     """
     # Distances are relative to the range of each input; one without a range counts as constant.
     ranges = np.ptp(states, axis=0)

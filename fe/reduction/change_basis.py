@@ -1,13 +1,14 @@
-"""From a structure and its reduced model to one whose supports, mass and stiffness may change.
+"""Extend the reduced model of a structure by columns for changes of supports, mass and stiffness.
 
 A support that yields moves the structure by the unit responses to its motions: the displacements of
 the structure when one motion of a support is prescribed and all else is held. They are added to the
 basis of the reduced model (the constraint modes of Craig and Bampton 1968, AIAA Journal 6 (7),
-1313-1319), with the static responses to their inertia. A change of the stiffness of the structure
-changes them, so that they are computed at several states.
+1313-1319), with the static responses to their inertia. They depend on the stiffness of the
+structure, so they are computed in several states.
 
-A mass at a place needs the static responses to forces there, and a loss of stiffness of a patch
-what it changes of the solutions under loads, under outputs as loads, and of the modes.
+For a point mass, the static responses to forces at its location are added. For a loss of stiffness
+of a patch, the changes of the solutions under loads, of those under outputs as loads, and of the
+modes are added.
 """
 
 from dataclasses import fields
@@ -39,22 +40,21 @@ from .reduced_basis import Reduction
 from .terms import ReductionTerms, cube_corners
 
 LEAST_REMAINDER = 1e-4
-"""Length outside the basis, relative to that of the vector, below which a direction is left out."""
+"""Norm outside the basis, relative to that of the vector, below which a direction is left out."""
 SAME_DIRECTION = 1e-7
-"""Directions of the structure's own bases below this relative length are left out."""
+"""Relative norm below which directions of the structure's own bases are left out."""
 SOLUTION_TOLERANCE = 1e-7
-"""Relative residual of solutions at other states, and of those with losses that errors are measured
-by."""
+"""Relative residual of solutions in other states, and of full solutions for measuring errors."""
 SNAPSHOT_TOLERANCE = 1e-5
-"""Relative residual of solutions with losses that the basis is made of."""
+"""Relative residual of solutions with losses from which the basis is made."""
 MOST_STATES = 8
-"""Number of states at which unit responses are computed, beside the middle one."""
+"""Number of states in which unit responses are computed, in addition to the central one."""
 INERTIA_RESPONSES = 1
-"""Static responses to inertia: to that of the unit response, to that of this response, and on."""
+"""Number of static responses to inertia: of the unit response, then of the previous one."""
 LARGE_LOSSES = (0.45, 0.7)
-"""Losses of stiffness of patches at which solutions are computed."""
+"""Losses of patches for which solutions are computed."""
 LEAST_LOSS_REMAINDER = 1e-3
-"""The same for changes of solutions by a loss of stiffness, relative to the solutions."""
+"""The same as `LEAST_REMAINDER` for changes of solutions by a loss, relative to the solutions."""
 MASS_RANGE = (0.01, 0.5)
 """Range of masses in which the errors are measured: the largest relative gain of a modal mass."""
 LOSS_RANGE = (0.05, 0.7)
@@ -65,7 +65,7 @@ under a load or in a mode."""
 
 
 def with_changes(yielding: AffineStructure, reduction: Reduction) -> ChangeableModel:
-    """Return the reduced model with the columns that its changes need.
+    """Extend a reduced model by the columns that changes of the structure need.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class _Columns:
     yielding : AffineStructure
         The structure whose supports yield.
     reduction : Reduction
-        The reduction of the same structure with its n unknowns, supports held.
+        The reduction of the same structure with its supports held, with n unknowns.
     """
 
     def __init__(self, yielding: AffineStructure, reduction: Reduction) -> None:
@@ -126,7 +126,7 @@ class _Columns:
         self.mass_places = mass_places(yielding)
         self.loss_places = loss_places(yielding)
         self.load_changes = load_changes(yielding)
-        # the responses to forces beside their place, or in another direction
+        # the responses to forces at another point, or in another direction
         forces = np.array([change.vector[: self.free] for change in self.load_changes])
         responses = self.factors.whitened(forces.reshape(-1, self.free).T)
         self._add_remainders(0, responses / np.linalg.norm(responses, axis=0))
@@ -136,7 +136,7 @@ class _Columns:
         return self.factors.whitened(self.factors.stiffness @ displacements)
 
     def add_motion(self, motion: SupportMotion) -> None:
-        """Add the columns of a motion of a support: unit responses, and responses to inertia."""
+        """Add the columns of a support motion: unit responses, and responses to their inertia."""
         number = 1 + self.structure.support_motions.index(motion)
         is_held = motion.spring == 0.0
         unit_response = self._unit_responses(motion, self.held_terms.reference[np.newaxis])
@@ -156,20 +156,15 @@ class _Columns:
             inertia_force = free_mass @ snapshots[-1]
         directions = [self._whitened(snapshot) for snapshot in snapshots]
         directions = [vector / np.linalg.norm(vector) for vector in directions]
-        # a change of the unit response counts by its part of the unit response
+        # a change of the unit response is relative to the unit response
         scale = np.linalg.norm(self._whitened(unit_response))
         block = np.concatenate((*directions, self._whitened(others) / scale), axis=1)
         self._add_remainders(number, block)
 
     def refine(self, model: ChangeableModel, number: int) -> None:
-        """Add the modes of the full model under one change, by a step of inverse iteration.
+        """Add the modes of the full model under one change, after a step of inverse iteration.
 
-        Parameters
-        ----------
-        model : ChangeableModel
-            The model on the present columns.
-        number : int
-            Number of the change, counted from zero.
+        `number` counts the changes from zero.
         """
         for case in self._cases(model, number):
             modes = case.full_solution(case.mass @ self._shapes(case.structure))
@@ -183,29 +178,29 @@ class _Columns:
     def _add_remainders(
         self, number: int, block: FloatArray, least: float = LEAST_REMAINDER
     ) -> None:
-        """Add to the columns of a change what whitened vectors (n, k) have outside its columns.
+        """Add the components of whitened vectors (n, k) outside a change's columns to these.
 
-        Directions shorter than `least` are left out.
+        Directions with a norm below `least` are left out.
         """
-        known = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
-        known.vectors = self.base.vectors
+        own_basis = OrthonormalBasis(self.free, drop=SAME_DIRECTION)
+        own_basis.vectors = self.base.vectors
         for owned, owner in zip(self.blocks, self.owners, strict=True):
             free_part = owned[: self.free]
             is_lift = owned[self.free :].any()
             if owner[:1].tolist() == [number] and not is_lift and owned.shape[1]:
-                known.extend(self._whitened(free_part))
+                own_basis.extend(self._whitened(free_part))
         for _ in range(2):
-            block = block - known.vectors @ (known.vectors.T @ block)
+            block = block - own_basis.vectors @ (own_basis.vectors.T @ block)
         # singular directions by the method of snapshots
         squares, vectors = np.linalg.eigh(block.T @ block)
         is_kept = squares > least**2
         directions = block @ (vectors[:, is_kept] / np.sqrt(squares[is_kept]))
-        kept = self.factors.unwhitened(directions)
-        self.blocks.append(np.pad(kept, ((0, self.structure.unknowns - self.free), (0, 0))))
-        self.owners.append(np.full(kept.shape[1], number, dtype=np.int64))
+        columns = self.factors.unwhitened(directions)
+        self.blocks.append(np.pad(columns, ((0, self.structure.unknowns - self.free), (0, 0))))
+        self.owners.append(np.full(columns.shape[1], number, dtype=np.int64))
 
     def _shapes(self, structure: ChangedStructure) -> FloatArray:
-        """Return the mode shapes of a structure on all unknowns (n', M)."""
+        """Return the mode shapes (n', M) of a structure on all unknowns."""
         shapes = structure.basis @ structure.mode_shapes
         count = len(shapes)
         return np.asarray(np.concatenate(self.blocks, axis=1)[:, :count] @ shapes)
@@ -217,7 +212,7 @@ class _Columns:
         return np.array([self.held_terms.theta(state) for state in states])
 
     def _unit_responses(self, motion: SupportMotion, thetas: FloatArray) -> FloatArray:
-        """Return displacements (n, B) per unit motion, or force against a spring, at B states."""
+        """Return displacements (n, B) per unit motion, or force against a spring, in B states."""
         if motion.spring > 0.0:
             unit_force = np.zeros((self.free, 1))
             unit_force[motion.unknown] = 1.0
@@ -242,7 +237,7 @@ class _Columns:
         return self.factors.unwhitened(solutions)
 
     def model(self) -> ChangeableModel:
-        """Return the model on all columns, its errors not measured yet."""
+        """Return the model on all columns; its errors are not measured yet."""
         columns = np.concatenate(self.blocks, axis=1)
         terms = self.terms
         # a load that acts on held nodes alone is none of the reduced model
@@ -301,7 +296,7 @@ class _Columns:
         )
 
     def add_mass(self, place: MassCandidate) -> None:
-        """Add the columns of a mass at a place: the static responses to forces there."""
+        """Add the columns of a point mass: the static responses to forces at its location."""
         number = self._first_mass + self.mass_places.index(place)
         forces = place.rows[:, : self.free].toarray().T
         block = self.factors.whitened(forces)
@@ -310,7 +305,7 @@ class _Columns:
         self._add_remainders(number, block / np.linalg.norm(block, axis=0))
 
     def add_loss(self, patch: LossCandidate) -> None:
-        """Add the columns of a loss of stiffness: what it changes of solutions and modes."""
+        """Add the columns of a loss of stiffness: the changes of solutions and modes."""
         number = self._first_loss + self.loss_places.index(patch)
         forces = self._forces_of_snapshots
         snapshots = self.factors.riesz(forces)
@@ -349,9 +344,10 @@ class _Columns:
         start: FloatArray,
         tolerance: float = SNAPSHOT_TOLERANCE,
     ) -> FloatArray:
-        """Return the solutions (n, k) of the structure, supports held, with a loss of a patch.
+        """Return the solutions (n, k) under forces for a loss of a patch, with supports held.
 
-        The iteration starts at displacements `start` (n, k).
+        `lost` is the patch's contribution to each stiffness term; the iteration starts at the
+        displacements `start` (n, k).
         """
         reference = self.held_terms.reference
         coefficients = np.array([1.0, *(-loss * reference[term] for term in lost)])
@@ -367,30 +363,27 @@ class _Columns:
 
     @property
     def _first_mass(self) -> int:
-        """Number of the first change that is a mass, counted from one."""
+        """Number, from one, of the first change that is a mass."""
         return 1 + len(self.structure.support_motions)
 
     @property
     def _first_loss(self) -> int:
-        """Number of the first change that is a loss of stiffness, counted from one."""
+        """Number, from one, of the first change that is a loss of stiffness."""
         return self._first_mass + len(self.mass_places)
 
     def _middle_vector(self, model: ChangeableModel) -> FloatArray:
-        """Return the values of a model's inputs in the middle of all ranges."""
+        """Return the inputs of a model at the midpoints of all ranges."""
         vector = model.nominal.copy()
         (middle_losses,) = self.held_terms.losses_at(0.5)
         vector[: self.held_terms.varied] = (*self.held_terms.middle, *middle_losses)
         return vector
 
     def _yielding_case(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
-        """Return the reduced and the full structure whose support yields, mid-range.
+        """Return the case of a support that yields.
 
-        Parameters
-        ----------
-        number : int
-            Number of the motion of the support.
-        gain : float
-            The largest relative gain of compliance under a load or in a mode.
+        `number` counts the support motions; `gain` is the largest relative gain of compliance under
+        a load
+        or in a mode.
         """
         motion = self.structure.support_motions[number]
         reference = self.held_terms.reference
@@ -417,13 +410,13 @@ class _Columns:
         return ChangedCase(structure, full_solution, self.mass, released_direction)
 
     def _held_solution(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements (n', k) of the full model, supports held, under loads."""
+        """Return the displacements (n', k) of the full model under loads, with supports held."""
         solution = np.zeros_like(loads)
         solution[: self.free] = self.factors.solve(loads[: self.free])
         return solution
 
     def _case_with_mass(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
-        """Return the structure with a mass; `gain` is the largest relative gain of a modal mass."""
+        """Return the case of a point mass; `gain` is the largest relative gain of a modal mass."""
         place = self.mass_places[number]
         vector = self._middle_vector(model)
         unchanged = ChangedStructure(model, vector, ModelPatch())
@@ -435,7 +428,7 @@ class _Columns:
         return ChangedCase(structure, self._held_solution, mass)
 
     def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "ChangedCase":
-        """Return the structure with a loss of stiffness."""
+        """Return the case of a loss of stiffness."""
         patch = self.loss_places[number]
         held = {term: matrix[: self.free, : self.free] for term, matrix in patch.terms.items()}
         primitive = RegionStiffnessLoss(patch.name, loss)
@@ -460,7 +453,8 @@ class _Columns:
     def error(self, model: ChangeableModel, number: int) -> float:
         """Return the largest relative error of a model under one change, at both ends of its range.
 
-        Outputs at rest are compared with those of the full model, in the middle of all ranges. The
+        Static outputs are compared with those of the full model, at the midpoints of all input
+        ranges. The
         error of a frequency is its change by one step of inverse iteration with the full model.
         """
         return max(
@@ -469,7 +463,7 @@ class _Columns:
         )
 
     def _cases(self, model: ChangeableModel, number: int) -> "list[ChangedCase]":
-        """Return the structure under one change, counted from zero, at both ends of its range."""
+        """Return the cases of one change, counted from zero, at both ends of its range."""
         change = 1 + number
         if change < self._first_mass:
             return [self._yielding_case(model, number, gain) for gain in GAIN_RANGE]
@@ -481,6 +475,6 @@ class _Columns:
 
 
 def _projected(terms: tuple[sparse.csr_array, ...], columns: FloatArray) -> FloatArray:
-    """Return symmetric terms (T, k, k) on columns (n, k)."""
+    """Project symmetric terms on columns (n, k): an array (T, k, k)."""
     projected = np.array([columns.T @ (term @ columns) for term in terms])
     return np.asarray(0.5 * (projected + projected.swapaxes(1, 2)))

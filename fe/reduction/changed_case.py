@@ -1,4 +1,4 @@
-"""A structure with one change, in full and reduced, and the error of the reduced one."""
+"""A structure with one change, as full and as reduced model, and the error of the latter."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from .terms import ReductionTerms
 
 
 class ChangedCase(NamedTuple):
-    """A structure with a change.
+    """A structure with a change, as full and as reduced model.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class ChangedCase(NamedTuple):
     mass : csr (n', n')
         The mass of the full model.
     direction : (n', 1) array
-        The unit response of the motion of a support that is held otherwise; empty without one.
+        The unit response to a released motion of a support; empty without one.
     """
 
     structure: ChangedStructure
@@ -40,30 +40,32 @@ def case_error(
     held_terms: ReductionTerms,
     shapes: FloatArray,
 ) -> float:
-    """Return the largest relative error of outputs at rest and frequencies in one case.
+    """Return the largest relative error of static outputs and natural frequencies in one case.
 
     The error of a frequency is its change by one step of inverse iteration with the full model.
 
     Parameters
     ----------
     terms, held_terms : ReductionTerms
-        Terms of the structure whose supports yield, and of that whose supports are held.
+        Terms of the structure whose supports yield, and of the one whose supports are held.
     shapes : (n', M) array
         The reduced mode shapes on all unknowns.
     """
     structure = case.structure
     # statics
     factors = terms.load_factors.tolist()
-    numbers = [factors.index(row) for row in held_terms.load_factors.tolist()]
-    outputs = terms.outputs.T @ case.full_solution(terms.loads[:, numbers])
+    load_numbers = [factors.index(row) for row in held_terms.load_factors.tolist()]
+    outputs = terms.outputs.T @ case.full_solution(terms.loads[:, load_numbers])
     displacements = structure.basis @ structure.static(structure.basis.T @ model.whole_load.T)
     reduced = model.whole_output[: len(outputs)] @ displacements
-    worst = 0.0
+    largest_error = 0.0
     for group in terms.groups:
         largest = np.abs(outputs[group]).max(axis=0)
         difference = np.abs(reduced[group] - outputs[group]).max(axis=0)
-        is_seen = largest > 0.0
-        worst = max(worst, float((difference[is_seen] / largest[is_seen]).max(initial=0.0)))
+        responds = largest > 0.0
+        largest_error = max(
+            largest_error, float((difference[responds] / largest[responds]).max(initial=0.0))
+        )
     # frequencies by the Rayleigh quotient of the improved modes
     inertia = case.mass @ shapes
     improved = case.full_solution(inertia)
@@ -71,4 +73,4 @@ def case_error(
     squares = squares / np.sum(improved * (case.mass @ improved), axis=0)
     frequency = np.sqrt(squares) / (2.0 * np.pi)
     frequency_errors = np.abs(structure.modes.frequency / frequency - 1.0)
-    return max(worst, float(frequency_errors.max()))
+    return max(largest_error, float(frequency_errors.max()))

@@ -1,4 +1,4 @@
-"""Approximate dual solutions of the outputs, on which the sharpness of the error bound rests.
+"""Approximate dual solutions of the outputs, which make the error bound sharp.
 
 At each anchor, a few dual solutions of each output span a reduced basis of that output, in which
 they are combined for each state (Rozza, Huynh and Patera 2008). Displacements and loads are
@@ -49,12 +49,10 @@ class DualSolutions(NamedTuple):
 
 
 def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> DualSolutions:
-    """Solve K psi = l for each output l roughly, and compute the norms of the residuals.
+    """Solve K psi = l approximately for each output l, and compute the norms of the residuals.
 
     Parameters
     ----------
-    terms : ReductionTerms
-        The full model, with n free unknowns.
     outputs : (n, O) array
         The outputs of the full model, whitened.
     stage : Stage
@@ -89,7 +87,7 @@ def dual_solutions(terms: ReductionTerms, outputs: FloatArray, stage: Stage) -> 
 
 
 def _solve_duals(terms: ReductionTerms, theta: FloatArray, outputs: FloatArray) -> FloatArray:
-    """Return approximate dual solutions (n, O) of outputs (n, O) at coefficients (T,)."""
+    """Return approximate dual solutions (n, O) for stiffness coefficients (T,)."""
     return solve_near(
         terms.factors,
         terms.stiffness_terms,
@@ -101,7 +99,7 @@ def _solve_duals(terms: ReductionTerms, theta: FloatArray, outputs: FloatArray) 
 
 
 def _dual_directions(solutions: list[FloatArray]) -> FloatArray:
-    """Return the directions (O, n, M) that M dual solutions (n, O) of each output span."""
+    """Return orthonormal directions (O, n, M) that span each output's M dual solutions (n, O)."""
     by_output = np.stack(solutions, axis=2).swapaxes(0, 1)
     directions, lengths, _ = np.linalg.svd(by_output, full_matrices=False)
     longest = lengths[:, :1]
@@ -113,14 +111,9 @@ def _dual_directions(solutions: list[FloatArray]) -> FloatArray:
 def _project_duals(
     terms: ReductionTerms, outputs: FloatArray, directions: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the residual factor and the projected stiffness (T, M, M) of each output's directions.
+    """Return the residual factor and the projected stiffness (T, M, M) for each output.
 
-    Parameters
-    ----------
-    outputs : (n, O) array
-        The outputs, whitened.
-    directions : (O, n, M) array
-        The directions of each output, whitened.
+    `outputs` (n, O) and the `directions` (O, n, M) of each output are whitened.
     """
     factors = terms.factors
     size, count = outputs.shape
@@ -137,12 +130,7 @@ def _project_batch(
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return the projections of `_project_duals` for b outputs at once.
 
-    Parameters
-    ----------
-    outputs : (n, b) array
-        The outputs, whitened.
-    displacements : (n, b, M) array
-        The directions of each output as displacements.
+    `outputs` (n, b) are whitened; `displacements` (n, b, M) are the directions of each output.
     """
     size, output_count = outputs.shape
     flat = displacements.reshape(size, -1)
@@ -168,7 +156,7 @@ def _project_batch(
 
 
 def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
-    """Return a small matrix that has the norm of each dual residual.
+    """Return a small matrix from which the norm of each dual residual follows.
 
     The residual of a dual solution is the output minus a combination of forces, with n rows:
     r = [output, force] c. Its norm is needed for many combinations c. With the QR factorisation
@@ -184,7 +172,7 @@ def _residual_factor(output: FloatArray, force: FloatArray) -> FloatArray:
     Returns
     -------
     (2 + T M, 1 + T M) array
-        The factor R, and a last row that adds what rounding may have made of the residual.
+        The factor R, and a last row that adds an allowance for rounding.
     """
     columns = np.column_stack((output, force))
     factor = np.linalg.qr(columns, mode="r")

@@ -1,8 +1,9 @@
-"""The modal basis of a reduced model, in which the first eigenmodes are accurate for every state.
+"""The modal basis of a reduced model, in which the lowest modes are accurate for every state.
 
 A working basis is grown by Davidson corrections until the modes of sampled states have small
-residuals in it. The modes of many states, computed in the working basis, are then compressed by
-singular values. `docs/explanation/reduced_model.md` describes the method and its accuracy.
+residuals in it. The modes of many states, computed in the working basis, are then compressed by a
+singular value decomposition. `docs/explanation/reduced_model.md` describes the method and its
+accuracy.
 """
 
 from collections.abc import Iterator
@@ -21,11 +22,11 @@ from .model_fields import ModalReduction
 from .terms import ModalState, ReductionTerms
 
 START_ITERATIONS = 4
-"""Inverse iterations that start the working basis of the modes."""
+"""Number of inverse iterations that start the working basis."""
 START_EXTRA_VECTORS = 4
-"""Vectors of these iterations beyond the modes that are computed."""
+"""Additional vectors in these iterations."""
 EXTRA_MODES = 2
-"""Modes that are computed beyond those that are wanted, because modes change their order."""
+"""Modes that are computed in addition to those that are wanted, since modes change their order."""
 MODAL_DROP = 1e-6
 """Shorter directions are dropped from the working basis, relative to the vectors of their block."""
 RESIDUAL_TOLERANCE = 3e-3
@@ -34,13 +35,13 @@ square."""
 FREQUENCY_TOLERANCE = 1e-5
 """Relative error of a frequency that compression may add."""
 MOST_CORRECTIONS = 12
-"""Limit of Davidson corrections for one state."""
+"""Largest number of Davidson corrections for one state."""
 
 
 def projected_modes(
     stiffness_terms: FloatArray, mass_terms: FloatArray, state: ModalState, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the first modes of a projected model at a state.
+    """Compute the lowest modes of a projected model in a state.
 
     Parameters
     ----------
@@ -48,8 +49,6 @@ def projected_modes(
         The projected stiffness terms.
     mass_terms : (Q, k, k) array
         The projected mass terms.
-    state : ModalState
-        The coefficients of both.
 
     Returns
     -------
@@ -65,7 +64,7 @@ def projected_modes(
 
 
 def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalReduction:
-    """Make a basis for the first modes of a structure, and the modal fields of its reduced model.
+    """Make a basis for the lowest modes of a structure, and the modal fields of its reduced model.
 
     Parameters
     ----------
@@ -98,7 +97,7 @@ def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalRed
 
 
 def _start_basis(terms: ReductionTerms, mode_count: int) -> ProjectedBasis:
-    """Return a working basis from a few inverse iterations on a block of vectors.
+    """Return a working basis from a few inverse iterations on random vectors.
 
     The iterations need not converge, since the refinement corrects the modes.
     """
@@ -117,7 +116,7 @@ def _start_basis(terms: ReductionTerms, mode_count: int) -> ProjectedBasis:
 
 
 def _refine(terms: ReductionTerms, working: ProjectedBasis, mode_count: int, stage: Stage) -> None:
-    """Grow the working basis until the modes of all sampled states have small residuals in it."""
+    """Extend the working basis until the modes of all sampled states have small residuals."""
     states = terms.refinement_states()
     for first in range(0, len(states), STATES_PER_ROUND):
         batch = states[first : first + STATES_PER_ROUND]
@@ -131,14 +130,14 @@ def _refine_states(
     """Add Davidson corrections X^-1 (K - omega^2 M) phi; yield each state whose modes converged."""
     largest = np.inf
     for _ in range(MOST_CORRECTIONS):
-        corrections, sizes = _davidson_corrections(terms, working, states, mode_count)
-        is_large = sizes > RESIDUAL_TOLERANCE
+        corrections, relative_norms = _davidson_corrections(terms, working, states, mode_count)
+        is_large = relative_norms > RESIDUAL_TOLERANCE
         needs_correction: BoolArray = np.any(is_large.reshape(len(states), -1), axis=1)
         by_state = list(zip(states, needs_correction, strict=True))
         yield from (state for state, corrected in by_state if not corrected)
         if not needs_correction.any():
             return
-        largest = float(sizes.max())
+        largest = float(relative_norms.max())
         working.add(corrections[:, is_large])
         states = [state for state, corrected in by_state if corrected]
     raise ReductionError(
@@ -152,18 +151,20 @@ def _davidson_corrections(
 ) -> tuple[FloatArray, FloatArray]:
     """Return vectors that improve a basis for the modes of S states, and the relative residuals.
 
-    The M modes of each state are computed in the working basis, a few vectors of displacements. A
-    mode phi computed in this way leaves the residual r = (K - omega^2 M) phi. Davidson's method
-    adds X^-1 r to the basis, where X approximates K; here X is the stiffness of a reference state,
-    which is factorised once. The vectors are returned in whitened coordinates, as X^-1/2 r, in
-    which their Euclidean norm is the energy norm of X^-1 r.
+    The M modes of each state are computed in the working basis. A mode phi computed in this way has
+    the residual r = (K - omega^2 M) phi. Davidson's method adds X^-1 r to the basis, where X
+    approximates K; here X is the stiffness of a reference state, which is factorised once. The
+    vectors
+    are returned in whitened coordinates, as X^-1/2 r, in which their Euclidean norm is the energy
+    norm
+    of X^-1 r.
 
     Returns
     -------
     corrections : (n, S M) array
         The whitened residuals, one column for each mode. The modes of one state stand side by side.
-    sizes : (S M,) array
-        The relative size of each residual: the square root of (r, X^-1 r) / (phi, K phi).
+    relative_norms : (S M,) array
+        The relative norm of each residual: the square root of (r, X^-1 r) / (phi, K phi).
     """
     # natural frequencies and modes in the working basis; all states side by side
     modes = [
@@ -182,23 +183,16 @@ def _davidson_corrections(
     residuals -= affine_product(terms.structure.mass_terms, mass * squared_frequencies, shapes)
     corrections = working.factors.whitened(residuals)
     # modes are mass-normalised, so (phi, K phi) is the squared frequency
-    sizes = np.linalg.norm(corrections, axis=0) / np.sqrt(squared_frequencies)
-    return corrections, sizes
+    relative_norms = np.linalg.norm(corrections, axis=0) / np.sqrt(squared_frequencies)
+    return corrections, relative_norms
 
 
 def _compressed_directions(
     working: ProjectedBasis, states: list[ModalState], count: int
 ) -> FloatArray:
-    """Return the fewest singular directions (k, Nm) of the modes that keep every frequency.
+    """Return the fewest directions (k, Nm) of the working basis that keep all frequencies.
 
-    Parameters
-    ----------
-    working : ProjectedBasis
-        The working basis.
-    states : list of ModalState
-        The states whose modes are compressed.
-    count : int
-        The number of modes of each state.
+    They are singular directions of the modes of all given states.
     """
     modes = [projected_modes(working.stiffness, working.mass, state, count) for state in states]
     squares = np.array([mode_squares for mode_squares, _ in modes])

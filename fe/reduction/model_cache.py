@@ -1,14 +1,14 @@
-"""Reduced models kept between runs: an unchanged design is built once, a changed one is built anew.
+"""A cache of reduced models: an unchanged design is read, a changed one is built.
 
 A build works in one thread, because sums over several threads depend on their number. A design
-therefore gives the same bytes on a machine, whatever its cores do.
+therefore gives the same bytes on a machine with any number of cores.
 
-A model that is kept is read in a fraction of the time that the modelling code takes to import, with
+Reading a model takes a fraction of the time that the modelling code takes to import, with
 scikit-fem and SciPy's sparse matrices. So only the functions that build a model import that code.
 
 This module also computes fields on the whole wing from the reduced model, and writes them as VTU
-files for ParaView. No equation of the full model is solved for them: the reduced solution is
-expanded on the mesh by the static basis, which takes milliseconds.
+files for ParaView. The full model is not solved for them: the reduced solution is expanded on the
+mesh by the static basis, which takes milliseconds.
 """
 
 from collections.abc import Callable
@@ -38,10 +38,8 @@ if TYPE_CHECKING:
     from .reduced_basis import Reduction
 
 MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduction")
-"""The subpackages that decide what a reduced model holds.
-
-A change in any of their files makes a new cache entry.
-"""
+"""The subpackages that determine a reduced model: a change in any of their files makes a new cache
+entry."""
 
 _WING_CELLS = "hexahedron20"
 """The kind of the cells of a wing, as `fe.structure.vtu` names it."""
@@ -50,21 +48,21 @@ _Record = TypeVar("_Record", bound=StoredArrays)
 
 
 def modelling_hash() -> str:
-    """Return the SHA-256 of the modelling code, hexadecimal."""
+    """Return the SHA-256 of the modelling code in hexadecimal."""
     package = Path(__file__).parents[1]
     hashes = [hash_tree(package / name, suffixes=[".py", ".toml"]) for name in MODELLING_PACKAGES]
     return hash_bytes("".join(hashes).encode())
 
 
 def cache_file(kind: str, design_hash: str, settings: object) -> Path:
-    """Return the file of a cache entry, named by a hash of design, settings and modelling code.
+    """Return the path of a cache entry, named by a hash of design, settings and modelling code.
 
     Parameters
     ----------
     kind : str
         The kind of record, such as "wing".
     settings : object
-        The settings of the build; their `repr` says all of them.
+        The settings of the build; their `repr` must contain them all.
     """
     content = f"{design_hash} {settings!r} {modelling_hash()}"
     return cache_folder() / f"{kind}-{hash_bytes(content.encode())[:32]}.npz"
@@ -114,7 +112,7 @@ class WingFields(ReducedModel):
 
     @property
     def model(self) -> ReducedModel:
-        """The reduced model alone."""
+        """The reduced model without the fields on the mesh."""
         return ReducedModel(**_fields_of(self))
 
 
@@ -153,12 +151,10 @@ def reduced_model(
     ----------
     source : WingDesign, Path or str, optional
         The design of a wing, by default the shipped one, or the path of a structure file.
-    progress : Progress, optional
-        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
-        The accuracy that is asked for of a wing; by default that of the design.
+        The required accuracy for a wing; by default that of the design.
     memory_limit : float, optional
-        Bytes that assembly and factorisation of a structure may take, as in
+        Memory that assembly and factorisation of a structure may take [bytes], as in
         `fe.structure.operators.load_and_assemble`.
 
     Raises
@@ -187,10 +183,8 @@ def wing_fields(
     ----------
     design : WingDesign, optional
         The wing; the shipped one by default.
-    progress : Progress, optional
-        The display of the progress, if the model must be built.
     settings : StructureSettings, optional
-        The accuracy that is asked for; by default that of the design.
+        The required accuracy; by default that of the design.
 
     Raises
     ------
@@ -210,7 +204,7 @@ def build_fields(
     progress: Progress | None = None,
     settings: StructureSettings | None = None,
 ) -> WingFields:
-    """Build what `wing_fields` returns, without the cache."""
+    """Build what `wing_fields` returns, without using the cache."""
     from .reduced_basis import reduce_structure
 
     operators = _assembled(design, progress)
@@ -218,7 +212,7 @@ def build_fields(
 
 
 def _assembled(design: WingDesign, progress: Progress | None) -> "AffineOperators":
-    """Return the operators of a wing, and report the stage."""
+    """Assemble the operators of a wing as a stage of the progress."""
     from fe.wing.operators import assemble
 
     with reporter(progress).stage("Meshing and assembling the wing"):
@@ -232,8 +226,6 @@ def patch_arrays(design: WingDesign | None = None, progress: Progress | None = N
     ----------
     design : WingDesign, optional
         The wing; the shipped one by default.
-    progress : Progress, optional
-        The display of the progress, if the arrays must be built.
 
     Raises
     ------
@@ -249,7 +241,7 @@ def patch_arrays(design: WingDesign | None = None, progress: Progress | None = N
 
 
 def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> PatchArrays:
-    """Build what `patch_arrays` returns, without the cache."""
+    """Build what `patch_arrays` returns, without using the cache."""
     from .patch_basis import reduce_patches
 
     return reduce_patches(_assembled(design, progress), progress)
@@ -258,7 +250,7 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
 def _reduced_structure(
     file: Path | str, progress: Progress | None, memory_limit: float | None
 ) -> ReducedModel:
-    """Return the reduced model of a structure file; the parameters are those of `reduced_model`."""
+    """Return the reduced model of a structure file, as `reduced_model` does."""
 
     def build() -> ReducedModel:
         from fe.structure.operators import assemble_structure
@@ -273,16 +265,12 @@ def _reduced_structure(
 
 
 def changeable_model(file: Path | str, progress: Progress | None = None) -> ChangeableModel:
-    """Return the model of a structure file that a campaign is compared with, from the cache.
+    """Return the changeable model of a structure file, from the cache if possible.
 
-    It has the force and the displacement at each port of the file, see
-    `AffineStructure.with_port_forces`, and the columns that changes of the structure need. Its
-    `design_hash` is that of the model without ports.
-
-    Parameters
-    ----------
-    progress : Progress, optional
-        The display of the progress, if the model must be built.
+    It has a force and a displacement at each port of the file, see
+    `AffineStructure.with_port_forces`, and the columns for changes of the structure. Its
+    `design_hash`
+    is that of the model without ports.
 
     Raises
     ------
@@ -306,7 +294,7 @@ def changeable_model(file: Path | str, progress: Progress | None = None) -> Chan
 
 
 def check_structure(file: Path | str) -> None:
-    """Read a structure file with its mesh and assemble both, unless its reduced model is cached.
+    """Check that a structure file can be assembled, unless its reduced model is in the cache.
 
     Raises
     ------
@@ -320,7 +308,7 @@ def check_structure(file: Path | str) -> None:
 
 
 def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
-    """Return the cache file of the reduced model of a structure file, with its ports or without."""
+    """Return the path of a structure file's cache entry, with ports or without."""
     design = load_structure(file)
     design_hash = structure_hash(design, file.parent, with_ports=with_ports)
     kind = "changeable" if with_ports else "structure"
@@ -328,13 +316,7 @@ def _structure_cache_file(file: Path, *, with_ports: bool = False) -> Path:
 
 
 def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:
-    """Return a reduced model with its bases expanded on the mesh of the full model.
-
-    Parameters
-    ----------
-    reduction : Reduction
-        The reduced model of the structure, and the bases.
-    """
+    """Return a reduced model with its bases expanded on the mesh of the full model."""
     from fe.elements.cells import CellMesh
     from fe.elements.kinds import HEXAHEDRA_20
 
@@ -361,7 +343,7 @@ def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFie
 
 
 def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> None:
-    """Write displacement, strain and damage of the wing at rest as a VTU file.
+    """Write static displacement, strain and damage of the wing as a VTU file.
 
     Point data is `displacement` [m]. Cell data, at the centres of the cells, are `strain` (xx, yy,
     zz, yz, xz, xy), `spanwise_strain` (yy, positive if compressed, as the gauges read it), `region`
@@ -372,7 +354,7 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     path : str or Path
         The file; an existing one is replaced.
     vector : (V,) array
-        Values of all that can be chosen, from `ReducedModel.vector`.
+        Values of the inputs, from `ReducedModel.vector`.
 
     Raises
     ------
@@ -413,7 +395,7 @@ def write_modes_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> N
     path : str or Path
         The file; an existing one is replaced.
     vector : (V,) array
-        Values of all that can be chosen, from `ReducedModel.vector`.
+        Values of the inputs, from `ReducedModel.vector`.
 
     Raises
     ------

@@ -38,7 +38,7 @@ class ModalFields(TypedDict):
 
 
 class ModalReduction(NamedTuple):
-    """A modal basis and what it gives to the reduced model.
+    """The modal basis of a structure, and the modal fields of its reduced model.
 
     Attributes
     ----------

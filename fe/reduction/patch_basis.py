@@ -1,10 +1,10 @@
 """The wing in a basis that is rich enough for the changes of `fe.runtime.patch`.
 
-The basis is made in two steps. A working basis of several hundred vectors holds the solutions of
-the full model under loads, point forces, the gauges as loads (whose presence squares the error of a
-strain), and each stiffness and mass term, at two states of health. In the working basis many
-patched states are solved. The basis that is kept consists of the singular directions of their
-solutions and modes, with larger weights for what is used most.
+The basis is made in two steps. A working basis of several hundred vectors spans the solutions of
+the full model under loads, point forces, the gauges as loads (which squares the error of a strain),
+and each stiffness and mass term, in two states of health. In the working basis many patched states
+are solved. The final basis consists of the singular directions of their solutions and modes, with
+larger weights for those that are used most.
 """
 
 from typing import NamedTuple
@@ -39,24 +39,24 @@ DAMAGED_LOSS = 0.7
 LIFT_POLYNOMIALS = 6
 """Number of Legendre polynomials along the span that weight the lift for the working basis."""
 MODES = 8
-"""Modes that are snapshots."""
+"""Number of modes among the snapshots."""
 INERTIA_SHAPES = 6
-"""Of these, modes whose inertia, and whose forces in parts of the skin, are loads as well."""
+"""Number of these modes whose inertia, and whose forces in the skin, are loads as well."""
 POINT_STATIONS = 13
-"""Stations at which point forces act, about."""
+"""Approximate number of stations at which point forces act."""
 NEAR_GAUGE = 1.5
-"""A strip is near a gauge within this multiple of the largest distance of mesh lines."""
+"""A strip is near a gauge within this multiple of the widest strip."""
 START_SHAPES = 16
-"""Modes from which those of a patched wing are iterated."""
+"""Number of modes from which those of a patched wing are iterated."""
 WORKING_TOLERANCE = 3e-7
-"""Squared size, relative to the largest, of a direction that the working basis leaves out."""
+"""Eigenvalue, relative to the largest, below which the working basis leaves out a direction."""
 
 MAIN_LOAD_WEIGHT = 3.0
 """Weight of the solutions under tip force, lift and washed-out lifts; others have one."""
 WASHOUT_EXPONENTS = (0.5, 1.0, 2.0, 4.0)
 """Exponents of the washed-out lifts."""
 OUTBOARD_STATIONS = (0.75, 1.0)
-"""Where point forces act, as fractions of the semi-span."""
+"""Stations of point forces, as fractions of the semi-span."""
 OTHER_STRAIN_WEIGHT = 0.4
 """Weight of the solutions under strains across a gauge, and under shear strains, as loads."""
 MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
@@ -65,7 +65,7 @@ UNCHANGED_WEIGHT = 10.0
 
 
 class _ChangeProbabilities(NamedTuple):
-    """Fractions of the patched states with losses in their regions, and with each change."""
+    """Probabilities that a patched state has losses in regions, and each change."""
 
     region_losses: float = 0.5
     local_loss: float = 0.75
@@ -74,7 +74,7 @@ class _ChangeProbabilities(NamedTuple):
 
 
 class _ChangeFractions(NamedTuple):
-    """The numbers of the changes of a patched state, as fractions of their ranges."""
+    """The values of a patched state's changes, as fractions of their ranges."""
 
     start: float
     length: float
@@ -121,15 +121,7 @@ def _working_basis(full_model: PatchOperators) -> FloatArray:
 
 
 def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
-    """Return solutions (n, S) of the full model, all damage regions with one loss.
-
-    Parameters
-    ----------
-    full_model : PatchOperators
-        The full model of the wing, with the rows that patches act on.
-    loss : float
-        The stiffness loss.
-    """
+    """Return solutions (n, S) of the full model with the same loss in all damage regions."""
     operators = full_model.operators
     health = dict.fromkeys(operators.regions, loss)
     factors = Factorisation(operators.stiffness(None, health))
@@ -149,14 +141,9 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
 
 
 def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray:
-    """Return the loads (L, n) of the snapshots: first the gauges, then tip force and lift.
+    """Return the loads (L, n) of the snapshots: the gauges, tip force and lift, then others.
 
-    Parameters
-    ----------
-    full_model : PatchOperators
-        The full model of the wing, with the rows that patches act on.
-    modes : (n, m) array
-        The lowest modes of the model.
+    `modes` (n, m) are the lowest modes of the model.
     """
     operators = full_model.operators
     lines = full_model.line_rows
@@ -190,12 +177,7 @@ def _snapshot_loads(full_model: PatchOperators, modes: FloatArray) -> FloatArray
 def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
     """Return the elastic forces (n, s) of each part of the skin in the snapshot solutions.
 
-    Parameters
-    ----------
-    full_model : PatchOperators
-        The full model of the wing, with the rows that patches act on.
-    solutions : (n, S) array
-        Solutions under the loads of `_snapshot_loads`, then the modes.
+    `solutions` (n, S) are those under the loads of `_snapshot_loads`, then the modes.
     """
     layout = full_model.layout
     gauge_stations = layout["gauge_stations"]
@@ -221,7 +203,7 @@ def _skin_forces(full_model: PatchOperators, solutions: FloatArray) -> list[Floa
 
 
 def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
-    """Return basis' matrix basis (N, N), computed on the rows that the matrix has."""
+    """Return basis^T matrix basis (N, N), computed on the rows that the matrix has."""
     rows = np.flatnonzero(np.diff(matrix.indptr))
     basis_rows = basis[rows]
     product = basis_rows.T @ (matrix[rows][:, rows] @ basis_rows)
@@ -229,15 +211,7 @@ def _projected(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
 
 
 def project(full_model: PatchOperators, basis: FloatArray) -> PatchArrays:
-    """Return the arrays of a wing in a basis.
-
-    Parameters
-    ----------
-    full_model : PatchOperators
-        The full model, with n free unknowns.
-    basis : (n, N) array
-        The basis.
-    """
+    """Return the arrays of a wing in a basis (n, N)."""
     operators = full_model.operators
     stiffness = np.stack([_projected(term.matrix, basis) for term in operators.stiffness_terms])
     mass = np.stack([_projected(term, basis) for term in operators.mass_terms])
@@ -301,8 +275,9 @@ class _SnapshotLoads(NamedTuple):
 def _kept_directions(arrays: PatchArrays) -> FloatArray:
     """Return the directions (N, n) of the working basis that are kept.
 
-    Proper orthogonal decomposition: the eigenvectors with the largest eigenvalues of the weighted
-    sum of the outer products of all snapshots, at random patched states.
+    They are found by proper orthogonal decomposition: the eigenvectors with the largest eigenvalues
+    of
+    the weighted sum of the outer products of all snapshots, in random patched states.
     """
     wing = PatchedWing(arrays)
     loads = _weighted_loads(wing)
@@ -350,7 +325,7 @@ def _weighted_loads(wing: PatchedWing) -> _SnapshotLoads:
 
 
 def _unit_columns(vectors: FloatArray) -> FloatArray:
-    """Return vectors (N, k) scaled to length one."""
+    """Scale vectors (N, k) to length one."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
@@ -366,7 +341,7 @@ def _patched_state(
         next are fractions of the ranges of these changes (`_ChangeFractions`), and the last are
         fractions of the ranges of modulus, losses and masses.
     unchanged : bool
-        Whether to return the wing without changes and damage, in the middle of its ranges.
+        Whether to return the wing without changes and damage, at the midpoints of its ranges.
     """
     arrays = wing.arrays
     draws, change_values, value_fractions = np.split(

@@ -1,4 +1,4 @@
-"""Make the reduced model of a structure, such as a wing, and measure its errors."""
+"""Reduce a structure, such as a wing, and measure the errors of the reduced model."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from .terms import ReductionTerms, State
 
 @dataclass(frozen=True)
 class Reduction:
-    """A reduced model with the bases that made it.
+    """A reduced model and the bases from which it was made.
 
     Attributes
     ----------
@@ -62,12 +62,7 @@ def reduce_structure(
     Parameters
     ----------
     settings : StructureSettings, optional
-        The accuracy that is asked for; by default that of the structure's design.
-
-    Returns
-    -------
-    Reduction
-        The reduced model and its bases.
+        The required accuracy; by default that of the structure's design.
 
     Raises
     ------
@@ -161,7 +156,7 @@ def _design_fields(terms: ReductionTerms) -> DesignFields:
 
 @dataclass(frozen=True)
 class MeasuredErrors:
-    """Largest errors of a reduced structure at random states, against the full model.
+    """Largest errors of a reduced model at random states, compared with the full model.
 
     Attributes
     ----------
@@ -197,8 +192,6 @@ def measured_errors(
     ----------
     states : int
         The number of states, uniform in the ranges; each costs a factorisation.
-    seed : int
-        The seed of the states.
 
     Raises
     ------
@@ -232,7 +225,7 @@ def measured_errors(
 
 
 class _RelativeErrors(NamedTuple):
-    """Errors of strains and of displacements, NaN if there are none.
+    """Errors of strains and of displacements; NaN if the structure has none.
 
     Attributes
     ----------
@@ -245,7 +238,7 @@ class _RelativeErrors(NamedTuple):
 
 
 def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _RelativeErrors:
-    """Return errors and bounds of a reduced response, for strains and for other outputs."""
+    """Return the relative errors and bounds of strains and displacements."""
     errors = np.full(2, np.nan)
     bounds = np.full(2, np.nan)
     for kind, exact_outputs in enumerate((exact.strain, exact.output)):
@@ -258,7 +251,7 @@ def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _Relati
 
 
 def _random_values(model: ReducedModel, count: int, seed: int) -> FloatArray:
-    """Return random values (count, V) in the validity box, under nominal or unit controls."""
+    """Return random inputs (count, V) in the validity box, with nominal or unit controls."""
     low, high = model.validity_box.T
     generator = np.random.default_rng(seed)
     fractions = generator.random((count, len(low)))

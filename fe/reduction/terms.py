@@ -1,4 +1,4 @@
-"""A structure as its reduction sees it, and the states at which the reduced model is tested."""
+"""The terms of a structure for its reduction, and the states in which the model is tested."""
 
 import itertools
 from collections.abc import Sequence
@@ -13,29 +13,28 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure, affine_sum
 
 MOST_GRID_REGIONS = 3
-"""Up to this number of damage regions the tested states form a full grid; beyond it they are
-chosen."""
+"""Largest number of damage regions for which the tested states form a full grid."""
 State = tuple[float, ...]
 """Values of the parameters, then the losses of the damage regions."""
 
 LEAST_COSINE = 1e-3
-"""Least output, relative to the largest output that a load of the same energy could cause. Errors
-are relative to no smaller output."""
+"""Least output to which errors are relative, as a fraction of the largest output that a load of the
+same energy could cause."""
 UNSEEN_FRACTION = 0.1
 """If no output responds to a load, its errors are relative to this fraction of the largest output
 of all loads, each at its largest coefficient."""
 INNER_MODAL_STATES = 10
-"""States inside the box at which the working basis of the modes is refined."""
+"""Number of states inside the box in which the working basis of the modes is refined."""
 INNER_TRAINING_STATES = 128
 """Number of states in the training set that lie inside the box, in addition to its corners."""
 INNER_TRAINING_STATES_MANY_REGIONS = 1024
 """The same with more than `MOST_GRID_REGIONS` regions."""
 MOST_MASS_CORNERS = 64
-"""Corners of the box of masses at which modes are compressed."""
+"""Largest number of corners of the box of masses in which modes are compressed."""
 
 
 class ModalState(NamedTuple):
-    """The coefficients that decide the modes.
+    """The coefficients that determine the modes.
 
     Attributes
     ----------
@@ -50,7 +49,7 @@ class ModalState(NamedTuple):
 
 
 def loss_at(ranges: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return losses at fractions of their ranges, with the remaining stiffness in equal ratios.
+    """Return losses at fractions of their ranges, with geometric steps of the remaining stiffness.
 
     The remaining stiffness 1 - loss goes from 1 - low to 1 - high as a geometric sequence.
 
@@ -92,7 +91,7 @@ def _number_from_one(names: Sequence[str], name: str | None) -> int:
 
 
 def _ranges_of(structure: AffineStructure, names: Sequence[str]) -> FloatArray:
-    """Return least and largest value (N, 2) of quantities by their names."""
+    """Return the least and the largest value (N, 2) of named quantities."""
     ranges = [structure.ranges[name] for name in names]
     return np.array(ranges, dtype=np.float64).reshape(-1, 2)
 
@@ -144,7 +143,7 @@ class ReductionTerms:
         self._set_reference()
 
     def _set_stiffness_terms(self) -> None:
-        """Set the stiffness terms and the parameter and region that each is proportional to.
+        """Set the stiffness terms, with the parameter and region of each.
 
         The last term has to be constant, as the error bound needs one: if it is not, a constant
         term of zeros is added.
@@ -164,7 +163,7 @@ class ReductionTerms:
         self.stiffness_factors: IntArray = np.array(factors, dtype=np.int64)
 
     def _set_loads(self) -> None:
-        """Set the load vectors, with load terms of the same control and free mass added up.
+        """Set the load vectors; load terms of the same control and free mass are added up.
 
         A load term is proportional to a control (such as the load factor), to a free mass, to both
         or to neither. Sums that are zero are left out.
@@ -193,7 +192,7 @@ class ReductionTerms:
         self.loads: FloatArray = np.stack([zero_column, *load_sums.values()], axis=1)[:, 1:]
 
     def _set_outputs(self) -> None:
-        """Set the outputs, and the groups of outputs that are judged by a common scale."""
+        """Set the outputs, and the groups of outputs whose errors have a common scale."""
         rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
         self.outputs: FloatArray = np.asarray(rows.T.toarray())
         output_count = self.outputs.shape[1]
@@ -206,7 +205,7 @@ class ReductionTerms:
         self.groups = tuple(groups)
 
     def _set_reference(self) -> None:
-        """Set the middle of all ranges, and the losses that separate anchors."""
+        """Set the midpoints of all ranges, and the losses that separate anchors."""
         self.middle = [float(np.mean(limits)) for limits in self.parameters]
         (middle_losses,) = self.losses_at(0.5)
         self.reference = self.theta((*self.middle, *middle_losses))
@@ -215,11 +214,11 @@ class ReductionTerms:
 
     @cached_property
     def factors(self) -> Factorisation:
-        """The factorised stiffness at the reference; its energy norm is that of the reduction."""
+        """The factorised stiffness at the reference, whose energy norm the reduction uses."""
         return Factorisation(affine_sum(self.reference, self.stiffness_terms))
 
     def theta(self, state: State) -> FloatArray:
-        """Return the coefficients (T,) of the stiffness terms at a state."""
+        """Return the coefficients (T,) of the stiffness terms in a state."""
         values = np.array(state)
         count = len(self.parameters)
         parameter = np.append(1.0, values[:count])
@@ -228,25 +227,27 @@ class ReductionTerms:
         return np.asarray(parameter[parameter_numbers] * remaining_stiffness[region_numbers])
 
     def losses_at(self, *fractions: float) -> FloatArray:
-        """Return losses (B, K): in a row, all regions are at one fraction of their ranges."""
+        """Return losses (B, K): a row for each fraction of all regions' ranges."""
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:
-        """Return the anchors: groups of states at which dual solutions are computed.
+        """Return the anchors: groups of states in which dual solutions are computed.
 
-        The error bound of an output needs the output's dual solution. At any state it is
-        approximated by a combination of the dual solutions at the states of one anchor. A state
-        consists of the parameters of the structure and of the stiffness losses of its K regions.
+        The error bound of an output needs the output's dual solution. In any state it is
+        approximated by a
+        combination of the dual solutions in the states of one anchor.
 
         With few regions, the range of each loss is halved. Each of the 2^K combinations of halves
-        has an anchor of one state, in the middle of these halves. With many regions there is a
-        single anchor, whose states are the corners of the box of all parameters and losses.
+        has an
+        anchor of one state, in the middle of these halves. With many regions there is a single
+        anchor,
+        whose states are the corners of the box of all parameters and losses.
 
         Returns
         -------
         list of list of (T,) array
-            For each anchor its states, each given by the coefficients of the T stiffness terms. If
-            there are several anchors, the loss of the last region changes fastest.
+            For each anchor the coefficients of the T stiffness terms in its states. If there are
+            several anchors, the loss of the last region changes fastest.
         """
         has_many_regions = self.splits.size == 0
         if has_many_regions:
@@ -278,7 +279,7 @@ class ReductionTerms:
         return [tuple(state) for state in values.tolist()]
 
     def training_states(self) -> list[State]:
-        """Return the states of the greedy search: corners of the box, and points inside it."""
+        """Return the states of the greedy search: corners of the box, and points inside."""
         if len(self.losses) <= MOST_GRID_REGIONS:
             count = INNER_TRAINING_STATES
         else:
@@ -287,10 +288,9 @@ class ReductionTerms:
         return self.states(np.concatenate(fractions))
 
     def refinement_states(self) -> list[ModalState]:
-        """Return the states at which the working basis of the modes is refined.
+        """Return the states in which the working basis of the modes is refined.
 
-        These are corners of the box, under least and largest masses in turn, and some states
-        inside.
+        These are corners of the box, with least and largest masses in turn, and some states inside.
         """
         corners = cube_corners(self.varied)
         corner_numbers = np.arange(len(corners))
@@ -300,9 +300,9 @@ class ReductionTerms:
         return self._modal_states(fractions, INNER_MODAL_STATES)
 
     def compression_states(self) -> list[ModalState]:
-        """Return the states whose modes the modal basis must hold.
+        """Return the states whose modes the modal basis must represent.
 
-        These are corners of the box under the corners of the box of masses, and states inside.
+        These are corners of the box with each corner of the box of masses, and some states inside.
         """
         all_mass_corners = itertools.product((0.0, 1.0), repeat=len(self.masses))
         mass_corners = list(itertools.islice(all_mass_corners, MOST_MASS_CORNERS))
@@ -330,7 +330,9 @@ class ReductionTerms:
         """Return the least outputs to which errors are relative, see `LEAST_COSINE`.
 
         In whitened coordinates, an output l responds to a load f by l . f, which is at most |l| |f|
-        (Cauchy and Schwarz).
+        (Cauchy and Schwarz). A load to which no output of a group responds is compared with the
+        responses
+        to all loads, see `UNSEEN_FRACTION`.
 
         Parameters
         ----------

@@ -1,12 +1,12 @@
-"""Motions that CalculiX binds to the unknowns of the matrices: those of tied nodes, and rotations.
+"""Motions without rows of their own in CalculiX's matrices: tied nodes, and rotations.
 
 A tied node has no row in the matrices, because CalculiX eliminates it: its motion is a weighted sum
 of rows. A weak spring of stiffness k between the node and an added node r shows the weights: in the
 column of r, the stored stiffness holds -k times the weight of each row.
 
-Shells and beams have no rotations as unknowns either. If a node bears a moment, CalculiX makes the
-mean rotation of its section an unknown in place of another motion. The weights of the rotation
-follow from the stiffness before and after this substitution.
+Shells and beams have no rotations as unknowns either. If a node bears a moment, CalculiX replaces
+another unknown by the mean rotation of its section. The weights of the rotation follow from the
+stiffness before and after this substitution.
 """
 
 from collections import Counter
@@ -40,12 +40,12 @@ class _Probe(NamedTuple):
 
     Attributes
     ----------
-    motion : NodeComponent
+    motion : Dof
         Node and direction of the motion.
     added_node : int
         The added node at the other end, which has a row in this direction.
     direction : int
-        Its direction along an axis.
+        The direction of the spring at the added node.
     """
 
     motion: Dof
@@ -59,21 +59,19 @@ def read_tied_motions(
     matrices: StoredMatrices,
     dofs: Sequence[Dof],
 ) -> dict[Dof, WeightedRows]:
-    """Return how motions along axes that have no rows follow from the rows.
+    """Return the motions of tied nodes as weighted rows of the matrices.
 
     Parameters
     ----------
-    jobs : CalculixJobs
-        CalculiX at work on the deck.
     matrices : StoredMatrices
         The matrices of these blocks.
-    dofs : sequence of NodeComponent
-        Nodes and directions without rows.
+    dofs : sequence of Dof
+        Degrees of freedom without rows.
 
     Returns
     -------
-    dict of NodeComponent to WeightedRows
-        The weights of each motion; without those that CalculiX would not show.
+    dict of Dof to WeightedRows
+        The weights of each motion; motions whose weights CalculiX does not show are left out.
 
     Raises
     ------
@@ -100,7 +98,7 @@ def read_rotations(
     matrices: StoredMatrices,
     dofs: Sequence[Dof],
 ) -> dict[Dof, WeightedRows]:
-    """Return how rotations of nodes of shells and beams follow from the rows.
+    """Return rotations of nodes of shells and beams as weighted rows of the matrices.
 
     The parameters are those of `read_tied_motions`, with the directions 4, 5 and 6.
 
@@ -133,12 +131,9 @@ def _mean_rotation(
 
     With the weights c and the eliminated row e, the motion of e is (rotation - sum of the other
     c_i u_i) / c_e. The row of the rotation in the new stiffness is therefore K_ee / c_e^2 on the
-    diagonal, and (K_ei - K_ee c_i / c_e) / c_e beside it, which is solved for c.
-
-    Returns
-    -------
-    WeightedRows or None
-        The weights; None if the moment makes no new unknown.
+    diagonal, and (K_ei - K_ee c_i / c_e) / c_e beside it, which is solved for c. The result is None
+    if
+    the moment makes no new unknown.
     """
     node, direction = dof
     loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
@@ -164,7 +159,7 @@ def _mean_rotation(
 def _eliminated_row(
     matrices: StoredMatrices, loaded: StoredMatrices, rotation: int, lost_dof: Dof
 ) -> int | None:
-    """Return the row that a rotation replaces; None if the other rows do not stand in order.
+    """Return the row that a rotation replaces; None if the order of the other rows differs.
 
     Several rows may have the name of the lost one. Of those, it is the one without which the
     diagonals of both matrices have the most entries in common.
@@ -194,8 +189,9 @@ def _with_signs(
 ) -> dict[Dof, WeightedRows]:
     """Return the weights with the sign with which CalculiX moves the nodes under a moment.
 
-    Torsion of a straight beam moves no node of the deck. The sign then follows from the places of
-    the expanded nodes in the section, which the rotations about the two other axes tell.
+    Torsion of a straight beam moves no node of the deck. The sign then follows from the positions
+    of
+    the expanded nodes in the section, which the rotations about the two other axes show.
     """
     if not rotations:
         return {}
@@ -258,13 +254,9 @@ def _sign_by_section(
     """Return the sign of a rotation about an axis from those about the two other axes.
 
     The mean rotation about a has the weights (a x p) / (m |p|^2) at an expanded node, where p is
-    its place in the section without the component along a, and m the number of expanded nodes.
-    Hence p is -(a x w) / |w|^2 but for a positive factor.
-
-    Returns
-    -------
-    float
-        1 or -1; 0 if the other rotations do not tell the places.
+    its position in the section without the component along a, and m the number of expanded nodes.
+    Hence p is -(a x w) / |w|^2 up to a positive factor. The sign is 0 if the other rotations do not
+    show the positions.
     """
     node, direction = dof
     axis = np.eye(3)[direction - 4]
@@ -286,7 +278,7 @@ def _sign_by_section(
 
 
 def _vectors_of_section(dofs: Sequence[Dof], node: int, weights: WeightedRows) -> FloatArray:
-    """Return the weights (m, 3) of the expanded nodes of a node, which stand in order."""
+    """Return the weights (m, 3) of the expanded nodes of a node, in the order of the rows."""
     dense = weights.vector(len(dofs))
     vectors: list[FloatArray] = []
     previous_axis = 4
@@ -332,7 +324,7 @@ def _rotations_of_rigid_sections(
 
 
 def _free_number(jobs: CalculixJobs) -> int:
-    """Return the first number that no node and no element of the deck has."""
+    """Return the first number that is neither a node's nor an element's."""
     mesh = jobs.model.mesh
     largest_node = max(mesh.points)
     largest_element = max(mesh.elements)
@@ -340,7 +332,7 @@ def _free_number(jobs: CalculixJobs) -> int:
 
 
 def _added_nodes(jobs: CalculixJobs, positions: Mapping[int, int]) -> list[KeywordBlock]:
-    """Return the *NODE of added nodes, each at the position of a node of the deck."""
+    """Return the *NODE block of added nodes, each at the position of a node of the deck."""
     lines = []
     for added, node in positions.items():
         coordinates = [real_text(value) for value in jobs.model.mesh.points[node].tolist()]
@@ -349,7 +341,7 @@ def _added_nodes(jobs: CalculixJobs, positions: Mapping[int, int]) -> list[Keywo
 
 
 def _supports_of(probes: Sequence[_Probe]) -> list[KeywordBlock]:
-    """Return the *BOUNDARY that holds added nodes in the directions without a spring."""
+    """Return the *BOUNDARY block that holds added nodes in the directions without a spring."""
     free: dict[int, set[int]] = {}
     for probe in probes:
         free.setdefault(probe.added_node, set()).add(probe.direction)
@@ -387,7 +379,7 @@ def _weights_of(
     matrices: StoredMatrices,
     probes: Sequence[_Probe],
 ) -> dict[Dof, WeightedRows]:
-    """Return the weights that springs show; none if they change the other rows."""
+    """Return the weights that springs show; empty if CalculiX fails or the rows differ."""
     try:
         probed = jobs.matrices("probes", blocks)
     except CalculixError:
@@ -407,7 +399,7 @@ def _weights_of(
 
 
 def _are_same_rows(jobs: CalculixJobs, dofs: Sequence[Dof], expected: Sequence[Dof]) -> bool:
-    """Return whether rows have the same names, but for the numbers of nodes CalculiX adds."""
+    """Return whether rows have the same names, ignoring numbers of nodes that CalculiX adds."""
     known = jobs.model.mesh.points
     names = [(node if node in known else None, axis) for node, axis in dofs]
     expected_names = [(node if node in known else None, axis) for node, axis in expected]
@@ -415,7 +407,7 @@ def _are_same_rows(jobs: CalculixJobs, dofs: Sequence[Dof], expected: Sequence[D
 
 
 def _significant(weights: FloatArray) -> WeightedRows:
-    """Return the weights (n,) without those that are rounding."""
-    size = np.abs(weights)
-    rows: IntArray = np.flatnonzero(size > _SMALLEST_WEIGHT * size.max())
+    """Return the weights (n,) without rounding errors."""
+    magnitude = np.abs(weights)
+    rows: IntArray = np.flatnonzero(magnitude > _SMALLEST_WEIGHT * magnitude.max())
     return WeightedRows(rows, weights[rows])

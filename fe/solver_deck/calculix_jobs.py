@@ -1,4 +1,4 @@
-"""Runs of CalculiX on variants of a deck, whose faults are said with the line of the deck."""
+"""Run CalculiX on variants of a deck, and cite the line of the deck if it fails."""
 
 import re
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class StoredMatrices:
     ----------
     stiffness, mass : sparse (n, n) array
         The matrices.
-    dofs : list of NodeComponent
+    dofs : list of Dof
         Node and direction of each row. Nodes that CalculiX made have numbers beyond the deck's.
     """
 
@@ -42,12 +42,12 @@ class StoredMatrices:
 
 @dataclass(frozen=True)
 class CalculixJobs:
-    """CalculiX at work on a deck.
+    """Runs of CalculiX on variants of a deck.
 
     Attributes
     ----------
     time_limit : float
-        Time that one run may take [s].
+        Longest time of one run [s].
     """
 
     model: LinearModel
@@ -63,7 +63,7 @@ class CalculixJobs:
         preloaded: bool = False,
         step_lines: Sequence[str] = (),
     ) -> StoredMatrices:
-        """Return the matrices of the model with other blocks.
+        """Let CalculiX store the matrices of the model with given blocks.
 
         Parameters
         ----------
@@ -101,14 +101,14 @@ class CalculixJobs:
         preloaded: bool = True,
         quantity: Literal["U", "RF"] = "U",
     ) -> list[dict[int, FloatArray]]:
-        """Return the displacement (3,) of each node under each load alone, in the deck's unit.
+        """Let CalculiX compute nodal displacements (3,) under each load alone, in the deck's unit.
 
         Parameters
         ----------
         preloaded : bool
-            Whether they follow the preload, if the model has one.
+            Whether the loads follow the preload, if the model has one.
         quantity : "U" or "RF"
-            What CalculiX prints: RF are forces at nodes instead, the loads and the reactions.
+            "RF" gives forces at nodes instead: the loads and the reactions.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class CalculixJobs:
         return [{int(row[0]): row[1:] for row in table} for table in tables]
 
     def frequencies(self, count: int, blocks: Sequence[KeywordBlock]) -> FloatArray:
-        """Return the lowest frequencies (count,) [Hz].
+        """Let CalculiX compute the lowest natural frequencies (count,) [Hz].
 
         Raises
         ------
@@ -158,12 +158,9 @@ class CalculixJobs:
         return KeywordBlock("", "NSET", {"NSET": ALL_NODES}, data)
 
     def _run(self, name: str, text: str) -> str:
-        """Run CalculiX on a text and return what it printed into its table of results.
+        """Run CalculiX on a deck's text and return its table of results.
 
-        Raises
-        ------
-        CalculixError
-            If CalculiX fails; the sentence has its message and the line of the deck.
+        If it fails, the `CalculixError` has its message and the line of the deck.
         """
         try:
             return run_calculix(text, self.folder, name, self.time_limit)
@@ -177,7 +174,7 @@ class CalculixJobs:
             raise CalculixError(f"{where}: CalculiX did not finish: {message}") from None
 
     def _line_of(self, message: str) -> str:
-        """Return file and line of the deck that a message of CalculiX cites; else the file."""
+        """Return the file and line of the deck that a message cites, or else the file."""
         cited = _without_blanks(message)
         for block in self.model.blocks:
             head, *lines = block_lines(block)
@@ -189,7 +186,7 @@ class CalculixJobs:
 
 
 def first_error(log: str) -> str:
-    """Return the first error in the messages of CalculiX, in one line."""
+    """Return the first error in CalculiX's messages as one line."""
     lines = log.splitlines()
     for number, line in enumerate(lines):
         if "*ERROR" in line:
@@ -204,5 +201,5 @@ def first_error(log: str) -> str:
 
 
 def _without_blanks(text: str) -> str:
-    """Return a text without blanks, in capital letters."""
+    """Return a text in capital letters, without white space."""
     return re.sub(r"\s+", "", text).upper()

@@ -1,4 +1,4 @@
-"""How a structure from a deck agrees with CalculiX in statics and frequencies."""
+"""Compare a structure that was made from a deck with CalculiX, in statics and frequencies."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +34,7 @@ CalculiX changes the weights of the mean rotation of a beam's section by up to 1
 
 @dataclass(frozen=True)
 class DeckReport:
-    """A structure that was made from a deck, and how it agrees with CalculiX.
+    """A structure that was made from a deck, and its deviations from CalculiX.
 
     Attributes
     ----------
@@ -43,17 +43,17 @@ class DeckReport:
     regions : list of Region
         The regions that may lose stiffness.
     load_deviations : dict of str to float
-        For each load the largest difference of a nodal displacement to that of CalculiX, over the
+        For each load the largest difference of a nodal displacement from CalculiX, relative to the
         largest displacement.
     load_limits : dict of str to float
-        For each load the largest deviation that is accepted.
+        For each load the largest accepted deviation.
     has_mass : bool
         Whether the deck has a density.
     frequencies : (m,) array
         Lowest frequencies [Hz]. If the deck has no density, they are those with the density
-        `COMPARED_DENSITY`, and serve for the comparison alone.
+        `COMPARED_DENSITY`, for the comparison only.
     frequency_deviation : float
-        Largest relative difference of a frequency to that of CalculiX.
+        Largest relative difference of a frequency from CalculiX.
     remarks : list of str
         Sentences on what is linearised and what is left out.
     """
@@ -76,7 +76,7 @@ def compare_with_calculix(
     remarks: list[str],
     tolerance: float,
 ) -> DeckReport:
-    """Return how a structure file agrees with CalculiX in statics and frequencies."""
+    """Compare a structure file with CalculiX in statics and frequencies."""
     assembled = assemble_structure(file)
     deviations = {}
     if structure.loads:
@@ -111,7 +111,7 @@ def compare_with_calculix(
 
 
 def _limit(model: LinearModel, load: DeckLoad, tolerance: float) -> float:
-    """Return the largest deviation that is accepted under a load."""
+    """Return the largest accepted deviation under a load."""
     of_beams = {
         node
         for element in model.mesh.elements.values()
@@ -129,10 +129,10 @@ def _largest_deviation(
     theirs: dict[int, FloatArray],
     largest_of_rows: float,
 ) -> float:
-    """Return the largest difference of a nodal displacement, over the largest displacement.
+    """Return the largest difference of a nodal displacement, relative to the largest displacement.
 
     The largest displacement is that of any node, or of any row: under torsion of a straight beam
-    its section alone moves.
+    only the nodes of its section move.
     """
     counts = structure.row_counts()
     held = set(structure.model.held)

@@ -1,4 +1,4 @@
-"""From a deck of CalculiX to a structure from matrices, checked against CalculiX itself."""
+"""Convert a deck of CalculiX to a structure from matrices, and check it against CalculiX."""
 
 import itertools
 import re
@@ -48,16 +48,16 @@ from .structure_file import (
 )
 
 _CHANGED_MODULUS = 0.5
-"""By what the modulus of a region is multiplied to find its stiffness."""
+"""Factor on the modulus of a region with which its stiffness is found."""
 _LIFT = 5e-4
-"""Part of the stiffness that is added before it is tested whether what remains is indefinite."""
+"""Fraction of the stiffness that is added before the remainder is tested for definiteness."""
 _ROUNDING = 1e-12
-"""A region changes nothing if it changes no entry by this fraction of the largest one."""
+"""Fraction of the largest entry below which a change of the stiffness is rounding."""
 
 
 @dataclass(frozen=True)
 class DeckOptions:
-    """What a user chooses of a deck.
+    """The choices of a user on the conversion of a deck.
 
     Attributes
     ----------
@@ -65,11 +65,11 @@ class DeckOptions:
         Sets of elements that may lose stiffness, and of nodes whose displacement is an output; if
         empty, they are chosen.
     contact : "tied" or "open"
-        What becomes of contact pairs.
+        How contact pairs are modelled.
     preload : "tangent" or "none"
-        What becomes of a preload.
+        How a preload is modelled.
     time_limit : float
-        Time that a run of CalculiX may take [s].
+        Longest time of a run of CalculiX [s].
     tolerance : float
         Largest relative deviation from CalculiX.
     """
@@ -84,7 +84,7 @@ class DeckOptions:
 
 
 def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
-    """Write a deck as a structure from matrices, and compare it with CalculiX.
+    """Convert a deck to a structure from matrices, and compare it with CalculiX.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> D
         If CalculiX is not installed or fails, if the structure deviates from it by more than the
         tolerance, or if nothing of the structure can be compared with it.
     MeshError
-        If the deck cannot be read, or is not one of an elastic structure.
+        If the deck cannot be read, or does not describe an elastic structure.
     SolutionError
         If the structure is not held.
     """
@@ -115,7 +115,7 @@ def convert_deck(deck: Path, folder: Path, name: str, options: DeckOptions) -> D
 
 
 def _sentence_on_deck(deck: Path, folder: Path, message: str) -> str:
-    """Return a message that names the deck in place of files in the scratch folder."""
+    """Return a message with the deck's name in place of files in the scratch folder."""
     scratch_file = re.escape(str(folder)) + r"[^\s:,;()\[\]]*[^\s:,;()\[\].]"
     sentence = re.sub(scratch_file, lambda _: str(deck), message)
     if str(deck) in sentence:
@@ -124,7 +124,7 @@ def _sentence_on_deck(deck: Path, folder: Path, message: str) -> str:
 
 
 def _convert(deck: Path, folder: Path, name: str, options: DeckOptions) -> DeckReport:
-    """Write a deck as a structure; the parameters are those of `convert_deck`."""
+    """Convert a deck, as `convert_deck` does, but with messages on scratch files."""
     required_calculix()
     model = read_linear_model(deck, options.contact, options.preload)
     regions = choose_regions(model, options.regions)
@@ -197,24 +197,10 @@ def _structure_of_deck(
 def _stable_weight(
     model: LinearModel, stiffness: sparse.csr_array, regions: Sequence[sparse.csr_array]
 ) -> float:
-    """Return which part of the regions' stiffness a preloaded structure can lose in all of them.
+    """Return the fraction of all regions' stiffness that a preloaded structure can lose.
 
-    Parameters
-    ----------
-    stiffness : sparse (n, n) array
-        The stiffness with the preload.
-    regions : sequence of sparse (n, n) array
-        The stiffness of each region without preload.
-
-    Returns
-    -------
-    float
-        The largest tenth at which the remaining stiffness is not indefinite.
-
-    Raises
-    ------
-    SolutionError
-        If a loss of a tenth makes the structure unstable.
+    It is the largest multiple of 0.1 for which the remaining stiffness is not indefinite. Raises
+    `SolutionError` if a loss of 0.1 makes the structure unstable.
     """
     lost = regions[0]
     for region in regions[1:]:
@@ -236,12 +222,9 @@ def _stable_weight(
 def _preloaded_matrices(
     jobs: CalculixJobs, blocks: list[KeywordBlock], unloaded: StoredMatrices
 ) -> StoredMatrices:
-    """Return the matrices at the end of the preload; those of the unloaded structure without one.
+    """Return the matrices at the end of the preload, or the unloaded ones if there is none.
 
-    Raises
-    ------
-    CalculixError
-        If CalculiX fails, or if the preload changes which motions are unknowns.
+    Raises `CalculixError` if CalculiX fails, or if the preload changes which motions are unknowns.
     """
     if not jobs.model.preload:
         return unloaded
@@ -261,9 +244,7 @@ class _ChosenLoads(NamedTuple):
     Attributes
     ----------
     vectors : dict of str to (n,) array
-        The forces of those that nodes and directions alone do not describe.
-    remarks : list of str
-        The sentences.
+        The forces of loads that cannot be given by nodes and directions.
     """
 
     loads: list[DeckLoad]
@@ -309,12 +290,9 @@ def _choose_outputs(
     matrices: StoredMatrices,
     names: Sequence[str],
 ) -> tuple[MotionRows, list[OutputSet]]:
-    """Return the sets whose mean displacement is an output, and the rows that their nodes follow.
+    """Return the sets whose mean displacement is an output, and how it follows from the rows.
 
-    Raises
-    ------
-    MeshError
-        If a name is no set of nodes, or if the displacement of its nodes is not known.
+    Raises `MeshError` if a name is no set of nodes, or the displacement of its nodes is not known.
     """
     candidates = choose_output_sets(jobs.model, names)
     rows = MotionRows(matrices.dofs, set(jobs.model.held))
@@ -341,7 +319,7 @@ def _load_rows(
     matrices: StoredMatrices,
     loads: list[DeckLoad],
 ) -> MotionRows:
-    """Return how the loads act on the rows, also where CalculiX has eliminated what they move."""
+    """Return how the loads act on the rows, also on motions that CalculiX has eliminated."""
     load_rows = MotionRows(matrices.dofs, set(jobs.model.held))
     of_elements = {node for element in jobs.model.mesh.elements.values() for node in element.nodes}
     with_rows = set(matrices.dofs)
@@ -376,9 +354,11 @@ def _gravity_forces(
 ) -> dict[str, FloatArray]:
     """Return the nodal forces (n,) of each load that has an acceleration.
 
-    The rows of held nodes are missing in the mass matrix, but their mass also loads the nodes
-    beside them. For this reason the mass matrix of the structure without supports is multiplied by
-    the acceleration, and the rows of both are matched by name.
+    The rows of held nodes are missing in the mass matrix, but their mass also loads the adjacent
+    nodes.
+    For this reason the mass matrix of the structure without supports is multiplied by the
+    acceleration,
+    and the rows of both are matched by name.
     """
     accelerations = {
         load.name: load.acceleration for load in loads if load.acceleration is not None
@@ -400,7 +380,7 @@ def _gravity_forces(
 def _matched_rows(values: FloatArray, source: StoredMatrices, target: StoredMatrices) -> FloatArray:
     """Return the values of the target's rows, matched by name and order.
 
-    Names with other numbers of rows belong to held nodes; their values are zero.
+    Names with different numbers of rows belong to held nodes; their values are zero.
     """
     source_counts = row_counts(source.dofs)
     target_counts = row_counts(target.dofs)

@@ -1,4 +1,4 @@
-"""Forces and moments on the reference nodes of distributing couplings, as CalculiX shares them.
+"""Replace forces and moments on distributing couplings by the nodal forces of CalculiX.
 
 CalculiX applies such a load as forces at the nodes of the coupled surface, and prints these forces.
 To read them, all other nodes are held, and what else binds the nodes of the surface is left out.
@@ -29,14 +29,14 @@ _SMALLEST_FORCE = 1e-9
 def share_over_couplings(
     jobs: CalculixJobs, blocks: Sequence[KeywordBlock], loads: Sequence[DeckLoad]
 ) -> list[DeckLoad]:
-    """Return the loads with forces at the coupled nodes in place of those at reference nodes.
+    """Replace the loads at reference nodes of couplings by forces at the coupled nodes.
 
     A load on a coupling whose forces CalculiX does not print stays at the reference node.
 
     Raises
     ------
     MeshError
-        If a coupling names what the deck does not have.
+        If a coupling names something that the deck does not have.
     """
     nodes_of_reference = dict(_distributing_couplings(jobs.model))
     shared = []
@@ -61,7 +61,7 @@ def share_over_couplings(
 
 
 def _distributing_couplings(model: LinearModel) -> Iterator[tuple[int, list[int]]]:
-    """Yield the reference node of each distributing coupling, and the nodes that it couples."""
+    """Yield the reference node of each distributing coupling, and the coupled nodes."""
     shells = ShellGeometry(model.mesh, model.blocks)
     for block, next_block in zip(model.blocks, [*model.blocks[1:], None], strict=True):
         if block.keyword == "DISTRIBUTING COUPLING":
@@ -85,7 +85,7 @@ def _distributing_couplings(model: LinearModel) -> Iterator[tuple[int, list[int]
 def _forces_of_unit(
     jobs: CalculixJobs, blocks: Sequence[KeywordBlock], dof: Dof, nodes: Sequence[int]
 ) -> NodalForces:
-    """Return the forces at coupled nodes under a unit force or moment; empty if none is printed."""
+    """Return the forces at coupled nodes for a unit load; empty if CalculiX prints none."""
     model = jobs.model
     reference, direction = dof
     free_nodes = {reference, *nodes}
@@ -113,7 +113,7 @@ def _forces_of_unit(
 
 
 def _without_bonds(blocks: Sequence[KeywordBlock], reference: int) -> list[KeywordBlock]:
-    """Return the blocks without what binds nodes, but for the coupling of a reference node."""
+    """Return the blocks without everything that binds nodes but one node's coupling."""
     remaining = []
     is_other_coupling = False
     for block in blocks:

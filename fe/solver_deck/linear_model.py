@@ -1,8 +1,8 @@
-"""The linear model in a deck: what stands before its first step, at rest and without time.
+"""The linear model in a deck: the blocks before its first step, at rest and without time.
 
 A deck of CalculiX may hold contact, plasticity, preload, heat and curves over time. A structure for
-a twin has constant matrices. This module takes the blocks that make these matrices, and says in a
-sentence what is linearised and what is left out.
+a twin has constant matrices. This module takes the blocks that determine these matrices, and states
+what is linearised and what is left out.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,13 +18,13 @@ from reporting.words import comma_list
 from .mesh_of_deck import DeckMesh, read_deck_mesh
 
 ContactChoice = Literal["tied", "open"]
-"""What becomes of contact pairs: surfaces that stick to each other, or that do not touch."""
+"""How contact pairs are modelled: surfaces that stick to each other, or that do not touch."""
 
 PreloadChoice = Literal["tangent", "none"]
-"""What becomes of a preload: the stiffness at its end, or that of the unloaded structure."""
+"""How a preload is modelled: the stiffness at its end, or that of the unloaded structure."""
 
 _LONGEST_NUMBER = 20
-"""Characters of a number that CalculiX reads; it cuts off others without a word."""
+"""Number of characters of a number that CalculiX reads; it silently cuts off the others."""
 
 TRANSLATIONS = (1, 2, 3)
 ROTATIONS = (4, 5, 6)
@@ -195,7 +195,7 @@ class LinearModel:
         return "\n".join(lines) + "\n"
 
     def _preloaded_lines(self, steps: Iterable[Iterable[str]]) -> list[str]:
-        """Return the lines of supports, preload, and steps with small changes from its end."""
+        """Return the lines of supports, preload, and steps of small changes from its end."""
         lines = []
         for block in self.preload_supports:
             lines += block_lines(block)
@@ -213,13 +213,13 @@ class LinearModel:
 
 
 def real_text(value: float) -> str:
-    """Return a number in at most the 20 characters that CalculiX reads of it."""
+    """Format a number with at most the 20 characters that CalculiX reads."""
     text = repr(value)
     return text if len(text) <= _LONGEST_NUMBER else f"{value:.13e}"
 
 
 def block_lines(block: KeywordBlock) -> list[str]:
-    """Return the lines of a block as they stand in a deck."""
+    """Return the lines of a block in a deck."""
     head = f"*{block.keyword}"
     for name, value in block.parameters.items():
         head += f", {name}={value}" if value else f", {name}"
@@ -234,14 +234,14 @@ def read_linear_model(
     Parameters
     ----------
     contact : "tied" or "open"
-        What becomes of contact pairs.
+        How contact pairs are modelled.
     preload : "tangent" or "none"
-        What becomes of static steps before a first step of small changes (PERTURBATION).
+        How static steps before a first step of small changes (PERTURBATION) are modelled.
 
     Raises
     ------
     MeshError
-        If the deck cannot be read, is not one of an elastic structure, or has no element.
+        If the deck cannot be read, does not describe an elastic structure, or has no element.
     """
     all_blocks = list(read_blocks(path))
     if not all_blocks:
@@ -298,7 +298,7 @@ def _unloaded_blocks(
 
 
 def _preload_steps(steps: list[list[KeywordBlock]]) -> list[list[KeywordBlock]]:
-    """Return the steps before the first with PERTURBATION, if one of them is static."""
+    """Return the static steps before the first with PERTURBATION."""
     for number, step in enumerate(steps):
         if "PERTURBATION" in step[0].parameters:
             earlier = steps[:number]
@@ -310,7 +310,7 @@ def _preload_steps(steps: list[list[KeywordBlock]]) -> list[list[KeywordBlock]]:
 def _steps_after(
     steps: list[list[KeywordBlock]], preload_steps: list[list[KeywordBlock]]
 ) -> list[list[KeywordBlock]]:
-    """Return the steps from the first with PERTURBATION on, or all if there is no preload."""
+    """Return the steps from the first with PERTURBATION on; all if there is no preload."""
     if not preload_steps:
         return steps
     first = next(n for n, step in enumerate(steps) if "PERTURBATION" in step[0].parameters)
@@ -323,7 +323,7 @@ def _without_output(step: list[KeywordBlock]) -> list[KeywordBlock]:
 
 
 def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:
-    """Raise `MeshError` if a deck is not one of an elastic structure in one piece."""
+    """Raise `MeshError` if a deck does not describe an elastic structure in one piece."""
     for block in blocks:
         if block.keyword in _REFUSED:
             raise MeshError(
@@ -347,9 +347,9 @@ def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:
             for block in blocks
             if block.keyword in ("HYPERELASTIC", "HYPERFOAM", "USER MATERIAL", "CONDUCTIVITY")
         ]
-        found = comma_list(list(dict.fromkeys(materials))) if materials else "none"
+        material_text = comma_list(list(dict.fromkeys(materials))) if materials else "none"
         raise MeshError(
-            f"{path}: a material with *ELASTIC is expected, but the deck has {found}; give "
+            f"{path}: a material with *ELASTIC is expected, but the deck has {material_text}; give "
             "its materials an elastic modulus."
         )
 
@@ -389,7 +389,7 @@ def _supports(
 
 
 def _held_motions(supports: list[KeywordBlock], mesh: DeckMesh) -> tuple[list[HeldMotion], bool]:
-    """Return the motions that *BOUNDARY holds, and whether it moves any of them."""
+    """Return the motions that *BOUNDARY holds, and whether it prescribes any to be non-zero."""
     held: dict[HeldMotion, None] = {}
     moved = False
     for block in supports:
@@ -427,7 +427,7 @@ def _remarks(blocks: list[KeywordBlock], contact: ContactChoice) -> list[str]:
 def _preload_remarks(
     blocks: list[KeywordBlock], preload_steps: list[list[KeywordBlock]]
 ) -> list[str]:
-    """Return the sentences on the preload, and on what is left out of the steps after it."""
+    """Return the sentences on the preload, and on what is left out of later steps."""
     sentences = [
         f"the stiffness is that at the end of the preload of {len(preload_steps)} "
         f"{'step' if len(preload_steps) == 1 else 'steps'}, and stays as it is there",

@@ -1,4 +1,4 @@
-"""Loads of a deck: forces and moments at nodes, gravity, and pressure on faces and surfaces."""
+"""Read the loads of a deck: nodal forces and moments, gravity, and pressure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from .pressures import (
 from .shell_sides import ShellGeometry, ShellSide
 
 _SECTORS = 180
-"""CalculiX models two degrees of an axisymmetric body; a force in a deck is that on the whole."""
+"""CalculiX models a sector of two degrees of an axisymmetric body; forces act on the whole."""
 
 
 @dataclass
@@ -34,11 +34,11 @@ class DeckLoad:
     lines : list of str
         The lines of the deck that apply it.
     forces : dict
-        Forces at nodes, in the deck's unit.
+        Forces by node and direction, in the deck's unit.
     side_forces : dict of ShellSide to dict
         Forces on one side of the thickness of shells, at the shell's nodes.
     moments : dict
-        Moments at nodes, by node and direction 4, 5 or 6, in the deck's unit.
+        Moments by node and direction 4, 5 or 6, in the deck's unit.
     acceleration : (3,) array or None
         Acceleration of gravity, in the deck's units.
     """
@@ -71,7 +71,7 @@ class DeckLoad:
 
 @dataclass
 class DeckLoads:
-    """The loads of a deck that are read, and sentences on those that are left out."""
+    """The loads that were read, and sentences on those that are left out."""
 
     loads: list[DeckLoad]
     remarks: list[str]
@@ -80,7 +80,7 @@ class DeckLoads:
 def read_loads(model: LinearModel) -> DeckLoads:
     """Read the loads of a deck: those of one kind in one step are one load.
 
-    Loads of all kinds of steps are read, at the values of their lines, without time curves.
+    Loads of all kinds of steps are read, with the values of their lines, without time curves.
     """
     loads: list[DeckLoad] = []
     remarks: list[str] = []
@@ -123,13 +123,7 @@ def _add_block(
 def _load_of_line(
     model: LinearModel, shells: ShellGeometry, keyword: str, where: str, values: Sequence[str]
 ) -> DeckLoad:
-    """Return the load of a line, whose name is that of its kind.
-
-    Raises
-    ------
-    NotReadError
-        If the load is left out.
-    """
+    """Return the load of a line, named by its kind; raise `NotReadError` if it is left out."""
     if keyword == "CLOAD":
         return _nodal_load(model, where, values)
     if keyword == "DSLOAD":
@@ -140,12 +134,12 @@ def _load_of_line(
 
 
 def _pressure(forces: FaceForces) -> DeckLoad:
-    """Return the load of a pressure."""
+    """Return forces on faces as a load."""
     return DeckLoad("pressure", forces=forces.solid, side_forces=forces.sides)
 
 
 def _add_forces(forces: NodalForces, added: Mapping[tuple[int, int], float]) -> None:
-    """Add forces to those that act at the same nodes."""
+    """Add nodal forces to other ones, in place."""
     for dof, force in added.items():
         forces[dof] = forces.get(dof, 0.0) + force
 
@@ -181,7 +175,7 @@ def _nodal_load(model: LinearModel, where: str, values: Sequence[str]) -> DeckLo
 
 def _gravity(model: LinearModel, where: str, values: Sequence[str]) -> FloatArray:
     """Return the acceleration of a line of gravity, which must act on all elements."""
-    size, *direction = (real(where, _entry(values, number)) for number in (2, 3, 4, 5))
+    magnitude, *direction = (real(where, _entry(values, number)) for number in (2, 3, 4, 5))
     elements = set(model.mesh.elements_named(values[0], where))
     missing = set(model.mesh.elements) - elements
     if missing:
@@ -192,4 +186,4 @@ def _gravity(model: LinearModel, where: str, values: Sequence[str]) -> FloatArra
     axis = np.array(direction)
     if not axis.any():
         fail(where, "gravity needs a direction, but its three components are zero.")
-    return np.asarray(size * axis / np.linalg.norm(axis))
+    return np.asarray(magnitude * axis / np.linalg.norm(axis))

@@ -1,4 +1,4 @@
-"""Nodes, elements and sets of a deck, of any type of element."""
+"""Nodes, elements and sets of a deck, with elements of any type."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ _NODES_OF_TYPE = {
     "T3D2": 2,
     "T3D3": 3,
 }
-"""Numbers of nodes of types of elements whose names do not end with it."""
+"""Number of nodes of element types whose names do not contain it."""
 _COUNT_IN_NAME = re.compile(r"(?:C3D|CPS|CPE|CAX|M3D|S)(\d+)[A-Z]*")
 
 
@@ -74,11 +74,11 @@ class DeckMesh:
         )
 
     def nodes_named(self, text: str, where: str) -> list[int]:
-        """Return the nodes of a set, or the one whose number is given."""
+        """Return the nodes of a set, or the node with this number."""
         return _members(self.node_sets, text, where)
 
     def elements_named(self, text: str, where: str) -> list[int]:
-        """Return the elements of a set, or the one whose number is given."""
+        """Return the elements of a set, or the element with this number."""
         return _members(self.element_sets, text, where)
 
 
@@ -104,7 +104,7 @@ def read_deck_mesh(blocks: Sequence[KeywordBlock]) -> DeckMesh:
 
 
 def _members(sets: dict[str, list[int]], text: str, where: str) -> list[int]:
-    """Return the members of a set, or the number that stands in its place."""
+    """Return the members of a set, or the text as the only member if it is a number."""
     name = text.upper()
     if name in sets:
         return sets[name]
@@ -138,13 +138,13 @@ def _add_elements(mesh: DeckMesh, block: KeywordBlock) -> None:
 
 
 def _node_count(type_name: str) -> int | None:
-    """Return the number of nodes of a type of elements; None for an unknown type."""
+    """Return the number of nodes of an element type; None for an unknown type."""
     in_name = _COUNT_IN_NAME.fullmatch(type_name)
     return int(in_name[1]) if in_name else _NODES_OF_TYPE.get(type_name)
 
 
 def _element_records(block: KeywordBlock, node_count: int | None) -> Iterator[list[int]]:
-    """Yield number and nodes of each element; an element of unknown type has a line of its own."""
+    """Yield number and nodes of each element; one of unknown type takes one line."""
     record: list[int] = []
     for line in block.data:
         record += [whole(line.where, text) for text in line.texts]
@@ -154,7 +154,7 @@ def _element_records(block: KeywordBlock, node_count: int | None) -> Iterator[li
 
 
 def _add_members(sets: dict[str, list[int]], block: KeywordBlock) -> None:
-    """Add the members of an *NSET or *ELSET, written out, as sets, or generated."""
+    """Add the members of an *NSET or *ELSET: listed, given as sets, or generated."""
     members = sets.setdefault(block.required(block.keyword).upper(), [])
     for line in block.data:
         if "GENERATE" in block.parameters:

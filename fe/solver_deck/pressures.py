@@ -1,4 +1,4 @@
-"""Pressure on faces of solids and on shells, as forces at the nodes of the faces."""
+"""Pressure on faces of solids and on shells, as nodal forces."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -20,18 +20,18 @@ NodalForces = dict[tuple[int, int], float]
 
 
 class NotReadError(Exception):
-    """A line of a load that is left out; the message says why."""
+    """Raised for a line of a load that is left out; the message says why."""
 
 
 class FaceForces(NamedTuple):
-    """Forces at the nodes of loaded faces.
+    """Nodal forces on loaded faces.
 
     Attributes
     ----------
     solid : dict
-        Those on nodes of solids.
+        Forces on nodes of solids.
     sides : dict of ShellSide to dict
-        Those on one side of the thickness of shells, at the shell's nodes.
+        Forces on one side of the thickness of shells, at the shell's nodes.
     """
 
     solid: NodalForces
@@ -46,7 +46,7 @@ class _LoadedFace(NamedTuple):
     kind : ElementKind
         The solid whose shape functions the face has.
     face : int
-        Number of the face, from 0.
+        Index of the face, from 0.
     side : ShellSide or None
         The loaded side of a shell; None for a solid.
     """
@@ -68,7 +68,7 @@ bottom pushes along the normal."""
 
 
 def element_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -> FaceForces:
-    """Return the forces of a line of *DLOAD: elements, the label of a face, and the pressure.
+    """Return the nodal forces of a line of *DLOAD: elements, the label of a face, the pressure.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def element_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -
 
 
 def surface_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -> FaceForces:
-    """Return the forces of a line of *DSLOAD: a surface, P, and the pressure.
+    """Return the nodal forces of a line of *DSLOAD: a surface, P, and the pressure.
 
     Raises
     ------
@@ -100,14 +100,14 @@ def surface_pressure(shells: ShellGeometry, where: str, values: Sequence[str]) -
 
 
 def surface_nodes(shells: ShellGeometry, name: str, where: str) -> list[int]:
-    """Return the nodes of the faces of a surface, each once.
+    """Return the distinct nodes of the faces of a surface.
 
     Raises
     ------
     MeshError
         If the deck has no such surface of faces.
     NotReadError
-        If its faces are not read.
+        If its faces cannot be read.
     """
     nodes: dict[int, None] = {}
     for number, label in _surface_faces(shells, name, where):
@@ -119,7 +119,7 @@ def surface_nodes(shells: ShellGeometry, name: str, where: str) -> list[int]:
 
 
 def _surface_faces(shells: ShellGeometry, name: str, where: str) -> list[tuple[int, str]]:
-    """Return the faces of a surface: numbers of elements, each with the label of a pressure."""
+    """Return the faces of a surface: element numbers, each with the label of a pressure."""
     surfaces = [
         block
         for block in shells.blocks
@@ -140,7 +140,7 @@ def _surface_faces(shells: ShellGeometry, name: str, where: str) -> list[tuple[i
 def _pressure_forces(
     shells: ShellGeometry, faces: Sequence[tuple[int, str]], pressure: float
 ) -> FaceForces:
-    """Return the forces of a pressure on faces, each an element's number with a label."""
+    """Return the nodal forces of a pressure on faces, each an element number with a label."""
     result = FaceForces({}, {ShellSide.BOTTOM: {}, ShellSide.TOP: {}})
     for number, label in faces:
         element = shells.mesh.elements.get(number)
@@ -156,7 +156,7 @@ def _pressure_forces(
 
 
 def _loaded_face(element: DeckElement, label: str) -> _LoadedFace:
-    """Return the face of an element on which a pressure of a label acts."""
+    """Return the face of an element that the label of a pressure means."""
     solid = solid_of_shell(element.type_name)
     if solid is not None and label in _SHELL_FACES:
         return _LoadedFace(solid, face=0, side=_SHELL_FACES[label])
@@ -174,9 +174,10 @@ def _nodal_forces(
 ) -> Iterator[tuple[int, FloatArray]]:
     """Yield the nodes of a face with the force (3,) that the pressure exerts on each.
 
-    A shell is the first face of a solid, whose other nodes do not count. Pressure on the bottom
-    acts along the normal of the shell. Pressure on a solid acts against the outward normal, which
-    for the first face is the same direction.
+    A shell is treated as the first face of a solid, whose other nodes do not matter. Pressure on
+    the
+    bottom acts along the normal of the shell. Pressure on a solid acts against the outward normal,
+    which for the first face is the same direction.
     """
     kind = loaded.kind
     face = loaded.face

@@ -1,4 +1,4 @@
-"""Regions of a deck with materials of their own, and their moduli."""
+"""Give regions of a deck materials of their own, and scale their moduli."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -34,7 +34,7 @@ _MODULI = {
     "ANISO": tuple(range(21)),
     "ENGINEERING CONSTANTS": (0, 1, 2, 6, 7, 8),
 }
-"""Which constants of a temperature are moduli, by the TYPE of *ELASTIC; the others are ratios."""
+"""Indices of the constants that are moduli, by the TYPE of *ELASTIC; the others are ratios."""
 
 _CONSTANTS = {
     "ISO": 2,
@@ -42,7 +42,7 @@ _CONSTANTS = {
     "ANISO": 21,
     "ENGINEERING CONSTANTS": 9,
 }
-"""Number of constants of a temperature, by the TYPE of *ELASTIC."""
+"""Number of constants for one temperature, by the TYPE of *ELASTIC."""
 
 COMPARED_DENSITY = "1e-9"
 """Density of a deck without any, with which its frequencies are compared with those of CalculiX.
@@ -68,8 +68,8 @@ def choose_regions(model: LinearModel, set_names: Sequence[str]) -> list[Region]
     Parameters
     ----------
     set_names : sequence of str
-        Names of sets of elements; if it is empty, the sets of all sections whose material is
-        elastic.
+        Names of sets of elements; if empty, the sets of all sections with an elastic material are
+        taken.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def choose_regions(model: LinearModel, set_names: Sequence[str]) -> list[Region]
 
 
 def name_in_file(name: str) -> str:
-    """Return the name of a set as a name in a structure file: small letters, digits and `_`."""
+    """Convert the name of a set to a name in a structure file: small letters, digits and `_`."""
     letters = [letter if letter.isascii() and letter.isalnum() else "_" for letter in name.lower()]
     return "".join(letters)
 
@@ -130,16 +130,9 @@ def with_own_materials(model: LinearModel, regions: Sequence[Region]) -> list[Ke
 def with_scaled_modulus(
     blocks: Sequence[KeywordBlock], region_number: int, factor: float
 ) -> list[KeywordBlock]:
-    """Return blocks of `with_own_materials` in which the moduli of one region are multiplied.
+    """Return blocks of `with_own_materials` with the moduli of one region scaled.
 
-    Parameters
-    ----------
-    blocks : sequence of KeywordBlock
-        The blocks in which each region has materials of its own.
-    region_number : int
-        Number of the region, from 1.
-    factor : float
-        By what the moduli are multiplied.
+    The number of the region counts from 1.
     """
     scaled = []
     material = ""
@@ -154,7 +147,7 @@ def with_scaled_modulus(
 
 
 def with_densities(model: LinearModel, blocks: Sequence[KeywordBlock]) -> list[KeywordBlock]:
-    """Return blocks in which each elastic material has a density, which CalculiX asks for.
+    """Return blocks in which each elastic material has a density, which CalculiX needs.
 
     If the deck has no density at all, it is `COMPARED_DENSITY`; else it is negligible.
     """
@@ -209,7 +202,7 @@ def _elastic_sets(model: LinearModel) -> dict[str, frozenset[int]]:
 def _with_material_of_region(
     model: LinearModel, blocks: list[KeywordBlock], region: Region, suffix: str
 ) -> list[KeywordBlock]:
-    """Return blocks in which a region has copies of its materials, whose names end with a suffix.
+    """Return blocks in which a region has copies of its materials, named with a suffix.
 
     The elements of a section inside the region get the copies; those outside keep the materials.
     """
@@ -243,7 +236,7 @@ def _with_material_of_region(
 def _copied_materials(
     blocks: Sequence[KeywordBlock], names: set[str], suffix: str
 ) -> Iterator[KeywordBlock]:
-    """Yield the blocks of the named materials under names that end with a suffix."""
+    """Yield the blocks of some materials under names with a suffix."""
     is_copied = False
     for block in blocks:
         if block.keyword == "MATERIAL":
@@ -259,7 +252,7 @@ def _copied_materials(
 
 
 def _with_materials(section: KeywordBlock, suffix: str) -> KeywordBlock:
-    """Return a section whose materials are those with a suffix."""
+    """Return a section with the materials of the same names with a suffix."""
     if "MATERIAL" in section.parameters:
         material = section.parameters["MATERIAL"].upper() + suffix
         return section._replace(parameters=section.parameters | {"MATERIAL": material})
@@ -270,7 +263,7 @@ def _with_materials(section: KeywordBlock, suffix: str) -> KeywordBlock:
 
 
 def _with_set(section: KeywordBlock, set_name: str) -> KeywordBlock:
-    """Return a section of another set of elements."""
+    """Return a section with another set of elements."""
     return section._replace(parameters=section.parameters | {"ELSET": set_name})
 
 
@@ -284,7 +277,7 @@ def _element_set(section: KeywordBlock, name: str, members: Sequence[int]) -> Ke
 
 
 def _with_scaled_constants(block: KeywordBlock, factor: float) -> KeywordBlock:
-    """Return an *ELASTIC whose moduli are multiplied by a factor, at every temperature."""
+    """Return an *ELASTIC with its moduli scaled, at every temperature."""
     type_name = block.parameters.get("TYPE", "ISO").upper()
     # CalculiX reads the beginning of the word alone, so that ISOTROPIC is ISO.
     kind = next((name for name in _MODULI if type_name.startswith(name[:5])), None)
@@ -298,7 +291,7 @@ def _with_scaled_constants(block: KeywordBlock, factor: float) -> KeywordBlock:
 
 
 def _record_widths(kind: str) -> list[int]:
-    """Return how many numbers stand in each line of a record: the constants and a temperature."""
+    """Return how many numbers each line of a record has: the constants and a temperature."""
     remaining = _CONSTANTS[kind] + 1
     widths = []
     while remaining > 0:
@@ -310,7 +303,7 @@ def _record_widths(kind: str) -> list[int]:
 def _scaled_records(
     block: KeywordBlock, widths: Sequence[int], moduli: Sequence[int], factor: float
 ) -> list[DataLine]:
-    """Return the lines of constants in which the moduli are multiplied by a factor."""
+    """Return the lines of constants with the moduli scaled."""
     starts: Mapping[int, int] = {line: sum(widths[:line]) for line in range(len(widths))}
     lines = []
     for number, (where, values) in enumerate(block.data):

@@ -1,4 +1,4 @@
-"""Vectors over the rows of the matrices: motions of nodes as weighted rows, and nodal forces."""
+"""Motions of nodes as weighted rows of the matrices, and loads as vectors over the rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ class WeightedRows(NamedTuple):
     Attributes
     ----------
     rows : (m,) array of int
-        The rows.
+        Indices of the rows.
     weights : (m,) array
         Their weights.
     """
@@ -45,12 +45,12 @@ class WeightedRows(NamedTuple):
 
 
 class MotionReader:
-    """The rows of each motion of a node.
+    """The rows of each degree of freedom.
 
     Parameters
     ----------
-    dofs : sequence of NodeComponent
-        Node and direction of each row.
+    dofs : sequence of Dof
+        Degree of freedom of each row.
     """
 
     def __init__(self, dofs: Sequence[Dof]) -> None:
@@ -59,29 +59,29 @@ class MotionReader:
             self.rows.setdefault(dof, []).append(row)
 
     def weighted(self, dof: Dof, table: RowWeights) -> WeightedRows | None:
-        """Return a motion as weighted rows; None if there are none of known weights."""
+        """Return a motion as weighted rows; None if their weights are not known."""
         rows = self.rows.get(dof, [])
         if len(rows) not in table:
             return None
         return WeightedRows(np.array(rows), np.array(table[len(rows)]))
 
     def displacement(self, solution: FloatArray, dof: Dof) -> float | None:
-        """Return the displacement of a node in a solution (n,) as CalculiX prints it."""
+        """Return the displacement of a node in a solution (n,), as CalculiX prints it."""
         weighted = self.weighted(dof, READ_WEIGHTS)
         return None if weighted is None else float(solution[weighted.rows] @ weighted.weights)
 
 
 @dataclass(frozen=True)
 class MotionRows:
-    """How motions of nodes follow from the rows of the matrices, and loads act on these.
+    """How motions of nodes follow from the rows of the matrices, and how loads act on them.
 
     Attributes
     ----------
-    dofs : list of NodeComponent
-        Node and direction of each row.
+    dofs : list of Dof
+        Degree of freedom of each row.
     held : set of HeldMotion
-        Motions that are held, and take up what acts on them.
-    bound : dict of NodeComponent to WeightedRows
+        Held motions; loads on them have no effect.
+    bound : dict of Dof to WeightedRows
         Motions without a row of their own: those of tied nodes, and rotations.
     """
 
@@ -100,9 +100,9 @@ class MotionRows:
         return HeldMotion(node, direction) in self.held
 
     def displacement(self, dof: Dof) -> WeightedRows | None:
-        """Return the displacement of a node along an axis; None if it is not known.
+        """Return the displacement of a node as weighted rows; None if it is not known.
 
-        A held displacement follows from no row.
+        A held displacement has no rows.
         """
         if self.is_held(dof):
             return WeightedRows(np.empty(0, dtype=np.intp), np.empty(0))
@@ -111,19 +111,16 @@ class MotionRows:
         return self._reader.weighted(dof, READ_WEIGHTS)
 
     def names_all(self, load: DeckLoad) -> bool:
-        """Return whether all forces of a load act on rows that their names tell, or on supports."""
+        """Return whether nodes and directions alone describe a load's forces."""
         has_others = bool(load.moments) or any(
             any(forces.values()) for forces in load.side_forces.values()
         )
         return not has_others and not self.missing(load, bound=False)
 
     def missing(self, load: DeckLoad, *, bound: bool = True) -> list[Dof]:
-        """Return the motions of a load's forces along axes that have no rows and are not held.
+        """Return the translations at which a load acts and that have no rows and are not held.
 
-        Parameters
-        ----------
-        bound : bool
-            Whether bound motions count as having rows.
+        `bound` says whether bound motions count as having rows.
         """
         tables = [load.forces, *load.side_forces.values()]
         dofs = [dof for table in tables for dof, force in table.items() if force]
@@ -136,7 +133,7 @@ class MotionRows:
         ]
 
     def missing_rotations(self, load: DeckLoad) -> list[Dof]:
-        """Return the motions of a load's moments that have no rows and are not held."""
+        """Return the rotations at which a load acts and that have no rows and are not held."""
         return [
             dof
             for dof, moment in load.moments.items()
@@ -161,7 +158,7 @@ class MotionRows:
             np.add.at(vector, weighted.rows, force * weighted.weights)
 
     def _rows_of(self, dof: Dof) -> WeightedRows | None:
-        """Return the rows on which a force at a node acts."""
+        """Return the weighted rows on which a force at a node acts."""
         if dof in self.bound:
             return self.bound[dof]
         return self._reader.weighted(dof, FORCE_WEIGHTS)

@@ -1,4 +1,4 @@
-"""The two sides of shells, at half their thickness from the nodes."""
+"""The bottom and top sides of shells, half the thickness away from the mid-surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,14 +36,14 @@ class ShellSide(StrEnum):
 
 
 def solid_of_shell(type_name: str) -> ElementKind | None:
-    """Return the solid whose first face has the shape functions of a shell; None for no shell."""
+    """Return the solid whose first face has the shape functions of a shell, or None."""
     solid = _SHELL_SOLIDS.get(type_name)
     return None if solid is None else KIND_BY_TYPE[solid]
 
 
 @dataclass(frozen=True)
 class _Thickness:
-    """Thickness of a shell, and its middle above the nodes in thicknesses."""
+    """Thickness of a shell, and the offset of its mid-surface from the nodes in thicknesses."""
 
     thickness: float
     offset: float
@@ -51,7 +51,7 @@ class _Thickness:
 
 @dataclass(frozen=True)
 class ShellGeometry:
-    """Sides of the shells of a deck.
+    """Positions of nodes on the sides of a deck's shells.
 
     CalculiX expands a shell along the normal at each node, which is the mean of the normals of the
     shells that meet there, and applies pressure on the expanded side.

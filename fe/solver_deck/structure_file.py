@@ -1,4 +1,4 @@
-"""The structure file, matrices and vectors that describe a deck as a structure from matrices."""
+"""Write a deck as a structure file with matrices and vectors."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -24,9 +24,9 @@ MASS_FILE = "mass.npz"
 PARAMETER = "e"
 """Name of the parameter that scales the moduli of all regions."""
 LARGEST_NAME = 28
-"""Longest name of a set in the file, to which an axis is added."""
+"""Largest length of a set's name in the file, to which an axis is added."""
 MOST_OUTPUTS = 12
-"""Sets of nodes that become outputs, if none is named."""
+"""Largest number of sets that become outputs, if none is named."""
 
 
 class OutputSet(NamedTuple):
@@ -47,26 +47,22 @@ class OutputSet(NamedTuple):
     axes: str
 
     def dofs(self) -> list[Dof]:
-        """Return node and direction of all displacements that the outputs need."""
+        """Return the degrees of freedom whose mean is an output."""
         return [(node, "xyz".index(letter) + 1) for letter in self.axes for node in self.nodes]
 
 
 @dataclass(frozen=True)
 class DeckStructure:
-    """A deck as matrices.
+    """A deck as matrices, loads and outputs.
 
     Attributes
     ----------
-    matrices : StoredMatrices
-        Stiffness and mass of the whole.
     region_stiffness : dict of Region to sparse (n, n) array
         The stiffness of each region.
     load_vectors : dict of str to (n,) array
-        Forces of each load that nodes and directions alone do not describe, such as gravity.
-    output_sets : list of OutputSet
-        The sets of nodes whose displacement is an output.
+        Forces of loads that cannot be given by nodes and directions, such as gravity.
     motion_rows : MotionRows
-        How the motions of their nodes follow from the rows.
+        How the motions of output sets follow from the rows.
     """
 
     model: LinearModel
@@ -79,12 +75,12 @@ class DeckStructure:
     length_unit: str
 
     def row_counts(self) -> dict[Dof, int]:
-        """Return how many rows of the matrices each direction of a node has."""
+        """Return the number of rows of each degree of freedom."""
         return row_counts(self.matrices.dofs)
 
 
 def row_counts(dofs: Sequence[Dof]) -> dict[Dof, int]:
-    """Return how many rows have each name."""
+    """Return the number of rows of each degree of freedom."""
     counts: dict[Dof, int] = {}
     for dof in dofs:
         counts[dof] = counts.get(dof, 0) + 1
@@ -97,13 +93,13 @@ def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputS
     Parameters
     ----------
     names : sequence of str
-        Names of sets of nodes, each alone or with axes, as `TIP` or `TIP:z`; if it is empty, all
-        sets that hold at most half of the nodes.
+        Names of sets of nodes, each alone or with axes, such as `TIP` or `TIP:z`; if empty, all
+        sets with at most half of the nodes are taken.
 
     Raises
     ------
     MeshError
-        If a name is no set or number of nodes, or if its axes are none.
+        If a name is no set or number of nodes, or if its axes are not some of x, y, z.
     """
     if not names:
         return [
@@ -126,15 +122,14 @@ def choose_output_sets(model: LinearModel, names: Sequence[str]) -> list[OutputS
 
 
 def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> OutputSet | None:
-    """Return an output along those of its axes along which its mean displacement is known.
+    """Return an output with those of its axes along which its mean displacement is known.
+
+    A set that the user did not name, and that has no such axis, gives None.
 
     Parameters
     ----------
-    rows : MotionRows
-        How motions of nodes follow from the rows of the matrices.
     option : str or None
-        The text of `--output`; None if the set was not named. A set that was not named and has no
-        such axis is no output.
+        The text of `--output`; None if the user did not name the set.
 
     Raises
     ------
@@ -164,13 +159,7 @@ def movable_output(output: OutputSet, rows: MotionRows, option: str | None) -> O
 
 
 def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> Path:
-    """Write the structure file `NAME.toml` with its matrices and vectors into a folder.
-
-    Returns
-    -------
-    Path
-        The structure file.
-    """
+    """Write the structure file `NAME.toml` with its matrices and vectors; return its path."""
     sparse.save_npz(folder / "stiffness.npz", structure.matrices.stiffness)
     sparse.save_npz(folder / MASS_FILE, structure.matrices.mass)
     unknowns = "".join(f"{node}.{axis}\n" for node, axis in structure.matrices.dofs)
@@ -201,7 +190,7 @@ def write_structure_files(structure: DeckStructure, folder: Path, name: str) -> 
 
 
 def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
-    """Write the vector of a load, and return the name of its file."""
+    """Write the vector of a load; return the name of its file."""
     if load.name in structure.load_vectors:
         file = f"{load.name}.npy"
         np.save(folder / file, structure.load_vectors[load.name])
@@ -218,7 +207,7 @@ def _write_load(structure: DeckStructure, load: DeckLoad, folder: Path) -> str:
 
 
 def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> Iterator[str]:
-    """Yield the lines of the outputs of a set: mean displacements, and the strain of a pair."""
+    """Yield the lines of a set's outputs: mean displacements, and the strain between two nodes."""
     name = name_in_file(output.name)[:LARGEST_NAME]
     if not name[0].isalpha():
         name = f"n{name}"[:LARGEST_NAME]
@@ -238,9 +227,9 @@ def _output_lines(structure: DeckStructure, output: OutputSet, folder: Path) -> 
 
 
 def _write_mean(structure: DeckStructure, output: OutputSet, name: str, folder: Path) -> str:
-    """Write the vector of a mean displacement along one axis, and return the name of its file.
+    """Write the vector of a mean displacement along one axis; return the name of its file.
 
-    A table of nodes tells more than a vector of all rows, but cannot contain tied nodes.
+    A table of nodes is more readable than a vector of all rows, but cannot contain tied nodes.
     """
     rows = structure.motion_rows
     weight = 1.0 / len(output.nodes)
