@@ -1,4 +1,4 @@
-"""Structures and the wing against CalculiX on the identical mesh: statics and modes."""
+"""Compare structures and the wing with CalculiX on the identical mesh: statics and modes."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -19,12 +19,12 @@ INTEGRATION_POINTS = np.fliplr(gauss_points(3).points)
 
 
 def _relative_difference(theirs: FloatArray, ours: FloatArray) -> float:
-    """Return the largest difference over our largest value."""
+    """Return the largest difference relative to our largest value."""
     return float(np.abs(theirs - ours).max() / np.abs(ours).max())
 
 
 class Agreement(NamedTuple):
-    """The agreement of a model with CalculiX.
+    """Differences between a model and CalculiX.
 
     Attributes
     ----------
@@ -73,9 +73,9 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
         The model in one state. A structure is to be assembled with `mass_as_stiffness`, so that
         frequencies can be compared.
     folder : Path
-        The folder in which CalculiX writes its files.
+        CalculiX writes its files there.
     modes : int
-        The number of lowest modes to compare.
+        Number of modes.
 
     Raises
     ------
@@ -100,12 +100,9 @@ def _prints_strains(deck: CalculixDeck) -> bool:
 
 
 def _static_results(deck: CalculixDeck, folder: Path) -> list[_PrintedResults]:
-    """Run CalculiX for each load alone, and return the results that it prints.
+    """Run CalculiX for each load alone, and return its results.
 
-    Raises
-    ------
-    CalculixError
-        If CalculiX fails, or prints results for another number of loads.
+    Raises `CalculixError` if it fails, or prints results for another number of loads.
     """
     if not deck.loads:
         return []
@@ -148,21 +145,9 @@ def _calculix_frequencies(deck: CalculixDeck, folder: Path, modes: int) -> Float
 def _differences(
     deck: CalculixDeck, displacement: FloatArray, printed_results: _PrintedResults
 ) -> dict[str, float]:
-    """Return the relative differences between our solution and that of CalculiX for one load.
+    """Return the relative differences from CalculiX for one load, see `Agreement.loads`.
 
-    Parameters
-    ----------
-    deck : CalculixDeck
-        The model of n unknowns that both solved.
-    displacement : (n,) array
-        Our solution for the free unknowns [m].
-    printed_results : _PrintedResults
-        The results of CalculiX for the same load.
-
-    Returns
-    -------
-    dict of str to float
-        The difference of each quantity that the deck has; see `Agreement.loads`.
+    `displacement` (n,) is our solution for the free unknowns [m].
     """
     our_probes = deck.probes @ displacement
     our_nodes = deck.structure.full_displacement(displacement)

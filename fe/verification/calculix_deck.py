@@ -3,9 +3,9 @@
 CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets nodes,
 cells, local material constants with their orientations, supports and springs, rigid sets as
 equations on two reference nodes, and point masses as blocks tied to the structure. It integrates,
-assembles and solves on its own, and applies pressures and acceleration fields itself. The results
-that are read are displacements of probe nodes, which equations make equal to a strain or a
-displacement, because printed displacements have seven digits only.
+assembles and solves on its own, and applies pressures and acceleration fields itself. Strains and
+displacement outputs are read as displacements of probe nodes, which equations make equal to them,
+because printed displacements have seven digits only.
 """
 
 import itertools
@@ -32,7 +32,7 @@ from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators, wing_values
 
 CALCULIX_STRAINS = [0, 1, 2, 5, 4, 3]
-"""Numbers of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
+"""Indices of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
 # CalculiX's 21 anisotropic constants are the upper triangle of the elasticity, column by column.
 _COLUMNS, _ROWS = np.tril_indices(6)
 _ANISOTROPIC_ROWS = np.array(CALCULIX_STRAINS)[_ROWS]
@@ -65,13 +65,13 @@ class Step(NamedTuple):
     Attributes
     ----------
     load : (n,) array
-        The load [N], which replaces that of the step before; empty if that stays.
+        The load [N], which replaces that of the previous step; empty if that stays.
     lines : iterable of str
         Loads that CalculiX applies itself, and the printed results.
     nodal : bool
-        Whether the load is given as nodal forces, and not by lines.
+        Whether the load is given as nodal forces instead of lines.
     procedure : tuple of str
-        Lines that say which problem is solved.
+        Lines that select the problem to solve.
     """
 
     load: FloatArray = np.empty(0)
@@ -81,7 +81,7 @@ class Step(NamedTuple):
 
 
 class Grading(NamedTuple):
-    """Elasticity that varies within cells, which the deck states as temperature-dependent.
+    """Elasticity that varies within cells, which the deck describes as temperature-dependent.
 
     The nodes get artificial temperatures, between which CalculiX interpolates the elasticity.
 
@@ -145,13 +145,13 @@ class CalculixDeck:
     title : str
         The title of the job.
     body : Body
-        Its mesh with materials and supports; the n free unknowns are in the order of its supports.
+        Mesh, materials and supports; the n free unknowns are in the order of its supports.
     values : mapping of str to float
-        The state of the structure by name; all other values are nominal, and healthy.
+        The state of the structure by name; all other values are nominal, and losses are zero.
     loads : mapping of str to Step
-        Static steps of its loads, each alone.
+        Static steps, one for each load.
     grading : Grading, optional
-        Elasticity that changes inside cells.
+        Elasticity that varies inside cells.
     damping : (float, float)
         Rayleigh damping [1/s] and [s] of a step in time.
     """
@@ -166,7 +166,7 @@ class CalculixDeck:
 
     @property
     def _materials(self) -> Iterator[Material]:
-        """The materials of the deck in this state: equal cells share one."""
+        """The materials of the deck in this state, one for all cells with equal properties."""
         values_by_kind = self.structure.split_values(self.values)
         theta = self.structure.theta(values_by_kind.parameters, values_by_kind.losses)
         factor_of_cell = theta[self.body.part]
@@ -250,10 +250,7 @@ class CalculixDeck:
         return [*zip(block.corners, point + corners, strict=True)]
 
     def _equations(self, blocks: Iterable[MassBlock], first_probe: int) -> Iterator[list[Term]]:
-        """Yield the constraint equations, each as the terms of a sum that is zero.
-
-        The first term is that of the dependent displacement.
-        """
+        """Yield the constraint equations: terms whose sum is zero, the dependent one first."""
         yield from self._rigid_equations()
         for block in blocks:
             yield from _block_equations(block)
@@ -262,7 +259,7 @@ class CalculixDeck:
             yield [Term(first_probe + node, direction + 1, -1.0), *self.terms(row)]
 
     def _rigid_equations(self) -> Iterator[list[Term]]:
-        """Yield the equations of displacements that follow the motions of a rigid set."""
+        """Yield the equations of displacements that follow a rigid set."""
         supports = self.body.supports
         moving = np.flatnonzero(np.diff(supports.expansion.indptr))
         driven = np.setdiff1d(moving, supports.free_displacements)
@@ -272,7 +269,7 @@ class CalculixDeck:
             yield [Term(node, direction, -1.0), *self.terms(row)]
 
     @cached_property
-    def places(self) -> list[tuple[int, int]]:
+    def dofs(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
         first_motion = self.body.mesh.unknowns
         motions = range(first_motion, first_motion + self._motion_count)
@@ -282,7 +279,7 @@ class CalculixDeck:
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield a term for each nonzero entry of a row (n,) on the free unknowns."""
         for unknown_number in np.flatnonzero(values).tolist():
-            node, direction = self.places[unknown_number]
+            node, direction = self.dofs[unknown_number]
             yield Term(node, direction, float(values[unknown_number]))
 
 
@@ -310,17 +307,17 @@ def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
 
 
 def _groups_of_three(count: int) -> int:
-    """Return the number of nodes needed for `count` values, three directions each."""
+    """Return the number of nodes for `count` values, three directions each."""
     return -(-count // 3)
 
 
 def _node_and_direction(unknown_number: int) -> tuple[int, int]:
-    """Return node and direction, both from 1, of an unknown."""
+    """Return the node and the direction of an unknown, both from 1."""
     return unknown_number // 3 + 1, unknown_number % 3 + 1
 
 
 def number_line(values: ArrayLike) -> str:
-    """Return numbers with the digits of a double, at most 20 characters each, for CalculiX."""
+    """Format numbers with 14 digits, in at most 20 characters each, for CalculiX."""
     return ",".join(f"{value:.13E}" for value in np.asarray(values).ravel().tolist())
 
 
@@ -343,14 +340,14 @@ def structure_deck(structure: Structure) -> CalculixDeck:
 
 
 def _load_step(structure: Structure, load: MeshLoad) -> Step:
-    """Return the static step of a load, with the value of `control_value_alone`."""
+    """Return the static step of a load, its control at `control_value_alone`."""
     factor = structure.control_value_alone(load.name)
     lines = ["*DLOAD, OP=NEW"]
     if load.acceleration is not None:
-        size = float(np.linalg.norm(load.acceleration))
-        direction = np.sign(factor) * np.asarray(load.acceleration) / size
-        size_and_direction = number_line([abs(factor) * size, *direction])
-        lines.append(f"EHEAVY,GRAV,{size_and_direction}")
+        magnitude = float(np.linalg.norm(load.acceleration))
+        direction = np.sign(factor) * np.asarray(load.acceleration) / magnitude
+        magnitude_and_direction = number_line([abs(factor) * magnitude, *direction])
+        lines.append(f"EHEAVY,GRAV,{magnitude_and_direction}")
     elif load.pressure is not None and load.set is not None:
         surface = structure.mesh.faces_of(load.set, load.name)
         pressure = number_line([factor * load.pressure])

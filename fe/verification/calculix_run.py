@@ -91,9 +91,9 @@ def run_calculix(text: str, folder: Path, name: str, time_limit: float = _TIME_L
     Parameters
     ----------
     folder : Path
-        Where input, results and messages (`NAME.log`) are written; it is made if it is missing.
+        Input, results and messages (`NAME.log`) are written there; it is made if it is missing.
     time_limit : float
-        Time that CalculiX may take [s]; an hour by default.
+        Longest time of the run [s]; an hour by default.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Checks of a wing's model: rigid motions, sums that must agree, convergence, CalculiX."""
+"""Checks of a wing's model: rigid motions, balances, mesh convergence, CalculiX."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -29,11 +29,11 @@ from .calculix_deck import wing_deck
 from .calculix_run import calculix_program
 
 DAMAGED_LOSSES = (0.4, 0.6)
-"""Stiffness losses of the damage regions, in turn, in the damaged state that is checked."""
+"""Alternating stiffness losses of the damage regions in the damaged state that is checked."""
 REFINEMENTS = (0.5, 1.0, 2.0)
 QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
 RIGID_FORCE_LIMIT = 1e-12
-"""Largest elastic force in a rigid motion, relative to the terms whose sum it is."""
+"""Largest elastic force in a rigid motion, relative to the terms that cancel."""
 MASS_LIMIT = 1e-10
 """Largest relative difference between the mass of the matrix and that of the volumes."""
 BALANCE_LIMIT = 1e-5
@@ -41,7 +41,7 @@ BALANCE_LIMIT = 1e-5
 CONVERGENCE_LIMIT = 0.01
 """Largest relative change of a result between the two finest meshes."""
 CALCULIX_LIMIT = 1e-5
-"""Largest relative difference to CalculiX."""
+"""Largest relative difference from CalculiX."""
 
 
 class RootMotions(NamedTuple):
@@ -68,15 +68,7 @@ def _root_motions(operators: AffineOperators) -> RootMotions:
 
 
 class Balance(NamedTuple):
-    """Two sums that must agree.
-
-    Attributes
-    ----------
-    value, expected : float
-        The sums.
-    unit : str
-        The unit of both sums.
-    """
+    """Two sums that must agree, and their unit."""
 
     value: float
     expected: float
@@ -85,11 +77,6 @@ class Balance(NamedTuple):
 
 def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, Balance]:
     """Return pairs of sums that must be equal in a correct model of the wing.
-
-    Parameters
-    ----------
-    load_factor : float
-        The load factor of the turn.
 
     Returns
     -------
@@ -153,12 +140,7 @@ class MeshResults(NamedTuple):
 
 
 def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[MeshResults]:
-    """Return the results on a sequence of meshes; nothing is fitted again.
-
-    Parameters
-    ----------
-    refinements : sequence of float
-        The refinements of the meshes.
+    """Return the results on meshes of several refinements, without recalibration.
 
     Raises
     ------
@@ -189,10 +171,11 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
 
 
 def observed_order(ratio: float, values: Sequence[float]) -> float:
-    """Return the order of convergence p that the results on the three finest meshes show.
+    """Return the observed order of convergence p on the three finest meshes.
 
     With v = v_0 + c h^p and h_k = h_0 / ratio^k, successive changes of v have the ratio
-    ratio^p, from which p follows (Roache 1998, Richardson extrapolation).
+    ratio^p, from which p follows (Roache 1998, Richardson extrapolation). It is NaN if the results
+    oscillate, or if p is not between 0.05 and 12.
 
     Parameters
     ----------
@@ -200,11 +183,6 @@ def observed_order(ratio: float, values: Sequence[float]) -> float:
         The ratio of the mesh sizes h of successive meshes, coarser to finer.
     values : sequence of float
         The results, from the coarsest to the finest mesh; at least three.
-
-    Returns
-    -------
-    float
-        The order; NaN if the results oscillate, or if the order is not between 0.05 and 12.
     """
     earlier_change = values[-2] - values[-3]
     last_change = values[-1] - values[-2]
@@ -217,18 +195,16 @@ def observed_order(ratio: float, values: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the verification: a figure, and the limit that it must keep, if it has one.
+    """One line of the verification: a value, and its limit if it has one.
 
     Attributes
     ----------
     group, name : str
         The group of the check, and the quantity that is checked.
-    value : float
-        The figure.
     limit : float, optional
-        Largest allowed value; None for a figure that is only reported.
+        Largest allowed value; None for a value that is only reported.
     note : str
-        Text printed after the figure.
+        Text printed after the value.
     """
 
     group: str
@@ -239,12 +215,12 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the limit is kept."""
+        """Whether the value does not exceed its limit."""
         return self.limit is None or self.value <= self.limit
 
 
 def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[Check]:
-    """Return all checks of a design, with those against CalculiX if CalculiX is installed.
+    """Run all checks of a design, with those against CalculiX if it is installed.
 
     Parameters
     ----------
@@ -276,10 +252,10 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
     """Yield the checks of the wing's forces, masses and energies.
 
     First, rigid motions must cause no elastic force. With the stiffness K_0 without the springs of
-    the root, and all rigid motions r that the root allows, the figure is the largest entry of K_0 r
+    the root, and all rigid motions r that the root allows, the value is the largest entry of K_0 r
     relative to the largest entry of |K| |r|. That is the size of the terms that cancel, and so of
-    their rounding errors. Then come the balances of `wing_balance` at the load factor of the lift
-    that the design states, each as the relative difference of two sums.
+    their rounding errors. Then come the balances of `wing_balance` at the load factor of the
+    design's lift, each as the relative difference of two sums.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()
@@ -306,14 +282,14 @@ def balance_checks(operators: AffineOperators) -> Iterator[Check]:
 def convergence_checks(
     design: WingDesign, refinements: tuple[float, ...], *, limited: bool = True
 ) -> Iterator[Check]:
-    """Yield the change of every result between the two finest meshes, and its observed order.
+    """Yield the change of each result between the two finest meshes, and its observed order.
 
     Parameters
     ----------
     refinements : tuple of float
         At least three, from coarse to fine, with equal ratios.
     limited : bool
-        Hold the changes to their limits, which are made for `REFINEMENTS`.
+        Compare the changes with limits, which are made for `REFINEMENTS`.
     """
     results = mesh_convergence(design, refinements)
     middle, fine = refinements[-2:]
@@ -350,12 +326,9 @@ def convergence_checks(
 
 
 def calculix_checks(operators: AffineOperators, jobs: Path) -> Iterator[Check]:
-    """Yield the differences to CalculiX on the identical mesh: statics and six modes.
+    """Yield the differences from CalculiX on the identical mesh: statics and six modes.
 
-    Parameters
-    ----------
-    jobs : Path
-        The folder in which CalculiX writes its files.
+    `jobs` is the folder in which CalculiX writes its files.
     """
     damaged = tuple(
         DAMAGED_LOSSES[number % len(DAMAGED_LOSSES)] for number in range(len(operators.regions))

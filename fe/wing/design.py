@@ -28,15 +28,7 @@ _NAMES = Path(__file__).with_name("names.toml")
 
 
 def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
-    """Return the names and ranges of a wing's inputs, and the names of its outputs, as a design.
-
-    Parameters
-    ----------
-    regions : tuple of str
-        Names of the damage regions.
-    gauges : int
-        Number of gauges.
-    """
+    """Return a wing as a structure design: names and ranges of inputs, names of outputs."""
     content = read_toml(_NAMES, DesignFileError) | {
         "damage": [{"name": name} for name in regions],
         "gauge": [{"name": f"gauge_{number}"} for number in range(1, gauges + 1)],
@@ -47,7 +39,7 @@ def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
 
 
 RESERVED_NAMES = frozenset((*wing_input_names(()), "skin", "webs", "ribs"))
-"""Names that damage regions cannot have, because they mean something else beside these."""
+"""Names that damage regions cannot have, because other inputs or regions have them."""
 
 
 class WingDesign(DesignSection):
@@ -128,7 +120,7 @@ class WingDesign(DesignSection):
 
     @property
     def hash(self) -> str:
-        """SHA-256 of the content, 64 hexadecimal digits; comments and key order do not count."""
+        """SHA-256 of the content in hexadecimal; comments and the order of keys do not count."""
         content = self.model_dump(mode="json")
         default_names = default_region_names(len(self.defects))
         for defect, default_name in zip(content["defects"], default_names, strict=True):
@@ -148,7 +140,7 @@ class WingDesign(DesignSection):
         return self.webs[-1].chord
 
     def changed(self, **sections: Any) -> "WingDesign":
-        """Return a checked copy with other contents: `design.changed(mesh={"refinement": 2.0})`.
+        """Return a checked copy with changes: `design.changed(mesh={"refinement": 2.0})`.
 
         Parameters
         ----------
@@ -171,12 +163,12 @@ class WingDesign(DesignSection):
 
 
 def _smallest_chord(design: WingDesign) -> float:
-    """Return the chord at the root or at the tip [m], whichever is smaller."""
+    """Return the smaller of the chords at root and tip [m]."""
     return min(design.planform.root_chord, design.planform.tip_chord)
 
 
 def _web_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield webs that are not in order, or lie outside the chord."""
+    """Yield the checks that webs are in order and lie inside the chord."""
     smallest_chord = _smallest_chord(design)
     for index, (web, next_web) in enumerate(itertools.pairwise(design.webs)):
         distance = (next_web.chord - web.chord) * smallest_chord
@@ -191,7 +183,7 @@ def _web_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def _skin_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield a skin that is too thick for the section at a web."""
+    """Yield the checks that the skin is thin enough for the section at each web."""
     smallest_chord = _smallest_chord(design)
     thickness = design.skin.thickness
     for web in design.webs:
@@ -205,7 +197,7 @@ def _skin_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def _rod_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield rods in webs that do not exist."""
+    """Yield the checks that rods lie in webs that exist."""
     last_web = len(design.webs) - 1
     for index, rod in enumerate(design.rods):
         yield (
@@ -215,7 +207,7 @@ def _rod_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def _rib_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield ribs that overlap."""
+    """Yield the checks that ribs do not overlap."""
     intervals = sorted((*rib_interval(design, index), index) for index in range(len(design.ribs)))
     for (_, end, first), (start, _, second) in itertools.pairwise(intervals):
         yield (
@@ -225,7 +217,7 @@ def _rib_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def _box_check(design: WingDesign, subject: str, front: float, rear: float) -> Check:
-    """Return whether chord fractions lie outside the box, with the sentence about the subject."""
+    """Check that a pair of chord fractions lies inside the box; `subject` begins the message."""
     is_inside = design.front_chord <= front <= rear <= design.rear_chord
     return not is_inside, (
         f"{subject} lies outside the skin of the box from chord {design.front_chord:g} to "
@@ -234,7 +226,7 @@ def _box_check(design: WingDesign, subject: str, front: float, rear: float) -> C
 
 
 def _region_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield damage regions that lie off the box, overlap, or have names that are taken."""
+    """Yield the checks that damage regions lie on the box, do not overlap and have free names."""
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
         label = f"defects[{index}]"
@@ -273,13 +265,13 @@ def _overlap(defect: parts.Defect, other_defect: parts.Defect) -> bool:
 
 
 def _added_density_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield intervals of added density that end before they begin."""
+    """Yield the checks that intervals of added density begin before they end."""
     for index, added in enumerate(design.added_density):
         yield added.end <= added.start, f"added_density[{index}] must end behind its start"
 
 
 def _gauge_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield gauges that reach off the wing or off the box."""
+    """Yield the checks that gauges lie on the wing and on the box."""
     planform = design.planform
     half_length = 0.5 * design.gauges.averaging_spanwise
     half_width = 0.5 * design.gauges.averaging_chordwise
@@ -303,7 +295,7 @@ def _gauge_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def _point_checks(design: WingDesign) -> Iterator[Check]:
-    """Yield point masses and a test load that lie off the box."""
+    """Yield the checks that point masses and the test load lie on the box."""
     chords = [(f"point_masses[{i}]", mass.chord) for i, mass in enumerate(design.point_masses)]
     chords.append(("tip_load", design.tip_load.chord))
     for label, chord in chords:
@@ -313,7 +305,7 @@ def _point_checks(design: WingDesign) -> Iterator[Check]:
 
 
 def rib_interval(design: WingDesign, index: int) -> tuple[float, float]:
-    """Return start and end of a rib's thickness [m from the root], moved inside the span."""
+    """Return the start and the end of a rib [m from the root], moved inside the span."""
     rib = design.ribs[index]
     span = design.planform.semi_span
     start = rib.station * span - 0.5 * rib.thickness
@@ -322,18 +314,13 @@ def rib_interval(design: WingDesign, index: int) -> tuple[float, float]:
 
 
 def parse_design(content: dict[str, Any], source: str = "the design") -> WingDesign:
-    """Return the design in the content of a design file.
-
-    Parameters
-    ----------
-    source : str
-        The name of the design in sentences.
+    """Validate the content of a design file; `source` is its name in error messages.
 
     Raises
     ------
     InvalidDesignError
-        If the content is not a wing that can be built; the sentence names `source`, the key, what
-        was found and what was expected.
+        If the content is not a wing that can be built; the message names `source`, the key, what
+        was given and what was expected.
     """
     return validate(
         WingDesign, content, source, InvalidDesignError, what="a wing design", first_index=0
@@ -341,7 +328,7 @@ def parse_design(content: dict[str, Any], source: str = "the design") -> WingDes
 
 
 def load_design(path: Path | str | None = None) -> WingDesign:
-    """Read a design file; without a path, the shipped design of the UAV wing.
+    """Read and validate a design file, by default the shipped design of the UAV wing.
 
     Raises
     ------

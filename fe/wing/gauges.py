@@ -1,4 +1,4 @@
-"""Strain gauges of the wing as rows on the displacements."""
+"""Strain gauges of the wing, as rows that give strains from nodal displacements."""
 
 from typing import NamedTuple
 
@@ -62,13 +62,11 @@ class _SkinPoint(NamedTuple):
     Attributes
     ----------
     gauge : int
-        Number of the gauge.
+        Index of the gauge.
     weight : float
         Weight of the strain in the mean of the gauge.
-    cell : int
-        The cell of the point.
     local : (3,) array
-        The local position of the point in the cell.
+        The position of the point in the reference cell.
     """
 
     gauge: int
@@ -78,22 +76,17 @@ class _SkinPoint(NamedTuple):
 
 
 def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
-    """Return the matrix that gives the gauge strains from nodal displacements.
+    """Return the matrix (gauges, full) [1/m] that gives strains from nodal displacements.
 
     Kapteyn et al. 2021, eq. (15). The strain is that of the upper skin, on its outer surface or in
-    the middle of its thickness. It is averaged over the area of the gauge, separately in each
-    interval between mesh lines.
+    the middle of its thickness, positive in compression. It is averaged over the area of the gauge,
+    separately in each interval between mesh lines.
 
     Parameters
     ----------
     angle : float
         Direction of the gauges in the plane of the skin: the angle [rad] from the spanwise
         direction, positive towards the trailing edge.
-
-    Returns
-    -------
-    csr (gauges, full)
-        Rows [1/m], positive in compression.
     """
     points: list[_SkinPoint] = []
     for gauge in range(len(mesh.design.gauges.positions)):
@@ -114,7 +107,7 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
 
 
 def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
-    """Return the integration points of a gauge, which averages over a rectangle around its middle.
+    """Return the integration points of a gauge, which averages over a rectangle.
 
     Along the span, the middle of the rectangle keeps its distance to the straight chord line.
     """
@@ -145,20 +138,7 @@ def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
 def _directions_in_skin(
     mesh: WingMesh, cells: IntArray, local_positions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return unit directions in the skin, along the span and aft.
-
-    Parameters
-    ----------
-    cells : (p,) array of int
-        Cells.
-    local_positions : (p, 3) array
-        A local position in each of the cells.
-
-    Returns
-    -------
-    along, aft : (p, 3) arrays
-        The directions.
-    """
+    """Return unit vectors (p, 3) in the skin, along the span and aft, at positions in cells."""
     along_chord, along_span, _ = np.moveaxis(mesh.jacobians_at(cells, local_positions), 2, 0)
     normal = unit_vector(np.cross(along_chord, along_span))
     _, span_component, _ = np.split(normal, 3, axis=1)

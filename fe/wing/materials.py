@@ -19,7 +19,7 @@ _SPANWISE = 1  # of the local axes, and of the strains in them
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
-    """Return the elasticity (nc, 6, 6) [Pa] in space of every cell, at e = 1, without damage."""
+    """Return the elasticity (nc, 6, 6) [Pa] of each cell in global axes, at e = 1, undamaged."""
     elasticities = np.empty((len(mesh.cells), 6, 6))
     _set_skin_elasticity(mesh, elasticities)
     for index, web in enumerate(mesh.design.webs):
@@ -35,7 +35,7 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
 
 
 def _set_skin_elasticity(mesh: WingMesh, elasticities: FloatArray) -> None:
-    """Set the elasticity of the skin and of the leading-edge wall in local axes (nc, 6, 6) [Pa].
+    """Set the elasticity of the skin and of the leading-edge wall in local axes, in place.
 
     The local axes are chordwise (1), spanwise (2) and across (3). The wall stands upright: its
     thickness lies along the chord, so that its in-plane shear is that of axes 2 and 3.
@@ -60,7 +60,7 @@ def _set_skin_elasticity(mesh: WingMesh, elasticities: FloatArray) -> None:
 
 
 def _add_rod_stiffness(mesh: WingMesh, elasticities: FloatArray) -> None:
-    """Add the flapwise bending stiffness of rods to their webs, in local axes (nc, 6, 6) [Pa]."""
+    """Add the flapwise bending stiffness of rods to their webs, in local axes, in place."""
     for rod in mesh.design.rods:
         has_rod = _cells_with_rod(mesh, rod)
         height = _web_height(mesh)[has_rod]
@@ -71,16 +71,16 @@ def _add_rod_stiffness(mesh: WingMesh, elasticities: FloatArray) -> None:
 
 
 def _cells_with_rod(mesh: WingMesh, rod: Rod) -> BoolArray:
-    """Return whether each cell (nc,) belongs to the web of a rod, within the reach of the rod."""
+    """Return whether each cell (nc,) belongs to the part of a web with a rod."""
     on_web = mesh.web == rod.web
     within_reach = mesh.centre_stations < rod.reach
     return np.asarray(on_web & within_reach)
 
 
 def cell_axes(mesh: WingMesh) -> FloatArray:
-    """Return the local material axes (nc, 3, 3) of every cell.
+    """Return the local material axes (nc, 3, 3) of each cell, as rows.
 
-    The rows are chordwise, spanwise and across the surface of the cell.
+    They are chordwise, spanwise and normal to the surface of the cell.
     """
     centre = np.array([[0.5, 0.5, 0.5]])
     jacobian = jacobians(mesh.kind, mesh.nodes, centre).squeeze(axis=1)
@@ -92,15 +92,10 @@ def cell_axes(mesh: WingMesh) -> FloatArray:
 
 
 def modulus_variation(mesh: WingMesh) -> FloatArray:
-    """Return the ratio of Young's modulus at Gauss points of cells to that at their centres.
+    """Return Young's modulus at Gauss points of cells relative to their centres: (nc, 27).
 
     The points are those of `gauss_points(3)`. The ratio differs from one if the skin's modulus is
     given at stations, between which it is linear, so that it changes within a cell.
-
-    Returns
-    -------
-    (nc, 27) array
-        The ratios.
     """
     rule = gauss_points(3)
     factor = np.ones((len(mesh.cells), len(rule.weights)))
@@ -124,7 +119,7 @@ def _web_height(mesh: WingMesh) -> FloatArray:
 
 
 def cell_density(mesh: WingMesh) -> FloatArray:
-    """Return the density (nc,) [kg/m^3] of every cell."""
+    """Return the density (nc,) [kg/m^3] of each cell."""
     design = mesh.design
     density = np.full(len(mesh.cells), design.skin.density)
     station = mesh.centre_stations

@@ -1,9 +1,9 @@
-"""Mesh of the wing: a tensor grid of hexahedra from which skin, web and rib cells are kept.
+"""Mesh of the wing: the cells of a tensor grid of hexahedra that are skin, webs or ribs.
 
 Axes: x aft along the chord, y outboard along the span, z up; the straight chord line of the
-planform is x = 0. Cells run (chord i, span j, height k): k = 0 is the lower skin, the last k the
-upper skin. Between them lie the webs, the ribs and the wall that closes the leading edge. Local
-axes of a cell follow (i, j, k), and its Jacobian is positive.
+planform is x = 0. Cells are indexed by chord i, span j and height k: k = 0 is the lower skin, the
+last k the upper skin. Between them lie the webs, the ribs and the wall that closes the leading
+edge. Local axes of a cell follow (i, j, k), and its Jacobian is positive.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from .mesh_lines import MeshLine, cells_within, chord_lines, rib_cells, span_lin
 from .parts import four_digit_half_thickness, four_digit_slope
 
 SKIN = 0
-"""Number of the skin in `WingMesh.region_names`; the damage regions follow, then webs and ribs."""
+"""Index of the skin in `WingMesh.region_names`; the damage regions follow, then webs and ribs."""
 
 _NARROW = 0.2
 """A cell is narrow below this fraction of the widest one."""
@@ -65,12 +65,12 @@ class WingMesh(CellMesh):
 
     @property
     def region_names(self) -> tuple[str, ...]:
-        """Names of the regions: skin, the damage regions of the design, webs, ribs."""
+        """Names of the regions: skin, damage regions, webs, ribs."""
         return ("skin", *self.design.regions, "webs", "ribs")
 
     @property
     def stiffness_term(self) -> IntArray:
-        """Stiffness term (nc,) of each cell: the skin, a damage region, or all else."""
+        """Stiffness term (nc,) of each cell: the skin, a damage region, or all others."""
         return np.minimum(self.region, len(self.design.regions) + 1)
 
     @property
@@ -103,17 +103,9 @@ class WingMesh(CellMesh):
         return table
 
     def chord_positions(self, distance: float) -> FloatArray:
-        """Return the distances of the mesh lines along the span from the leading edge.
+        """Return the distances (nx + 1,) [m] of the lines along the span from the leading edge.
 
-        Parameters
-        ----------
-        distance : float
-            Distance of the section from the root [m].
-
-        Returns
-        -------
-        (nx + 1,) array
-            Distances [m].
+        `distance` is that of the section from the root [m].
         """
         planform = self.design.planform
         chord = planform.chord(distance / planform.semi_span)
@@ -122,7 +114,7 @@ class WingMesh(CellMesh):
     def skin_point(
         self, distance: float, behind: float, *, upper: bool = True
     ) -> tuple[int, FloatArray]:
-        """Find the cell of a point on the outer surface of the skin, and its position in the cell.
+        """Return the cell of a point on the outer surface of the skin, and its position (3,) in it.
 
         The check of the design guarantees that the point lies on the box.
 
@@ -134,13 +126,6 @@ class WingMesh(CellMesh):
             Distance from the leading edge [m].
         upper : bool
             Whether the point is on the upper skin or on the lower one.
-
-        Returns
-        -------
-        cell : int
-            The cell.
-        local : (3,) array
-            The local position in the cell.
         """
         i, x = _interval_of(self.chord_positions(distance), behind)
         j, y = _interval_of(self.span_lines, distance)
@@ -160,7 +145,7 @@ def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
 def straight_edged(
     distance_aft: FloatArray, chord: FloatArray, thickness_ratio: float
 ) -> FloatArray:
-    """Return half thicknesses at mesh lines, so that straight edges fit the airfoil best.
+    """Return half thicknesses at mesh lines with which straight edges fit the airfoil best.
 
     Straight edges between points of the airfoil would make the section too thin, the more so the
     coarser the mesh. Here each line is moved off the airfoil, by offsets that minimise the squared
@@ -207,10 +192,7 @@ def _half_thickness(behind: FloatArray, chord: FloatArray, thickness_ratio: floa
 def _hat_function_gram(width: FloatArray) -> FloatArray:
     """Return the inner products (ny + 1, nx + 1, nx + 1) of the lines' hat functions.
 
-    Parameters
-    ----------
-    width : (nx, ny + 1) array
-        Width of the cells at each station [m].
+    `width` (nx, ny + 1) is the width of the cells at each station [m].
     """
     cells, stations = width.shape
     gram = np.zeros((stations, cells + 1, cells + 1))
@@ -224,24 +206,13 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
 
 
 def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return moments of the gap between the airfoil and the straight edges of its mesh.
+    """Return moments (ny + 1, nx + 1) [m^2] of the gap between the airfoil and straight edges.
 
-    For each mesh line, the gap times the linear shape function (hat) of the line is integrated over
-    the chord, by Gauss-Legendre quadrature in each cell.
-
-    Parameters
-    ----------
-    behind : (nx + 1, ny + 1) array
-        Distance of each mesh line behind the leading edge, at each station [m].
-    chord : (ny + 1,) array
-        The chord at each station [m].
-    thickness_ratio : float
-        Thickness of the airfoil over its chord.
-
-    Returns
-    -------
-    (ny + 1, nx + 1) array
-        The integrals [m^2].
+    The moment of a mesh line is the integral over the chord of the gap times the linear shape
+    function
+    (hat) of the line, by Gauss-Legendre quadrature in each cell. `behind` (nx + 1, ny + 1) is the
+    distance of each line from the leading edge at each station [m], `chord` (ny + 1,) the chord
+    [m].
     """
     width = np.diff(behind, axis=0)
     height_on_lines = _half_thickness(behind, chord, thickness_ratio)
@@ -266,21 +237,9 @@ def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: flo
 def _grid_points(
     design: WingDesign, across: FloatArray, along: tuple[MeshLine, ...], height_cells: int
 ) -> FloatArray:
-    """Return the vertices of the whole grid.
+    """Return the vertices (nx + 1, ny + 1, nz + 1, 3) [m] of the whole grid.
 
-    Parameters
-    ----------
-    across : (ny + 1,) array
-        Mesh lines across the span [m].
-    along : tuple of MeshLine
-        The nx + 1 mesh lines along the span.
-    height_cells : int
-        Number of cells between the skins.
-
-    Returns
-    -------
-    (nx + 1, ny + 1, nz + 1, 3) array
-        Positions [m].
+    `across` (ny + 1,) are the mesh lines across the span [m], `along` the nx + 1 lines along it.
     """
     planform = design.planform
     thickness_ratio = design.airfoil.thickness_ratio
@@ -315,7 +274,7 @@ class _GridCells:
     leading_edge, is_kept : (nx, ny, nz) array of bool
         Whether a cell belongs to the leading-edge wall, and to the wing at all.
     region : (nx, ny, nz) array of int
-        Number of the region in `WingMesh.region_names`.
+        Index of the region in `WingMesh.region_names`.
     """
 
     web: IntArray
@@ -328,7 +287,7 @@ class _GridCells:
 def _grid_cells(
     design: WingDesign, across: FloatArray, along: tuple[MeshLine, ...], height_cells: int
 ) -> _GridCells:
-    """Return the parts of the grid's cells; parameters are those of `_grid_points`."""
+    """Assign each cell of the grid to a part; the parameters are those of `_grid_points`."""
     # numbers of a cell along the chord, along the span and over the height
     shape = (len(along) - 1, len(across) - 1, height_cells + 2)
     i, j, k = np.indices(shape)

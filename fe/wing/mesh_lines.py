@@ -1,4 +1,4 @@
-"""Mesh lines of the wing: those that the parts of the wing ask for, and lines between them."""
+"""Mesh lines of the wing: those that its parts require, and lines between them."""
 
 import itertools
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from fe.runtime.errors import MeshError
 from .design import WingDesign, rib_interval
 
 SMALLEST_GAP = 2e-4
-"""Two mesh lines that the design asks for may not lie closer than this [m]."""
+"""Smallest distance of two mesh lines that the design requires [m]."""
 _SAME = 1e-9
 
 
@@ -26,7 +26,7 @@ class MeshLine(NamedTuple):
     offset : float
         The distance of the line from this position [m].
     label : str
-        The name of the line in sentences.
+        The name of the line in messages.
     """
 
     fraction: float
@@ -42,7 +42,7 @@ class MeshLine(NamedTuple):
 
 
 class OptionalLine(NamedTuple):
-    """A mesh line that is taken if it crosses no other and none is nearer than `room` [m]."""
+    """A mesh line that is used if it crosses no other and none is nearer than `room` [m]."""
 
     line: MeshLine
     room: float
@@ -56,21 +56,9 @@ def _filled(
 ) -> list[MeshLine]:
     """Return the required lines, optional ones that have room, and lines between them.
 
-    Parameters
-    ----------
-    required : iterable of MeshLine
-        Lines that the design requires; of two lines at the same position one is kept.
-    optional : iterable of OptionalLine
-        Lines that are taken if they have room.
-    chords : (k,) array
-        The chords at root and tip, where lines are compared [m].
-    size : float
-        The largest cell at the first chord [m].
-
-    Raises
-    ------
-    MeshError
-        If required lines nearly coincide or cross.
+    `chords` (k,) are the chords at which lines are compared [m], and `size` is the largest cell at
+    the
+    first of them [m]. Raises `MeshError` if required lines nearly coincide or cross.
     """
     lines = _distinct_lines(required, chords)
     for line, room in optional:
@@ -85,7 +73,7 @@ def _filled(
 
 
 def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[MeshLine]:
-    """Return required lines in their order, each once; raises `MeshError` if two are too close."""
+    """Sort required lines and drop duplicates; raise `MeshError` if two are too close."""
     lines: list[MeshLine] = []
     for line in sorted(required, key=lambda line: (line.at(chords)[0], line.label)):
         if lines:
@@ -104,10 +92,9 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
 
 
 def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
-    """Return whether a new line keeps its distance from all others.
+    """Return whether a new line lies between others, crosses none and keeps its distance.
 
-    It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
-    the chords.
+    The distance is `room` [m], at each of the chords.
     """
     other_positions = np.array([other_line.at(chords) for other_line in lines])
     gaps = line.at(chords) - other_positions
@@ -123,16 +110,9 @@ def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatA
 def _lines_between(
     start: MeshLine, end: MeshLine, chords: FloatArray, size: float
 ) -> list[MeshLine]:
-    """Return evenly spaced mesh lines between two lines, without these.
+    """Return evenly spaced mesh lines between two lines, excluding these.
 
-    Parameters
-    ----------
-    start, end : MeshLine
-        The two lines.
-    chords : (k,) array
-        The chords at which lines are located [m].
-    size : float
-        The largest distance of neighbouring lines at the first of these chords [m].
+    `size` is the largest distance of neighbouring lines at the first of the chords (k,) [m].
     """
     distance = (end.at(chords) - start.at(chords))[0]
     # 1e-9: a quotient that is an integer but for rounding errors needs no additional cell
@@ -162,17 +142,14 @@ def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLin
 
 
 def span_lines(design: WingDesign) -> FloatArray:
-    """Return the mesh lines across the span: rib faces, edges of defects, ends of bands, others.
+    """Return the distances (ny + 1,) [m] of the mesh lines across the span from the root.
 
-    Returns
-    -------
-    (ny + 1,) array
-        The distances of the lines from the root [m].
+    They are rib faces, edges of defects, ends of bands, and lines between.
 
     Raises
     ------
     MeshError
-        If two lines that the design asks for nearly coincide.
+        If two lines that the design requires nearly coincide.
     """
     span = design.planform.semi_span
     settings = design.mesh
@@ -231,12 +208,12 @@ def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
 def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
     """Return the nx + 1 mesh lines along the span.
 
-    These are web faces, edges of defects, the leading-edge wall, and lines between.
+    They are web faces, edges of defects, the leading-edge wall, and lines between.
 
     Raises
     ------
     MeshError
-        If two lines that the design asks for nearly coincide, or cross between root and tip.
+        If two lines that the design requires nearly coincide, or cross between root and tip.
     """
     planform = design.planform
     settings = design.mesh
@@ -260,7 +237,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return for each cell between mesh lines the interval that contains its middle.
+    """Return the interval (n,) that contains the middle of each cell between lines, -1 for none.
 
     Parameters
     ----------
@@ -268,11 +245,6 @@ def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) ->
         Mesh lines, ascending.
     intervals : iterable of (float, float)
         Start and end of each interval.
-
-    Returns
-    -------
-    (n,) array of int
-        Number of the interval, -1 for none.
     """
     middle = 0.5 * (lines[1:] + lines[:-1])
     interval_of_cell = np.full(len(middle), -1, dtype=np.int64)

@@ -4,8 +4,8 @@ K(e, z) = e K_skin + (1 - z1) K_1 + ... + K_0 and M(m) = M_0 + m_servo M_s + m_p
 K_skin is the skin without the damage regions: in the published model the factor e does not scale
 them. The root is a rigid rib on three springs. Its held motions are eliminated, so that all
 matrices act on the free unknowns: those of the nodes outside the root section, then root heave [m],
-flap [rad] and yaw [rad]. Gauge strains are weights of nodal displacements, Kapteyn et al. 2021, eq.
-(15). Statics and modes of the full wing follow eqs. (13), (15) and (16).
+flap [rad] and yaw [rad]. Gauge strains are weighted sums of nodal displacements, Kapteyn et al.
+2021, eq. (15). Statics and modes of the full wing follow eqs. (13), (15) and (16).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ROOT_UNKNOWNS = 3
 
 @dataclass(frozen=True)
 class AffineWing(AffineStructure):
-    """A wing as a structure: a factor on its skin, two masses, a turn, a force near its tip."""
+    """A wing as a structure: a factor on its skin, two masses, the load of a turn, a tip force."""
 
     followed_load = TIP_FORCE
 
@@ -52,7 +52,7 @@ class AffineWing(AffineStructure):
 
     @property
     def load_tip(self) -> FloatArray:
-        """Upward load (n,) of 1 N at the point of the static test; as a row, its displacement."""
+        """Load (n,) of 1 N upwards at the point of the static test; as a row, its displacement."""
         return self.load_terms[1].vector
 
     @property
@@ -61,19 +61,19 @@ class AffineWing(AffineStructure):
         return np.asarray(self.displacement_output.todense()).ravel()
 
     def turn(self, load_factor: float, tip_force: float = 0.0) -> FloatArray:
-        """Return the load (n,) [N] at a load factor and an upward tip force [N]."""
+        """Return the load (n,) [N] for a load factor and an upward tip force [N]."""
         return load_factor * self.load_lift + tip_force * self.load_tip
 
 
 def point_masses(servo: float, pitot: float) -> dict[str, float]:
-    """Return the masses [kg] of one servo and of the pitot by their names."""
+    """Return the masses [kg] of one servo and of the pitot tube by their input names."""
     return {"servo_mass": servo, "pitot_mass": pitot}
 
 
 def stiffness_parts(regions: Iterable[str]) -> tuple[tuple[str | None, str | None], ...]:
-    """Return parameter and region of each part of the stiffness.
+    """Return the parameter and the region of each part of the stiffness.
 
-    The parts are the skin without the damage regions, each of these, and all else.
+    The parts are the skin without the damage regions, each of these, and all others.
     """
     skin = ("young_modulus_factor", None)
     all_else = (None, None)
@@ -118,13 +118,13 @@ class AffineOperators(AffineWing):
 
 
 def structural_mass(design: WingDesign) -> float:
-    """Return the mass of the structure without its point masses, from the cells' volumes [kg]."""
+    """Return the mass of the structure without point masses [kg], from the cells' volumes."""
     mesh = build_mesh(design)
     return float(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum())
 
 
 def root_support(mesh: WingMesh) -> Supports:
-    """Return the support of the wing: its root section moves as a rigid rib on springs.
+    """Return the support of the wing: its root section is a rigid rib on springs.
 
     The rib may heave along z, flap about x and yaw about z, both about the straight chord line. Its
     three unknowns come last. Its other motions are held.
@@ -149,7 +149,7 @@ def root_support(mesh: WingMesh) -> Supports:
 
 
 def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float) -> FloatArray:
-    """Return weights (nodes,) that give the displacement of a section at a chord position.
+    """Return nodal weights (nodes,) that give the displacement of a section at a chord position.
 
     It is the mean of the displacements of the upper and the lower skin there.
 
@@ -171,7 +171,7 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
 
 
 def upward(weights: FloatArray) -> FloatArray:
-    """Return weights on all unknowns (full,) that weigh upward displacements of nodes (nodes,)."""
+    """Expand nodal weights (nodes,) to weights (full,) of upward displacements."""
     return np.kron(weights, np.array([0.0, 0.0, 1.0]))
 
 
@@ -203,17 +203,13 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
 
 
 def lift_load(mesh: WingMesh) -> FloatArray:
-    """Return the aerodynamic load of a wing at load factor 1, upward and forward, without inertia.
+    """Return the aerodynamic load (3 nodes,) [N] at load factor 1, upward and forward.
 
     Half of the load acts on each skin, on the outer faces of its cells. Along the span it follows
     the distribution of the design. Along the chord it is proportional to (1 - xi)^p, where xi is
     the fraction of the chord from the leading edge and p the exponent of the design. Its sum over
-    all nodes is exactly the force of the design, divided by the load factor of that force.
-
-    Returns
-    -------
-    (3 nodes,) array
-        The forces x, y, z of each node [N]; x points aft, y along the span, z up.
+    all nodes is exactly the force of the design, divided by the load factor of that force. The
+    components are x aft, y along the span, z up.
     """
     lift = mesh.design.lift
     distribution = np.zeros(len(mesh.points))
@@ -227,7 +223,7 @@ def lift_load(mesh: WingMesh) -> FloatArray:
 
 
 def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None:
-    """Add the pressure on the upper or the lower skin to a load (nodes,), up to a common factor."""
+    """Add the pressure on the upper or lower skin to a load (nodes,), up to a common factor."""
     planform = mesh.design.planform
     lift = mesh.design.lift
     # integration points on the outer faces
@@ -280,15 +276,15 @@ def assemble(source: Path | str, memory_limit: float | None = None) -> AffineStr
 
 
 def assemble(source: WingDesign | Path | str, memory_limit: float | None = None) -> AffineStructure:
-    """Return the full finite element model of a wing, or of a structure file.
+    """Assemble the full finite element model of a wing, or of a structure file.
 
     Parameters
     ----------
     source : WingDesign, Path or str
         The design of a wing, or the path of a structure file beside its mesh or matrices.
     memory_limit : float, optional
-        Bytes that assembly and factorisation of a structure may take; by default what the machine
-        has free.
+        Memory that assembly and factorisation of a structure may take [bytes]; by default all that
+        is free.
 
     Returns
     -------
@@ -308,12 +304,9 @@ def assemble(source: WingDesign | Path | str, memory_limit: float | None = None)
 
 
 def _assemble_wing(design: WingDesign) -> AffineOperators:
-    """Mesh a wing design and assemble its matrices as sums of terms, one for each parameter.
+    """Mesh a wing design and assemble its affine operators.
 
-    Raises
-    ------
-    MeshError
-        If lines of the design nearly coincide, so that they cannot be meshed.
+    Raises `MeshError` if lines of the design nearly coincide.
     """
     mesh = build_mesh(design)
     body = wing_body(mesh)
@@ -341,7 +334,7 @@ def _assemble_wing(design: WingDesign) -> AffineOperators:
 def wing_values(
     wing: AffineWing, young_modulus_factor: float, stiffness_loss: Losses, **others: float
 ) -> dict[str, float]:
-    """Return the values of the wing's parameters, losses, masses and controls by their names.
+    """Return the values of a wing's inputs by name.
 
     Parameters
     ----------
@@ -355,19 +348,14 @@ def wing_values(
 
 
 def flapwise_bending_modes(wing: AffineWing, modes: NaturalModes) -> IntArray:
-    """Return the numbers of the first and the second flapwise bending among modes of a wing.
+    """Return the indices (2,) of the first two flapwise bending modes of a wing.
 
-    These are the two modes that contribute most to the compliance under a force near the tip; a lag
-    mode may lie between them.
+    These are the two modes that contribute most to the compliance under a force near the tip; a
+    lead-lag mode may lie between them.
 
     Parameters
     ----------
     modes : NaturalModes
         At least three modes, from `natural_frequencies`.
-
-    Returns
-    -------
-    (2,) array of int
-        The numbers, counted from 0.
     """
     return most_compliant_modes(wing.load_tip, modes.frequency**2, modes.shape)

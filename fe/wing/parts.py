@@ -26,7 +26,7 @@ _FOUR_DIGIT_COEFFICIENTS = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
 
 def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float) -> FloatArray:
-    """Return the half thickness of a symmetric four-digit section, as a fraction of the chord.
+    """Return the half thickness (...,) of a symmetric four-digit section over the chord.
 
     Parameters
     ----------
@@ -34,11 +34,6 @@ def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float)
         Distance from the leading edge over the chord, clipped to 0..1.
     thickness_ratio : float
         Largest thickness over the chord.
-
-    Returns
-    -------
-    (...,) array
-        The half thickness.
     """
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 0.0, 1.0)
     a0, a1, a2, a3, a4 = _FOUR_DIGIT_COEFFICIENTS
@@ -355,15 +350,8 @@ class MeshSettings(DesignSection):
 def schrenk(planform: Planform, station: ArrayLike) -> FloatArray:
     """Return Schrenk's lift distribution: the mean of the chord and of an ellipse of equal area.
 
-    Parameters
-    ----------
-    station : array_like (...,)
-        Fractions of the semi-span.
-
-    Returns
-    -------
-    (...,) array
-        Lift per length over total lift [1/m].
+    Returns the lift per length over the total lift (...,) [1/m] at fractions (...,) of the semi-
+    span.
     """
     eta = np.asarray(station, dtype=float)
     chord_sum = planform.root_chord + planform.tip_chord

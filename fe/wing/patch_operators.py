@@ -1,10 +1,10 @@
-"""Full operators of the primitives of `fe.runtime.patch`: effects on the full model.
+"""Operators of the full wing model for the primitives of `fe.runtime.patch`.
 
-Stations are the sections of the mesh that hold nodes: its lines across the span and the middles
+Stations are the sections of the mesh that contain nodes: its lines across the span and the middles
 between them. Forces and displacements of a section are those of lines along the span: the elastic
 line (the chord line of the static test) and the webs. Between two of them the section moves as a
-straight line, beyond the outermost as the straight line through the last two. A force goes to two
-lines by the law of the lever, so that a force between two webs does not dent the thin skin; nor
+straight line, beyond the outermost as the straight line through the last two. A force is shared by
+two lines by the law of the lever, so that a force between two webs does not dent the thin skin; nor
 would one in a test, where a clamp or a cord around the section takes it.
 """
 
@@ -23,7 +23,7 @@ from .mesh import WingMesh
 from .operators import AffineOperators, section_displacement, turn_load, upward
 
 LEAST_LINE_DISTANCE = 0.1
-"""Least distance between lines of a section, as a fraction of the chord."""
+"""Smallest distance between lines of a section, as a fraction of the chord."""
 
 
 class LineRows(NamedTuple):
@@ -65,7 +65,7 @@ class StrainRows(NamedTuple):
 
 
 class WingLayout(TypedDict):
-    """The fields of `fe.runtime.wing_rows.PatchArrays` that no basis changes."""
+    """The fields of `fe.runtime.wing_rows.PatchArrays` that do not depend on a basis."""
 
     strip_lines: FloatArray
     strip_of: IntArray
@@ -85,12 +85,12 @@ class WingLayout(TypedDict):
 
 @dataclass(frozen=True)
 class PatchOperators:
-    """What `fe.runtime.wing_rows.PatchArrays` hold of a wing, on its n free unknowns.
+    """The content of `fe.runtime.wing_rows.PatchArrays` on the n free unknowns.
 
     Attributes
     ----------
     layout : WingLayout
-        The places and lengths of a wing, which no unknown changes.
+        Positions and lengths, which are the same in every basis.
     line_rows : LineRows
         Displacements of the lines along the span.
     strain_rows : StrainRows
@@ -116,7 +116,7 @@ class PatchOperators:
 
 
 class _SkinStrips(NamedTuple):
-    """The T parts of the skin's stiffness: a strip between mesh lines and a stiffness term each.
+    """The T parts of the skin's stiffness, each of one strip and one stiffness term.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class _SkinStrips(NamedTuple):
 
 
 def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
-    """Return the weights of a mean over the planform, by Simpson's rule along the span.
+    """Return the weights (P,) of a mean over the planform, by Simpson's rule along the span.
 
     Parameters
     ----------
@@ -141,11 +141,6 @@ def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> F
         middle of the interval.
     root_chord, tip_chord : float
         The chords [m]; between them the chord is linear.
-
-    Returns
-    -------
-    (P,) array
-        The weights, which sum to one.
     """
     length = stations[2::2] - stations[:-2:2]
     weights = np.zeros(len(stations))
@@ -177,7 +172,7 @@ def section_lines(design: WingDesign) -> tuple[float, ...]:
 
 
 def assemble_patch_operators(operators: AffineOperators) -> PatchOperators:
-    """Assemble the operators of the primitives of patches for a wing."""
+    """Assemble the operators of a wing for the primitives of patches."""
     mesh = operators.wing_mesh
     design = mesh.design
     planform = design.planform
@@ -251,23 +246,10 @@ def _strain_rows(operators: AffineOperators) -> StrainRows:
 def _lift_rows(
     operators: AffineOperators, weight: FloatArray, stations: FloatArray
 ) -> sparse.csr_array:
-    """Return the upward lift of load factor 1, divided among stations along the span.
+    """Return the lift of load factor 1 at each station along the span: (P, n) [N].
 
-    The force at each node of the mesh is counted to the station nearest to it.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The wing of n free unknowns.
-    weight : (full,) array
-        The weight at all nodes; its forces point downwards, so its entries are negative [N].
-    stations : (P,) array
-        Distances of the stations from the root [m].
-
-    Returns
-    -------
-    csr (P, n)
-        One load vector for each station [N]; their sum is the lift without the weight.
+    The force at each node is assigned to the nearest station; the rows sum to the lift without the
+    weight. `weight` (full,) is the weight at all nodes, negative as it points downwards [N].
     """
     mesh = operators.wing_mesh
     lift_of_unknowns = turn_load(operators.body)
@@ -284,7 +266,7 @@ def _lift_rows(
 
 
 def _skin_strips(operators: AffineOperators) -> _SkinStrips:
-    """Return the stiffness of the skin, split by strips between mesh lines and stiffness terms."""
+    """Split the stiffness of the skin by strips between mesh lines and by stiffness terms."""
     mesh = operators.wing_mesh
     _, centre_position, _ = mesh.centres.T
     strip_of_cell = np.searchsorted(mesh.span_lines, centre_position) - 1
