@@ -13,95 +13,26 @@ from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchema
+from pydantic import (
+    GetJsonSchemaHandler,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+    WithJsonSchema,
+)
+from pydantic_core import CoreSchema
 
 from discrepancy.errors import VerdictFileError
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
-from reporting.format_schema import (
-    JsonSchema,
-    format_schema,
-    summary_of_class,
-)
+from reporting.format_schema import JsonSchema, format_schema
 from reporting.json_file import JsonDocument, JsonObject, read_json
 from reporting.json_file import plain as json_of
 from reporting.provenance import Provenance
 
-PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
-"""Unit of every real parameter of every primitive (translational or rotational port: the first
-or second)."""
-
-_MEANING_OF_VALUE = {
-    "along_chord": "Distance by which the force acts further aft.",
-    "along_span": "Distance by which the force acts further outboard.",
-    "amplitude": "Change of the zero after `time`.",
-    "angle": "Angle by which the gauge or the force is turned.",
-    "axis": 'Axis of the move or tilt of a force; "along" or "across" for a gauge.',
-    "channel": 'Name of the channel, or "*" for all channels of `quantity`.',
-    "chi": "Exponent of the distribution of slip displacements.",
-    "coefficient": "Factor of the law.",
-    "compliance": "Motion of the support for each unit of its reaction.",
-    "control": "Name of the control whose force changes.",
-    "cosine": "Amplitude of the cosine.",
-    "damping_ratio": "Fraction of critical damping.",
-    "displacement_exponent": "Exponent of the displacement.",
-    "displacements": "Displacements of the table, rising.",
-    "element_count": "Number of parallel elements.",
-    "exponent": "Exponent of the law.",
-    "force": "Formula of the force in the `time` of the trial.",
-    "forces": "Force at each displacement or speed of the table.",
-    "fraction": "Additional fraction of the weight.",
-    "frequency": "Frequency.",
-    "gain": "Relative error of the gain.",
-    "distance": "Distance of the force or the gauge from its place.",
-    "gauge": "Name of the gauge.",
-    "half_width": "Half the width of the gap.",
-    "lag": "Time by which the reading is late.",
-    "length": "Length of the stretch.",
-    "level": "Speed, or value of the state, at which the law begins.",
-    "limit": "Largest reading.",
-    "logger": 'Name of the logger, or "*" for all.',
-    "loss": "Lost fraction of the stiffness.",
-    "mass": "Added mass.",
-    "motion": 'Motion of the support: "x", "y", "z", or "rx", "ry", "rz" about an axis.',
-    "offset": "Added reading; for a `channel_offset` a formula in the `time` of the trial.",
-    "order": "Order of the law or filter.",
-    "phase": "Phase of the sine.",
-    "port": "Name of the port.",
-    "place": "Name of the place: a set of nodes, a point or a node.",
-    "quantity": 'Quantity of the channels if `channel` is "*"; empty for all quantities.',
-    "rate": "Relative change in each unit of time.",
-    "region": "Name of the damage region.",
-    "reference_displacement": "Displacement by which the displacement of the law is divided.",
-    "reference_velocity": "Speed by which the speed of the law is divided.",
-    "run": "Label of the run.",
-    "side": "Sign of the displacement on which the law acts; 0 for both.",
-    "sine": "Amplitude of the sine.",
-    "slip_force": "Force at which all elements slip.",
-    "speeds": "Speeds of the table, rising.",
-    "start": "Start of the stretch, as a distance from the root.",
-    "station": "Place, as a distance from the root.",
-    "stiffness": "Stiffness of the spring.",
-    "support": "Name of the support: its set of nodes, or its nodes.",
-    "tare": "Added force.",
-    "time": "Time in which the zero moves by `amplitude`.",
-    "time_constant": "Time constant of the filter.",
-    "velocity_exponent": "Exponent of the speed.",
-    "wave_number": "Angle of the sine for each unit of displacement.",
-    "yield_displacement": "Displacement at which the law yields.",
-    "zero": "Error of the first time stamp.",
-}
-"""Meaning of each value of the primitives, by its name; the equation of a primitive says more."""
-
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
-_JSON_TYPES: dict[type, JsonObject] = {
-    float: {"type": "number"},
-    int: {"type": "integer"},
-    str: {"type": "string"},
-    tuple: {"type": "array", "items": {"type": "number"}},
-}
 _NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
 _BEGIN = {
     "type": ["number", "null"],
@@ -143,29 +74,34 @@ def _patch(rows: object) -> ModelPatch:
 
 def _primitive_schema(primitive: type[Primitive]) -> JsonObject:
     """Return the JSON Schema of one kind of primitive, from its own fields."""
-    units = PRIMITIVE_UNITS[primitive.kind]
-    kind_of_primitive = {"const": primitive.kind, "description": "Kind of the primitive."}
-    columns: JsonObject = {"kind": kind_of_primitive}
-    for name, kind in primitive.value_types().items():
-        if name not in _MEANING_OF_VALUE:
-            raise TypeError(
-                f"The number {name!r} of {primitive.__module__}.{primitive.__name__} has no "
-                "meaning: give one in `_MEANING_OF_VALUE` of discrepancy/document.py."
-            )
-        columns[name] = {**_JSON_TYPES[kind], "description": _MEANING_OF_VALUE[name]}
-        if name in units:
-            columns[name]["unit"] = units[name]
+    schema = format_schema(primitive, primitive.__name__)
+    columns: JsonObject = {
+        "kind": {"const": primitive.kind, "description": "Kind of the primitive."}
+    }
+    for name in primitive.value_types():
+        column = schema["properties"][name]
+        column.pop("default", None)  # a file states all values
+        unit = primitive.units.get(name)
+        columns[name] = {**column, "unit": unit} if unit else column
+    windows = {"windows": _WINDOWS} if primitive.can_act_in_windows else {}
     return {
         "type": "object",
         "title": primitive.__name__,
-        "description": summary_of_class(primitive),
-        "properties": {
-            **columns,
-            **({"windows": _WINDOWS} if primitive.can_act_in_windows else {}),
-        },
+        "description": schema["description"],
+        "properties": {**columns, **windows},
         "required": list(columns),
         "additionalProperties": False,
     }
+
+
+class _SchemaOfPatch:
+    """Gives a patch its JSON Schema, which is made only if it is asked for."""
+
+    @staticmethod
+    def __get_pydantic_json_schema__(_: CoreSchema, __: GetJsonSchemaHandler) -> JsonObject:
+        # editors know the shipped laws only
+        shipped = [kind for kind in PRIMITIVES.values() if kind not in INSTALLED_LAWS]
+        return {"type": "array", "items": {"oneOf": [_primitive_schema(kind) for kind in shipped]}}
 
 
 Number = Annotated[
@@ -177,22 +113,7 @@ Number = Annotated[
         }
     ),
 ]
-Patch = Annotated[
-    ModelPatch,
-    PlainValidator(_patch),
-    WithJsonSchema(
-        {
-            "type": "array",
-            "items": {
-                "oneOf": [
-                    _primitive_schema(primitive)
-                    for primitive in PRIMITIVES.values()
-                    if primitive not in INSTALLED_LAWS  # editors know the shipped laws only
-                ]
-            },
-        }
-    ),
-]
+Patch = Annotated[ModelPatch, PlainValidator(_patch), _SchemaOfPatch()]
 
 
 # ---------------------------------------------------------------- documents

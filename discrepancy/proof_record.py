@@ -17,7 +17,8 @@ class Scores:
     """Mean square residual over the variance of the noise, of channels with a noise record; nan
     without one [1]."""
     log_score: Number
-    """Mean predictive log density of a sample, standardised by its noise [nat]."""
+    """Mean predictive log density of a sample, standardised by its noise; -1.419 for a right model
+    with known parameters [nat]."""
     coverage_50: Number
     """Fraction of the samples within the central predictive intervals of 50 % [1]."""
     coverage_90: Number
@@ -126,11 +127,12 @@ class Proof:
     log_score_gain: Number
     """Gain of the mean predictive log density per held-out sample [nat]."""
     log_score_gain_error: Number
-    """Standard error of this gain [nat]."""
+    """Standard error of this gain, for which each trial counts as one unit [nat]."""
     remaining: str = ""
     """What is still not explained, in one sentence."""
     closed_reason: str = ""
-    """Why the fraction cannot be given; empty if it can."""
+    """Why the fraction cannot be given, such as held-out trials that agree with the model within
+    their noise both before and after; empty if it can."""
     effects: tuple[str, ...] = ()
     """The hypothesis: its effects with their places, as `effect_label` gives them."""
 

@@ -95,13 +95,13 @@ class NamedEffect:
     name: str
     """Name of the effect."""
     place: str
-    """Where it acts."""
+    """Channel, port, run or frequency where it acts; empty if it has no place."""
     family: str
-    """Name of its family."""
+    """Name of the family of laws to which it belongs."""
     parameters: tuple[ParameterEstimate, ...]
     """Its parameters."""
     shape: tuple[ParameterEstimate, ...]
-    """Its free exponents, if its family was fitted."""
+    """Its exponents, if its law has a free shape; else empty."""
     patch: Patch
     """Primitive changes of the model."""
 
@@ -211,7 +211,8 @@ class ForceLeft:
     trials: int
     """Number of trials."""
     tested: bool
-    """Whether the law has a force in these trials that is large enough to be detected."""
+    """Whether the law has a force in these trials that is large enough to be detected; else they
+    cannot test it."""
 
 
 @dataclass(frozen=True)
@@ -255,13 +256,17 @@ class ForceAtPort:
     """Correlation time of the force [s]."""
     orders: Mapping[str, Number]
     """Fraction of the force's variance that is explained by its mean at equal displacement,
-    velocity, amplitude, time, recorded input or rate of an input, by the name of that variable [1];
-    at equal displacement and velocity if these explain clearly more together."""
+    velocity, amplitude, time, recorded input or rate of an input, by the name of that variable; 1
+    if the force is a function of the variable, 0 if the two are independent [1]. Displacement and
+    velocity together are among the variables if they explain clearly more, and so is the
+    displacement relaxed within some time."""
     ordered_by: tuple[str, ...]
-    """Variables that explain the force about as well as the best one; empty if none explains it."""
+    """Variables whose value in `orders` is at least 0.3 and within 0.05 of the largest;
+    "displacement and velocity" alone if no single variable explains 0.6 of what these explain
+    together; empty if none explains the force."""
     law: str = ""
-    """Law that was fitted to the force, with places if laws act at several ports; empty if none
-    was."""
+    """The named effect or the best hypothesis, with places if laws act at several ports; empty if
+    no law was fitted."""
     fitted: ForceLeft | None = None
     """What remains of the force with the law in fitted trials; if laws act at several ports, of the
     forces at all of them."""

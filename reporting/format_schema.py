@@ -65,7 +65,7 @@ def _schema_of(model: Any) -> JsonSchema:
     return {"$defs": definitions, **root} if definitions else root
 
 
-def summary_of_class(cls: type) -> str:
+def _summary_of_class(cls: type) -> str:
     """Return the text of a class's own docstring before its first section, in one paragraph."""
     text, *_ = _SECTION_OF_DOCSTRING.split(cleandoc(cls.__doc__ or ""))
     return " ".join(text.split())
@@ -134,7 +134,7 @@ def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
             described |= _description_and_unit(text)
         properties[key] = described
     described_schema = {**schema, "properties": properties}
-    described_schema["description"] = summary_of_class(cls)
+    described_schema["description"] = _summary_of_class(cls)
     if required:
         described_schema["required"] = [key for key in properties if key in required]
     return described_schema

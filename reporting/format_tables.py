@@ -60,6 +60,12 @@ class KeyTable:
     schema: JsonSchema
     places: list[str] = field(default_factory=list)
 
+    @property
+    def kind(self) -> str | None:
+        """The kind that the table has in a file, if its keys depend on that."""
+        kind: str | None = self.schema["properties"].get("kind", {}).get("const")
+        return kind
+
 
 @dataclass(frozen=True)
 class PrintedTable:
@@ -100,11 +106,11 @@ def _with_addresses(tables: Sequence[KeyTable], page: str) -> list[PrintedTable]
     """
     counts: Counter[str] = Counter()
     printed = []
-    for table in tables:
-        anchor = _anchor(_heading(table))
+    for group in _groups(tables):
+        anchor = _anchor(_heading(group[0]) if len(group) == 1 else _heading_of_places(group[0]))
         number = f"-{counts[anchor]}" if counts[anchor] else ""
         counts[anchor] += 1
-        printed.append(PrintedTable(table.schema, f"{page}#{anchor}{number}"))
+        printed += [PrintedTable(table.schema, f"{page}#{anchor}{number}") for table in group]
     return printed
 
 
@@ -131,16 +137,66 @@ def format_page(
         return f"[table]({address})"
 
     sections = []
-    for table in tables:
-        rows = list(_rows(table.schema, schema, link))
-        summary = table.schema.get("description", "")
+    for group in _groups(tables):
+        if len(group) > 1:
+            sections.append(_section_of_kinds(group, schema, link))
+            continue
+        table = group[0]
         paragraphs = [
             f"## {_heading(table)}",
-            _markdown(summary),
-            _markdown_table(rows),
+            _markdown(table.schema.get("description", "")),
+            _markdown_table(list(_rows(table.schema, schema, link))),
         ]
         sections.append("\n\n".join(text for text in paragraphs if text))
     return "\n\n".join(sections) + "\n"
+
+
+def _groups(tables: Sequence[KeyTable]) -> list[list[KeyTable]]:
+    """Return the tables, those together that differ in their `kind` and can stand in one place."""
+    groups: list[list[KeyTable]] = []
+    for table in tables:
+        is_further_kind = (
+            groups and table.kind is not None and groups[-1][0].kind is not None
+        ) and groups[-1][0].places == table.places
+        if is_further_kind:
+            groups[-1].append(table)
+        else:
+            groups.append([table])
+    return groups
+
+
+def _section_of_kinds(
+    group: Sequence[KeyTable], root: JsonSchema, link: Callable[[JsonSchema], str]
+) -> str:
+    """Return the section of tables that differ in their `kind`.
+
+    It has a table of the kinds with the names and units of their keys, and a table of all keys. A
+    key that means the same in several kinds has one row.
+    """
+    kinds = []
+    kinds_of_row: dict[KeyRow, list[str]] = {}
+    for table in group:
+        rows = [row for row in _rows(table.schema, root, link) if row.key != "`kind`"]
+        keys = [f"{row.key} [{row.unit}]" if row.unit else row.key for row in rows]
+        meaning = _markdown(table.schema.get("description", ""))
+        kinds.append([f"`{table.kind}`", meaning, ", ".join(keys)])
+        for row in rows:
+            kinds_of_row.setdefault(row._replace(unit=""), []).append(f"`{table.kind}`")
+    counts = Counter(row.key for row in kinds_of_row)
+    rows_of_keys = []
+    for row, names in kinds_of_row.items():
+        is_ambiguous = counts[row.key] > 1
+        rows_of_keys.append(
+            row._replace(key=f"{row.key} of {listing(names)}") if is_ambiguous else row
+        )
+    return "\n\n".join(
+        [
+            f"## {_heading_of_places(group[0])}",
+            "The key `kind` decides the other keys.",
+            _lines_of_table([["kind", "meaning", "keys [unit]"], *kinds]),
+            _markdown_table(sorted(rows_of_keys, key=lambda row: row.key)),
+        ]
+    )
 
 
 def _markdown_table(rows: Sequence[KeyRow]) -> str:
@@ -150,9 +206,14 @@ def _markdown_table(rows: Sequence[KeyRow]) -> str:
         for name in KeyRow._fields
         if name not in _OPTIONAL_COLUMNS or any(getattr(row, name) for row in rows)
     ]
-    cells = [columns, ["---"] * len(columns)]
-    cells += [[getattr(row, name) or " " for name in columns] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    return _lines_of_table([columns, *([getattr(row, name) for name in columns] for row in rows)])
+
+
+def _lines_of_table(cells: Sequence[Sequence[str]]) -> str:
+    """Return rows of cells as a table of Markdown, whose first row is the head."""
+    head, *rows = [[cell or " " for cell in row] for row in cells]
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def undocumented_keys(schema: JsonSchema) -> list[str]:
@@ -231,14 +292,18 @@ def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:
 
 
 def _heading(table: KeyTable) -> str:
-    """Return the heading of a table: its places, and its kind if there are several."""
-    places = [f"`{place}`" for place in table.places if place]
-    heading = listing(places) if places else "The file"
-    kind = table.schema["properties"].get("kind", {}).get("const")
-    if kind is not None:
-        return f'{heading}, kind "{kind}"'
+    """Return the heading of a table: its places, and its kind if it has one."""
+    heading = _heading_of_places(table)
+    if table.kind is not None:
+        return f'{heading}, kind "{table.kind}"'
     variant = table.schema.get("variant")
     return f"{heading}, {variant}" if variant else heading
+
+
+def _heading_of_places(table: KeyTable) -> str:
+    """Return the places of a table as a heading."""
+    places = [f"`{place}`" for place in table.places if place]
+    return listing(places) if places else "The file"
 
 
 def _anchor(heading: str) -> str:

@@ -53,9 +53,9 @@ class InTables:
     name: Name
     """Name, unique in the campaign; also that of its column unless `column` says otherwise."""
     quantity: Quantity
-    """The physical quantity."""
+    """The physical quantity; a signal is not calibrated."""
     column: Name = field(default="", compare=False, kw_only=True)
-    """Name of its column in the files; empty if that is `name`."""
+    """Name of its column in the tables and the noise record; empty if that is `name`."""
     unit: InFiles = field(default="", compare=False, kw_only=True)
     """Unit of its column in the files; empty if the campaign was not read from files."""
 
@@ -79,7 +79,9 @@ class RecordedInput(InTables):
     values: Annotated[FloatArray, NOT_IN_FILES, Field(default=np.empty(0), exclude=True)]
     """Values at the samples (N,) [SI]."""
     hold: Hold | None = None
-    """Course between the samples; None if the file does not state it, which means linear."""
+    """Course between the samples. "zero_order": constant, and the readings of a row are those just
+    before the input is set. "linear", the default: straight lines. "smooth": a cubic spline, as all
+    motions and prescribed states have."""
     offset_deviation: NotNegative = 0.0
     """Prior standard deviation of a constant error of the record in this trial [SI]; zero for
     none."""
@@ -97,14 +99,14 @@ class Channel(InTables):
     noise: NoiseRecord | None = None
     """Its noise; without it, the size of the residuals of a fit cannot be judged."""
     gain_deviation: Deviation = 0.0
-    """Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
-    unknown scale (the scale of the release amplitudes, if only these show it)."""
+    """Prior standard deviation of the channel's relative gain error [1]; "free" (infinite) for a
+    signal of unknown scale (the scale of the release amplitudes, if only these show it)."""
     offset_deviation: Deviation = 0.0
-    """Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free
-    zero."""
+    """Prior standard deviation of its zero in each trial [channel's unit]; "free" (infinite) for a
+    free zero."""
     station: Number | None = None
     """Position along the span [m], for maps."""
     chord: Number | None = None
     """Position along the chord [fraction], for maps."""
     accept: Accepted = ()
-    """Faults of its data that the user accepts, in all trials: words of `ACCEPTABLE`."""
+    """Faults of its data that the user accepts, in all trials."""

@@ -142,13 +142,15 @@ class Event:
     """
 
     name: Name
-    """Name in expressions, where ``NAME`` is its time and ``NAME_until`` its end."""
+    """Name in expressions, of letters, digits and underscores; `NAME` is its time and `NAME_until`
+    its end. An event that happens several times in a trial has an entry for each time, with
+    `until`; these intervals must not overlap."""
     trials: Annotated[tuple[Name, ...], Field(min_length=1), LIST] = ()
     """Names of the trials in which it happened."""
     time: NotNegative = field(kw_only=True)
     """Time since the start of each of these trials [s]."""
     until: Number | None = field(default=None, kw_only=True)
-    """Its end [s]; None if it is not stated."""
+    """Its end [s]; None if it is that of the trial."""
     trial: Name | None = field(default=None, kw_only=True)
     """A single trial, which a file may state in place of `trials`. Without both the event happened
     in all trials that are records in time."""

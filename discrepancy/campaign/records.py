@@ -62,21 +62,21 @@ class TrialKeys:
     file: InFiles = field(default="", compare=False)
     """Name of its table; empty if it was not read from a file."""
     run: str = ""
-    """Label of the run (set-up) that the trial belongs to."""
+    """Name of the set-up; readings of one run share one seating of the object."""
     held_out: Annotated[bool, Field(strict=True)] = False
     """True if the trial is used only for the proof, and not to find or to fit anything."""
     noise_factor: Positive = 1.0
     """Standard deviation of the noise in this trial over that of the channels' noise records, as
     known from the acquisition (averaging, another range) [1]."""
     load_place: Name | tuple[Number, Number] = "tip_load"
-    """Point at which the force acts: a name that the model knows ("tip_load" of the wing), or (y
-    [m] from the root, x [fraction of the chord])."""
+    """Point at which the force acts: a name that the model knows ("tip_load" of the wing), or (y,
+    x), the distance from the root and the place along the chord [m and fraction of the chord]."""
     release: Release | None = None
     """How a ring-down began; None for other kinds."""
     hold: Hold | None = None
-    """Course of the force of a forced trial between its samples."""
+    """Course of the force of a forced trial between its samples, as that of an input."""
     accept: Accepted = ()
-    """Faults of its data that the user accepts, in all channels: words of `ACCEPTABLE`."""
+    """Faults of its data that the user accepts, in all channels."""
 
     @property
     def keys_in_file(self) -> dict[str, Any]:

@@ -167,10 +167,10 @@ class TrialSection(records.TrialKeys):
     start: NotNegative | None = None
     """Time since the start of the campaign; by default 0, or the first time of the table [s]."""
     temperature: Number | None = None
-    """Temperature of the trial; by default the reference temperature [degC]."""
+    """Temperature of the trial; by default the reference temperature, else unknown [degC]."""
     health: dict[Name, NotNegative] = field(default_factory=dict)
     """Stiffness loss of each damage region, by its name, and `deviation`, their standard deviation
-    [1]."""
+    [1]; by default the structure is healthy and exactly known."""
     release: Annotated[Release, pydantic.AfterValidator(_release_in_si)] | None = None
     """How a ring-down began; every ring-down needs it."""
     channels: Annotated[tuple[Name, ...], LIST] | None = None
@@ -178,9 +178,12 @@ class TrialSection(records.TrialKeys):
     left_out: dict[
         str, Annotated[tuple[Annotated[int, pydantic.Field(strict=True, ge=1)], ...], LIST]
     ] = field(default_factory=dict)
-    """Rows that do not count, counted from 1, by the name of the channel."""
+    """Rows that do not count, counted from 1, by the name of the channel, as in `{ g17 = [12, 40]
+    }`."""
     begins: records.Start | None = None
-    """How a forced or driven trial began; by default at rest under the first loads."""
+    """How a forced or driven trial began: "settled", at rest under what acts first (the default);
+    "still", with displacements, speeds and states zero; or "unknown", so that the initial state is
+    fitted."""
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -249,7 +252,7 @@ class CampaignSection(Section):
     parameters: dict[Name, StatedPriorSection] = pydantic.Field(default_factory=dict)
     """Prior of parameters of the model, by their names, in place of the model's own."""
     noise: NoiseFileSection | None = None
-    """Table of samples at rest."""
+    """The noise record: a table of samples at rest."""
     channel: Annotated[tuple[ChannelInFile, ...], pydantic.Field(min_length=1), LIST]
     """What is measured."""
     input: Annotated[
@@ -261,9 +264,9 @@ class CampaignSection(Section):
     event: Annotated[tuple[Event, ...], LIST] = ()
     """What happened at known moments."""
     remarks: Annotated[tuple[str, ...], LIST] = ()
-    """Sentences for people."""
+    """Sentences that are kept with the campaign, and that commands and reports repeat."""
     provenance: Annotated[tuple[str, ...], LIST] = ()
-    """Sentences on the files that the campaign was imported from."""
+    """Sentences on the files that the campaign was imported from, which no command prints."""
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = pydantic.Field(default_factory=dict)
     """Channels and inputs that share a clock, by the name of their logger; "force" is the force of
     forced trials."""

@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, WithJsonSchema
 
 from discrepancy.campaign.records import Channel, Quantity
 from discrepancy.document import (
-    PRIMITIVE_UNITS,
     Number,
     Origin,
     document_schema,
@@ -234,7 +233,7 @@ class StoredPatch:
     effects: tuple[PatchEffect, ...]
     """The effects in order."""
     channels: Mapping[str, str]
-    """Outputs of the wing FMU by the names of channels."""
+    """Output of the model that a channel is, for each channel that a primitive names."""
     parameters: tuple[CalibratedParameter, ...]
     """Calibrated parameters of the model, fitted together with these effects."""
     origin: Origin
@@ -310,7 +309,7 @@ def primitive_intervals(
 def _numbers_of(primitive: Primitive) -> dict[str, tuple[float, str]]:
     """Return the real numbers of a primitive with their units, those of a table as `forces[0]`."""
     numbers: dict[str, tuple[float, str]] = {}
-    for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
+    for name, unit in primitive.units.items():
         value = getattr(primitive, name)
         if isinstance(value, tuple):
             for index, item in enumerate(value):

@@ -6,7 +6,6 @@ from math import isfinite
 
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
-from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.report.text import NAMING, unit_text
 from discrepancy.system.interface import Model
@@ -156,7 +155,7 @@ def _location_text(
             reference = "reference_velocity"
         value = getattr(primitive, reference, None)
         if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
-            reference_unit = PRIMITIVE_UNITS[primitive.kind][reference]
+            reference_unit = primitive.units[reference]
             unit = definite_unit(reference_unit, primitive, model, campaign)
             marks.append(f"{value:.3g} {unit}")
     return f" at {' and '.join(marks)}" if marks else ""

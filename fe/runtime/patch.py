@@ -59,14 +59,18 @@ class PointMass(Primitive):
     """
 
     mass: Annotated[float, "kg"]
+    """Added mass."""
     station: Annotated[float, "m"]
+    """Place, as a distance from the root."""
 
 
 class PlaceMass(Primitive):
     """A mass is added at a named place of a structure; a negative one is lost."""
 
     place: str
+    """Name of the place: a set of nodes, a point or a node."""
     mass: Annotated[float, "kg"]
+    """Added mass."""
 
 
 class SupportCompliance(Primitive):
@@ -78,22 +82,29 @@ class SupportCompliance(Primitive):
     """
 
     support: str
+    """Name of the support: its set of nodes, or its nodes."""
     motion: str
+    """Motion of the support: "x", "y", "z", or "rx", "ry", "rz" about an axis."""
     compliance: Annotated[float, "m/N or rad/(N m)"]
+    """Motion of the support for each unit of its reaction."""
 
 
 class LocalStiffnessLoss(Primitive):
     """The skin loses `loss` of its stiffness over `length` beyond `start` [m from the root]."""
 
     loss: Annotated[float, "1"]
+    """Lost fraction of the stiffness."""
     start: Annotated[float, "m"]
+    """Start of the stretch, as a distance from the root."""
     length: Annotated[float, "m"]
+    """Length of the stretch."""
 
 
 class ModulusTemperature(Primitive):
     """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref))."""
 
     coefficient: Annotated[float, "1/K"]
+    """Relative loss of the modulus for each kelvin."""
 
 
 class RegionStiffnessLoss(Primitive):
@@ -103,13 +114,16 @@ class RegionStiffnessLoss(Primitive):
     """
 
     region: str
+    """Name of the damage region."""
     loss: Annotated[float, "1"]
+    """Lost fraction of the stiffness."""
 
 
 class StiffnessDrift(Primitive):
     """The whole stiffness drifts within a record: K (1 + `rate` t), t since its start."""
 
     rate: Annotated[float, "1/s"]
+    """Relative change of the stiffness in each second."""
 
 
 # ---------------------------------------------------------------- internal forces
@@ -129,23 +143,31 @@ class LoadPlace(Primitive):
     """Forces act further outboard (`along_span` [m]) and further aft (`along_chord` [m])."""
 
     along_span: Annotated[float, "m"]
+    """Distance by which the force acts further outboard."""
     along_chord: Annotated[float, "m"]
+    """Distance by which the force acts further aft."""
 
 
 class LoadOffset(Primitive):
     """The force of a `control` of a structure acts by `distance` along an axis from its place."""
 
     control: str
+    """Name of the control whose force changes."""
     axis: str
+    """Axis of the move."""
     distance: Annotated[float, "m"]
+    """Distance of the force from its place."""
 
 
 class LoadTilt(Primitive):
     """The force of a `control` of a structure is turned by `angle` towards an axis."""
 
     control: str
+    """Name of the control whose force changes."""
     axis: str
+    """Axis towards which the force turns."""
     angle: Annotated[float, "rad"]
+    """Angle by which the force is turned."""
 
 
 class GaugeOffset(Primitive):
@@ -156,15 +178,20 @@ class GaugeOffset(Primitive):
     """
 
     gauge: str
+    """Name of the gauge."""
     axis: str
+    """"along" the gauge or "across" it."""
     distance: Annotated[float, "m"]
+    """Distance of the gauge from its place."""
 
 
 class LoadGain(Primitive):
     """While a force is applied, (1 + `gain`) times the recorded force plus `tare` [N] acts."""
 
     gain: Annotated[float, "1"]
+    """Relative error of the gain."""
     tare: Annotated[float, "N"]
+    """Added force."""
 
 
 class Washout(Primitive):
@@ -174,7 +201,9 @@ class Washout(Primitive):
     """
 
     coefficient: Annotated[float, "1"]
+    """Factor of the unloading."""
     exponent: Annotated[float, "1"]
+    """Exponent of the place along the span."""
 
 
 class InertiaRelief(Primitive):
@@ -184,6 +213,7 @@ class InertiaRelief(Primitive):
     """
 
     fraction: Annotated[float, "1"]
+    """Additional fraction of the weight."""
 
 
 class PortLoad(Primitive):
@@ -192,7 +222,9 @@ class PortLoad(Primitive):
     can_act_in_windows: ClassVar[bool] = True
     formula_fields: ClassVar[tuple[str, ...]] = ("force",)
     port: str
+    """Name of the port."""
     force: str
+    """Formula of the force in the `time` of the trial."""
 
 
 STRUCTURE = (

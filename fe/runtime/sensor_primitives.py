@@ -117,8 +117,11 @@ class SensorGain(Sensor):
 
     can_act_in_windows: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     gain: Annotated[float, "1"]
+    """Relative error of the gain."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
@@ -132,8 +135,11 @@ class SensorSaturation(Sensor):
 
     can_act_in_windows: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     limit: Annotated[float, CHANNEL_UNIT]
+    """Largest reading."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
@@ -159,10 +165,15 @@ class SensorDrift(Sensor):
 
     can_act_in_windows: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     amplitude: Annotated[float, CHANNEL_UNIT]
+    """Change of the zero after `time`."""
     time: Annotated[float, "s"]
+    """Time in which the zero moves by `amplitude`."""
     exponent: Annotated[float, "1"] = 1.0
+    """Exponent of the course of the zero over time."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the drift of the zero at each sample.
@@ -197,8 +208,11 @@ class ChannelOffset(Sensor):
     can_act_in_windows: ClassVar[bool] = True
     formula_fields: ClassVar[tuple[str, ...]] = ("offset",)
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     offset: str
+    """Added reading, as a formula in the `time` of the trial."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the offset at each sample; its rate is a difference quotient."""
@@ -216,7 +230,9 @@ class SensorRotation(Sensor):
 
     strain_only: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     angle: Annotated[float, "rad"]
+    """Angle by which the gauge is turned."""
 
 
 class ThermalStrain(Sensor):
@@ -225,7 +241,9 @@ class ThermalStrain(Sensor):
     strain_only: ClassVar[bool] = True
     can_act_in_windows: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     coefficient: Annotated[float, "1/K"]
+    """Apparent strain for each kelvin."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the thermal strain at each sample; the temperature changes slowly."""
@@ -239,9 +257,13 @@ class HighPass(Sensor):
     """
 
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     time_constant: Annotated[float, "s"]
+    """Time constant of the filter."""
     order: Annotated[float, "1"] = 1.0
+    """Order of the filter."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
 
 class SensorLag(Sensor):
@@ -252,8 +274,11 @@ class SensorLag(Sensor):
     """
 
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     lag: Annotated[float, "s"]
+    """Time by which the reading is late."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
@@ -343,7 +368,9 @@ class Clock(Sensor):
     """
 
     rate: Annotated[float, "1"]
+    """Relative error of the rate of the clock."""
     zero: Annotated[float, "s"]
+    """Error of the first time stamp."""
 
 
 class LoggerClock(Sensor):
@@ -355,7 +382,9 @@ class LoggerClock(Sensor):
     """
 
     logger: str
+    """Name of the logger, or "*" for all."""
     rate: Annotated[float, "1"]
+    """Relative error of the rate of the clock."""
 
 
 class Line(Sensor):
@@ -367,10 +396,15 @@ class Line(Sensor):
 
     can_act_in_windows: ClassVar[bool] = True
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     frequency: Annotated[float, "Hz"]
+    """Frequency."""
     cosine: Annotated[float, CHANNEL_UNIT]
+    """Amplitude of the cosine."""
     sine: Annotated[float, CHANNEL_UNIT]
+    """Amplitude of the sine."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the line at each sample of a dynamic record."""
@@ -394,11 +428,17 @@ class DecayingLine(Sensor):
     """
 
     channel: str
+    """Name of the channel, or "*" for all channels of `quantity`."""
     frequency: Annotated[float, "Hz"]
+    """Frequency."""
     damping_ratio: Annotated[float, "1"]
+    """Fraction of critical damping."""
     cosine: Annotated[float, PER_RELEASE]
+    """Amplitude of the cosine."""
     sine: Annotated[float, PER_RELEASE]
+    """Amplitude of the sine."""
     quantity: str = ""
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the oscillation at each sample of a ring-down.
@@ -430,9 +470,13 @@ class RunOffset(Sensor):
     """Static readings of the trials labelled `run` have this `offset`: the seating of a run."""
 
     run: str
+    """Label of the run."""
     offset: Annotated[float, CHANNEL_UNIT]
+    """Added reading."""
     channel: str = EVERY_CHANNEL
+    """Name of the channel, or "*" for all channels of `quantity`."""
     quantity: str = "displacement"
+    """Quantity of the channels if `channel` is "*"; empty for all quantities."""
 
     def error(self, record: SensorRecord) -> SensorError:
         """Return the offset in static trials of the run."""

@@ -72,6 +72,26 @@ def test_a_table_of_keys_has_no_column_that_is_empty():
     assert mass == "| `mass` | Its mass. | number | kg |"
 
 
+def test_a_key_that_means_the_same_in_several_kinds_of_a_table_is_printed_once():
+    port = {"type": "string", "description": "Name of the port."}
+    kinds = {
+        "spring": {"port": port, "size": {"type": "number", "unit": "N/m", "description": "Stiffness."}},
+        "damper": {"port": port, "size": {"type": "number", "unit": "N s/m", "description": "Damping."}},
+    }
+    tables = [
+        {"description": f"A {name}.", "properties": {"kind": {"const": name}, **keys}}
+        for name, keys in kinds.items()
+    ]
+    schema = {"properties": {"law": {"oneOf": tables, "description": "The law."}}}
+    lines = format_page(schema, "toml").splitlines()
+    assert lines[4] == "| `law` | The law. | [table](#law) |"
+    assert [line for line in lines if "spring" in line] == [
+        "| `spring` | A spring. | `port`, `size` [N/m] |",
+        "| `size` of `spring` | Stiffness. | number |",
+    ]
+    assert [line for line in lines if "Name of the port" in line] == ["| `port` | Name of the port. | text |"]
+
+
 def test_schemas_and_pages_are_those_of_the_classes():
     """If this fails: python -m benchmarks.format_pages."""
     # in a process of its own, since pydantic reads the texts below fields when a class is defined

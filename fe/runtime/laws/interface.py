@@ -48,6 +48,7 @@ class PortForce(Primitive):
     """Whether the force depends on the history of the motion."""
 
     port: str
+    """Name of the port."""
 
     @property
     def proportional(self) -> tuple[str, ...]:

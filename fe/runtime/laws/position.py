@@ -21,9 +21,13 @@ class PowerStiffness(PortForce):
     """
 
     coefficient: Annotated[float, "N or N m"]
+    """Factor of the law."""
     exponent: Annotated[float, "1", POSITIVE]
+    """Exponent of the law."""
     side: int
+    """Sign of the displacement on which the law acts; 0 for both."""
     reference_displacement: Annotated[float, "m or rad", POSITIVE]
+    """Displacement by which the displacement of the law is divided."""
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number is not possible."""
@@ -56,7 +60,9 @@ class FreePlay(PortForce):
     """
 
     stiffness: Annotated[float, "N/m or N m/rad"]
+    """Stiffness of the spring."""
     half_width: Annotated[float, "m or rad", NOT_NEGATIVE]
+    """Half the width of the gap."""
 
     @property
     def magnitude(self) -> float:
@@ -82,8 +88,11 @@ class SineForce(PortForce):
     """
 
     coefficient: Annotated[float, "N or N m"]
+    """Factor of the law."""
     wave_number: Annotated[float, "rad/m or 1"]
+    """Angle of the sine for each unit of displacement."""
     phase: Annotated[float, "rad"]
+    """Phase of the sine."""
 
     @staticmethod
     def force_and_slope(
@@ -113,8 +122,11 @@ class BoucWen(PortForce):
 
     hysteretic: ClassVar[bool] = True
     stiffness: Annotated[float, "N/m or N m/rad"]
+    """Stiffness of the spring."""
     yield_displacement: Annotated[float, "m or rad", POSITIVE]
+    """Displacement at which the law yields."""
     order: Annotated[float, "1", POSITIVE]
+    """Order of the law."""
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
@@ -181,9 +193,13 @@ class MicroSlip(PortForce):
     hysteretic: ClassVar[bool] = True
     proportional = ("stiffness", "slip_force")
     slip_force: Annotated[float, "N or N m", POSITIVE]
+    """Force at which all elements slip."""
     stiffness: Annotated[float, "N/m or N m/rad", NOT_NEGATIVE]
+    """Stiffness of the spring."""
     chi: Annotated[float, "1"]
+    """Exponent of the distribution of slip displacements."""
     element_count: int = 12
+    """Number of parallel elements."""
 
     @property
     def parameter_row(self) -> FloatArray:

@@ -64,10 +64,15 @@ class PowerDamping(PortForce):
 
     depends_on_speed: ClassVar[bool] = True
     coefficient: Annotated[float, "N or N m", NOT_NEGATIVE]
+    """Factor of the law."""
     velocity_exponent: Annotated[float, "1", NOT_NEGATIVE]
+    """Exponent of the speed."""
     displacement_exponent: Annotated[float, "1", NOT_NEGATIVE]
+    """Exponent of the displacement."""
     reference_velocity: Annotated[float, "m/s or rad/s", POSITIVE]
+    """Speed by which the speed of the law is divided."""
     reference_displacement: Annotated[float, "m or rad", POSITIVE]
+    """Displacement by which the displacement of the law is divided."""
     force_and_slope = staticmethod(force_of_mean_speed)
 
     @property
@@ -90,9 +95,13 @@ class Overflow(PortForce):
 
     depends_on_speed: ClassVar[bool] = True
     coefficient: Annotated[float, "N or N m", NOT_NEGATIVE]
+    """Factor of the law."""
     exponent: Annotated[float, "1", POSITIVE]
+    """Exponent of the law."""
     level: Annotated[float, "m/s or rad/s", NOT_NEGATIVE]
+    """Speed, or value of the state, at which the law begins."""
     reference_velocity: Annotated[float, "m/s or rad/s", POSITIVE]
+    """Speed by which the speed of the law is divided."""
     force_and_slope = staticmethod(force_of_mean_speed)
 
     @property
@@ -110,7 +119,9 @@ class TableDamping(TabulatedForce, PortForce):
 
     depends_on_speed: ClassVar[bool] = True
     speeds: Annotated[tuple[float, ...], "m/s or rad/s"]
+    """Speeds of the table, rising."""
     forces: Annotated[tuple[float, ...], "N or N m"]
+    """Force at each displacement or speed of the table."""
     force_and_slope = staticmethod(force_of_mean_speed)
 
     @property

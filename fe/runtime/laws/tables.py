@@ -19,6 +19,7 @@ class TabulatedForce:
 
     kind: ClassVar[str]
     forces: tuple[float, ...]
+    """Force at each displacement or speed of the table."""
 
     @property
     def proportional(self) -> tuple[str, ...]:
@@ -56,7 +57,9 @@ class TableStiffness(TabulatedForce, PortForce):
     """
 
     displacements: Annotated[tuple[float, ...], "m or rad"]
+    """Displacements of the table, rising."""
     forces: Annotated[tuple[float, ...], "N or N m"]
+    """Force at each displacement or speed of the table."""
 
     @property
     def parameter_row(self) -> FloatArray:
