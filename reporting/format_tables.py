@@ -222,7 +222,7 @@ def undocumented_keys(schema: JsonSchema) -> list[str]:
     for table in _TableFinder(schema, "json").tables:
         for key, key_schema in table.schema["properties"].items():
             place = f"{' '.join(table.places)} {key}".strip()
-            if "description" not in key_schema:
+            if not _description(key_schema, schema):
                 keys.append(f"{place}: no description")
             elif "unit" not in key_schema and "number" in _basic_types(key_schema, schema):
                 keys.append(f"{place}: no unit")
@@ -345,8 +345,17 @@ def _rows(
             unit="" if unit == "1" else unit,
             default="needed" if key in required else _default_text(key_schema),
             range=_range_text(key_schema, root),
-            meaning=_markdown(key_schema.get("description", "")),
+            meaning=_markdown(_description(key_schema, root)),
         )
+
+
+def _description(key_schema: JsonSchema, root: JsonSchema) -> str:
+    """Return the description of a key; pydantic leaves it to its table if both have the same."""
+    text: str | None = key_schema.get("description")
+    if text is not None:
+        return text
+    description: str = _resolved(key_schema, root).get("description", "")
+    return description
 
 
 def _markdown(text: str) -> str:
