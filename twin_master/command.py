@@ -192,7 +192,7 @@ def run(
 
 
 def _refuse_options_of_seeds(workers: int | None, cluster: str | None, store: str) -> None:
-    """Refuse the options --workers, --cluster and --store where only one mission flies."""
+    """Refuse the options --workers, --cluster and --store for a single mission."""
     is_given = {
         "--workers": workers is not None,
         "--cluster": cluster is not None,
@@ -206,7 +206,7 @@ def _refuse_options_of_seeds(workers: int | None, cluster: str | None, store: st
 
 
 def _wrong_use_of_seeds() -> typer.BadParameter:
-    """Return the error that options do not go together with --seeds."""
+    """Return the error about options that cannot be combined with --seeds."""
     return typer.BadParameter(
         "--seeds needs a scenario, and cannot be combined with --resume (repeat the command "
         "instead), --seed or --view.",
@@ -276,7 +276,7 @@ def _fly_and_print_mission(
     view: bool,
     json: bool,
 ) -> None:
-    """Fly a mission, and print its outcome.
+    """Fly a mission and print its outcome.
 
     Parameters
     ----------
@@ -309,10 +309,9 @@ def _fly_and_print_mission(
 def _scenario_and_ssp(
     scenario: str | None, with_scenario: str | None
 ) -> tuple[str | None, Path | None]:
-    """Return the scenario, and the SSP file that is flown instead of its asset.
+    """Return the scenario, and the SSP file that replaces its asset.
 
-    An SSP file in the place of the scenario is flown; the option --scenario then names the
-    scenario.
+    If the argument SCENARIO is an SSP file, the option --scenario names the scenario.
     """
     if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
         if with_scenario is None:
@@ -369,7 +368,7 @@ def print_outcome(outcome: "RunOutcome") -> None:
 
 
 def _numbers_of_sources(outcome: "RunOutcome") -> dict[str, int]:
-    """Return a number from 1 for each source of a reference."""
+    """Return the number, from 1, of each source of a reference."""
     numbers: dict[str, int] = {}
     for figure in outcome.figures:
         if figure.reference_source and figure.reference_source not in numbers:
@@ -392,12 +391,12 @@ def _timing_rows(outcome: "RunOutcome") -> list[list[str]]:
 
 
 def printed_value(value: float | int | str | None, unit: str, text_for_none: str = "") -> str:
-    """Return a value with its unit; the text `text_for_none` for None."""
+    """Return a value with its unit, or `text_for_none` for None."""
     return text_for_none if value is None else f"{number(value)} {unit}".strip()
 
 
 def run_command_line(application: Callable[[], None], *further_errors: type[Exception]) -> None:
-    """Run a command line; an error of this project's packages becomes one sentence and exit code 1.
+    """Run a command line; turn errors of this project into one sentence and exit code 1.
 
     Parameters
     ----------
@@ -438,7 +437,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
 
 
 def _system_error_sentence(error: OSError) -> str:
-    """Return the sentence of an error of the operating system; streams have no file name there."""
+    """Return the sentence for an error of the operating system; those of streams name no file."""
     reason = error.strerror or error
     if error.filename is not None:
         return f"{error.filename}: {reason}."

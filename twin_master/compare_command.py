@@ -1,4 +1,4 @@
-"""The command `uav-twin compare`: what fleets and ensembles earned, side by side."""
+"""The command `uav-twin compare`: the earnings of fleets and ensembles, side by side."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -52,7 +52,7 @@ def compare(
 
 
 def print_figures(figures: "Figures") -> None:
-    """Print the figures as a table with a column for each group."""
+    """Print a table of results with a column for each group."""
     from twin_master.fleet.comparison import figure_rows
 
     rows = figure_rows(figures)

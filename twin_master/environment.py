@@ -58,8 +58,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     scenario : Scenario
         The scenario with the overrides.
     knowledge : Knowledge
-        What a twin of the scenario knows; `knowledge.twin()` is one, whose decisions are our own
-        policy.
+        The knowledge of a twin of the scenario; `knowledge.twin()` is a twin with the policy of
+        the scenario.
     action_space : Discrete(U)
         The index of a control.
     observation_space : Box (G,)

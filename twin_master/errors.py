@@ -62,7 +62,7 @@ class ScenarioError(TwinMasterError, ValueError):
 
 
 class RunFolderError(TwinMasterError, RuntimeError):
-    """A run folder cannot be used as asked, for example because it exists already."""
+    """A run folder cannot be used as asked, for example because it already exists."""
 
 
 class NotResumableError(RunFolderError):
@@ -70,7 +70,7 @@ class NotResumableError(RunFolderError):
 
 
 class MissionInputError(TwinMasterError, ValueError):
-    """An input of a mission, or the asset that is flown, is missing or does not fit."""
+    """An input of a mission, or the asset that flies, is missing or does not fit."""
 
 
 class FleetError(TwinMasterError, RuntimeError):

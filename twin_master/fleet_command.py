@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 Standing = Mapping[str, Any]
-"""How each asset of a watched fleet stands, as `FleetWatch.standing` tells it."""
+"""The state of each asset of a watched fleet, as `FleetWatch.standing` returns it."""
 ROWS = 20
 """The number of assets in the table on the console, the worst first."""
 MOST_ENDINGS = 10
@@ -180,7 +180,7 @@ class _Console:
             signal.raise_signal(signal.SIGINT)  # which ends the watch in order
 
     def say_address_of_metrics(self) -> None:
-        """Print the address where the figures are served, if they are."""
+        """Print the address of the metrics, if they are served."""
         if self.metrics_server is not None:
             self.say(f"Metrics: {self.metrics_server.address}")
 
@@ -192,7 +192,7 @@ class _Console:
             typer.echo(text, err=True)
 
     def refresh(self, standing: Standing) -> None:
-        """Show the table if it has changed; pass on the printed decisions to a program."""
+        """Show the table if it has changed; for a program, flush the printed decisions."""
         if not self._is_for_people:
             sys.stdout.flush()
         elif standing is not self._last_standing:
@@ -203,12 +203,8 @@ class _Console:
 def _heading(standing: Standing) -> str:
     """Return the heading of the table of watched assets, such as "3 assets, 120 steps, 1 alarm".
 
-    If messages were refused, or assets could not be watched, the heading has their numbers, too.
-
-    Parameters
-    ----------
-    standing : mapping
-        The last records of all watched assets, from `read_standing`.
+    The numbers of refused messages and of assets that could not be watched are added if there are
+    any.
     """
     from twin_master.fleet.watched.watched_asset import watched_fleet_counts
 
@@ -403,7 +399,7 @@ def fly_and_print_fleet(
 
 
 def _print_outcome(outcome: "FleetOutcome") -> None:
-    """Print how many twins flew, why flights failed or ended early, and where the report is."""
+    """Print the number of twins, why flights failed or ended early, and the path of the report."""
     from twin_master.fleet.configuration import REPORT_NAME
 
     flown_text = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
@@ -432,14 +428,14 @@ def _write_report(folder: Path) -> None:
 
 
 _POLLING_INTERVAL = 0.05
-"""Seconds between two looks whether a flight can be shown yet."""
+"""Seconds between two checks whether a flight can be shown yet."""
 _NICENESS_OF_VIEW = 5
 """The niceness of the process that shows a mission: the mission itself comes first."""
 
 
 @dataclass(frozen=True)
 class ViewServer:
-    """What shows a flight or a fleet in the browser.
+    """The server that shows a flight or a fleet in the browser.
 
     Attributes
     ----------
@@ -500,7 +496,7 @@ def view_beside(
 
 
 def _serve_mission(folder: Path, server: ViewServer | None) -> None:
-    """Show a mission once it is prepared, until the process that flies it ends."""
+    """Show a mission once it can be shown, until the process that flies it ends."""
     import multiprocessing
 
     if server is None:

@@ -1,6 +1,6 @@
-"""The two pictures of a run that are wanted in a notebook: the belief, and the residuals by gauge.
+"""Pictures for notebooks: the belief and the residuals of a run, and the states of a fleet.
 
-They are drawn from `run.nc` alone, so that they take whatever `open_run` returns.
+They are drawn from the stored arrays alone, as `open_run` and `open_fleet` return them.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # both take long to import
     from matplotlib.axes import Axes
 
 LARGEST_SHOWN = 4.0
-"""Residuals beyond this are drawn in the colour of this residual [standard deviations]."""
+"""Larger residuals have the colour of this one [standard deviations]."""
 
 
 class HasTree(Protocol):
@@ -80,7 +80,7 @@ def plot_belief(
 
 
 def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> "Axes":
-    """Draw what each gauge measured less what the twin expected, over the steps.
+    """Draw the residuals of each gauge, measured minus expected, over the steps.
 
     The residual is in the standard deviations that the twin assumes: if the model holds, 95 % of
     all cells are between -2 and 2. Cells of lost readings are grey.
@@ -123,9 +123,8 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
 def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
     """Draw the believed states of the twins of a fleet over the steps.
 
-    Each factor of the state of each group has a panel with the medians over the twins of the
-    believed and of the true states, and with the bands that hold 50 % and 90 % of the believed
-    ones.
+    Each factor of the state of each group has a panel. It shows the medians over the twins of the
+    believed and of the true states, and the bands of 50 % and 90 % of the believed ones.
 
     Parameters
     ----------

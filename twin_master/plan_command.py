@@ -124,7 +124,7 @@ def _print_plan(record: Record) -> None:
 
 @dataclass(frozen=True)
 class _GaugePlaces:
-    """Where the gauges are, for pictures.
+    """The positions of the gauges, for pictures.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ def _prepare(
     calibration: Path | None,
     candidates: str | None = None,
 ) -> "tuple[Knowledge, _GaugePlaces]":
-    """Return the knowledge of a scenario's twin, perhaps with further gauges, and where these are.
+    """Return the knowledge of a scenario's twin and the positions of its gauges.
 
     Parameters
     ----------
@@ -184,13 +184,13 @@ def _plan_mission(knowledge: "Knowledge") -> "tuple[BeliefPlan, ComparedPolicy]"
 
 
 _BLIND = 1e6
-"""The standard deviation of a blind sensor, relative to the largest value that it could show."""
+"""Standard deviation of a blind sensor over the largest value that it could show."""
 
 
 def _without_information(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
-    """Return the knowledge of a twin for which some gauges or inspections show nothing.
+    """Return the knowledge of a twin for which some gauges or inspections give no information.
 
-    They keep their place, but their noise becomes so large that their readings tell nothing.
+    They stay in the model, but with noise so large that their readings say nothing.
 
     Parameters
     ----------
@@ -329,7 +329,7 @@ def design(
 
 
 def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]:
-    """Return the titles that the option --among names; all titles if it is not given."""
+    """Return the titles that the option --among names, or all titles without it."""
     if among is None:
         return titles
     candidates = tuple(among.split(","))
@@ -407,7 +407,7 @@ def _write_design_picture(
     choice: "SensorDesign",
     chosen_titles: Sequence[str],
 ) -> None:
-    """Draw the information of the chosen sensors, and where they are."""
+    """Draw the information of the chosen sensors, and their positions."""
     import numpy as np
 
     from reporting.figures import write_picture
@@ -430,7 +430,7 @@ def _write_design_picture(
 
 
 def _find_gauges(scenario: "Scenario") -> _GaugePlaces:
-    """Return where the gauges are, from the structure file or the design of a wing."""
+    """Return the positions of the gauges, from the structure file or the design of a wing."""
     import numpy as np
 
     from fe.wing.design import load_design

@@ -1,4 +1,4 @@
-"""The run folder: complete or absent, never overwritten by mistake, resumable at any moment.
+"""The run folder, which is complete or absent, never overwritten by mistake, and resumable.
 
 `docs/reference/run_folder.md` describes its layout.
 """
@@ -46,7 +46,7 @@ def to_json(record: Mapping[str, object]) -> str:
 
 
 def find_config(folder: Path, *kinds: str) -> JsonObject | None:
-    """Return the configuration of a folder, if it has one and is of one of the kinds; else None.
+    """Return the configuration of a folder of one of the given kinds; None for any other folder.
 
     Without `kinds` only the folder of a run counts.
     """
@@ -68,7 +68,7 @@ def create_run_folder(
     replace: bool = False,
     fleet_is_locked: bool = False,
 ) -> Iterator[None]:
-    """Create a run folder with configuration and copies of all flown files, in one step; lock it.
+    """Create a run folder with its configuration and copies of all files, in one step; lock it.
 
     The folder is locked until the context ends.
 
@@ -182,7 +182,7 @@ def lock_run_folder(folder: Path, *, fleet_is_locked: bool = False) -> int:
 
 
 def _is_watched_fleet(folder: Path) -> bool:
-    """Return whether a folder is that of a fleet which another process watches at present."""
+    """Return whether a folder is that of a fleet which another process is watching."""
     if find_config(folder, WATCHED_FLEET_KIND) is None:
         return False
     lock = lock_folder(folder, shared=True)
@@ -238,7 +238,7 @@ def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
 
 
 def _check_plug_ins(folder: Path, recorded: JsonObject) -> None:
-    """Refuse to continue a run if a plug-in that was installed at its beginning is now another.
+    """Refuse to continue a run if a plug-in has changed since the run was begun.
 
     Plug-ins that were installed since do not matter, and runs of earlier versions record none.
     """
@@ -255,7 +255,7 @@ def _check_plug_ins(folder: Path, recorded: JsonObject) -> None:
 
 
 def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -> JsonObject:
-    """Write the hashes of all flown files into the configuration, or check them if they are there.
+    """Write the hashes of all input files into the configuration, or compare them with those there.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def record_inputs(folder: Path, config: JsonObject, hashes: Mapping[str, str]) -
 
 
 class LockedRun(NamedTuple):
-    """A run or a watch whose folder this process holds.
+    """A run or a watch whose folder this process has locked.
 
     Attributes
     ----------
@@ -370,7 +370,7 @@ def new_run_folder(
 def hold_run_folder(
     folder: Path, loaded_scenario: LoadedScenario | None, *, fleet_is_locked: bool = False
 ) -> Iterator[LockedRun]:
-    """Lock the folder of an earlier run or watch, in order to continue it.
+    """Lock the folder of an earlier run or watch, to continue it.
 
     Parameters
     ----------
@@ -403,6 +403,6 @@ def hold_run_folder(
 
 
 def restore(folder: Path, progress: Progress) -> None:
-    """Put back a run whose replacement was killed after the run had been moved aside."""
+    """Restore a run that was moved aside by a replacement that was then killed."""
     if restore_folder(folder):
         progress.note(f"A replacement of {folder} was interrupted: the previous run was restored.")

@@ -1,7 +1,7 @@
 """The random numbers of a run: one `SeedSequence`, from which each purpose spawns its own.
 
-The stream of a purpose does not depend on what other purposes draw. So the same damage can meet
-other noise, and a resumed run meets the same random numbers.
+The numbers of a purpose do not depend on how many other purposes draw. So the same damage can be
+combined with other noise, and a resumed run draws the same numbers.
 """
 
 import numpy as np

@@ -201,12 +201,7 @@ def watch(
             progress=terminal.progress(),
         )
         _print_end_of_watch(folder, watches[0], report=not no_report)
-    _exit_on_complaint(watches[0])
-
-
-def _exit_on_complaint(watched: "Watch") -> None:
-    """End the command with exit code 1 if the observations of a watch were not in order."""
-    complaint = watched.intake.complaint()
+    complaint = watches[0].intake.complaint()
     if complaint:
         raise terminal.error_exit(complaint)
 
@@ -214,18 +209,18 @@ def _exit_on_complaint(watched: "Watch") -> None:
 def _decision_printer(
     watches: "list[Watch]", *, flush: bool, pace: float, needs_reader: bool
 ) -> Callable[[Decision], None]:
-    """Return a function that prints a decision, and waits as long as the user wants.
+    """Return a function that prints a decision, and then waits for `pace` seconds.
 
     Parameters
     ----------
     watches : list of Watch
         A list to which the watch is added once it has begun.
     flush : bool
-        Whether each decision is to be written at once.
+        Whether each decision is written at once.
     pace : float
         The time to wait after each decision [s].
     needs_reader : bool
-        Whether the watch is to end once nobody reads the decisions any more.
+        Whether the watch ends once nobody reads the decisions any more.
     """
 
     def print_decision(decision: Decision) -> None:
@@ -238,7 +233,7 @@ def _decision_printer(
 
 
 def _print_end_of_watch(folder: Path, watched: "Watch", *, report: bool) -> None:
-    """Flush the decisions; print how many messages came, and where folder and report are."""
+    """Flush the decisions; print the number of messages, and the paths of folder and report."""
     from twin_master.store.writing import REPORT_NAME
 
     _write_to_output("", flush=True)

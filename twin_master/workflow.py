@@ -1,7 +1,6 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report.
 
-`check_scenario` checks a scenario before: it reads only the scenario and the small files beside it,
-which takes no time.
+`check_scenario` checks a scenario in advance, from the scenario and the small files beside it.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ POLICY_NAME = "policy.npy"
 
 
 Begun = Callable[[Path], None]
-"""Is called with the run folder once it exists and is locked, before anything is modelled."""
+"""A function that is called with the run folder once it is made and locked, before modelling."""
 
 
 def fly(
@@ -204,7 +203,7 @@ def _run(
     *,
     report: bool,
 ) -> RunOutcome:
-    """Go through all stages of a run; those of an interrupted run are taken up where it stopped."""
+    """Go through all stages of a run; an interrupted run continues where it stopped."""
     scenario = locked.scenario
     run_folder.remove_half_written_files(folder)
     if begun is not None:
@@ -260,7 +259,7 @@ def _run(
 def _note_mismatches(
     config: JsonObject, knowledge: Knowledge, source: AssetSource, progress: Progress
 ) -> None:
-    """Tell the user if the flown asset or the model is not the one that was calibrated."""
+    """Tell the user if the asset or the believed model is not the one that was calibrated."""
     scenario = knowledge.scenario
     draws = knowledge.draws
     truth = scenario.asset.true_parameters.get(draws.name)
@@ -280,7 +279,7 @@ def _note_mismatches(
 
 
 def _compile_twin(knowledge: Knowledge) -> None:
-    """Let a twin assimilate two steps without observations, which compiles its inner loops.
+    """Let a twin assimilate two steps without observations, so that its inner loops are compiled.
 
     Otherwise the first steps of the flight would take seconds longer than the others.
     """
@@ -293,7 +292,7 @@ def _compile_twin(knowledge: Knowledge) -> None:
 
 @contextmanager
 def _advice_on_error(folder: Path) -> Iterator[None]:
-    """Add to any error how the run can be continued, or begun again before its first step."""
+    """Add to any error how to continue the run, or how to begin again before its first step."""
     try:
         yield
     except NotResumableError:
@@ -318,7 +317,7 @@ def _fly(
     source: AssetSource,
     progress: Progress,
 ) -> MissionResult:
-    """Fly the mission, or the rest of an interrupted one, with a journal of its steps."""
+    """Fly the mission, or the remaining steps of an interrupted one, with a journal."""
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
     with (
@@ -354,7 +353,7 @@ def _model_misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
 
 
 def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:
-    """Return a function that writes the field under the last estimate and the last control."""
+    """Return a function that writes the field for the last estimate and the last control."""
     scenario = result.scenario
     last_step = result.flight.steps[-1].twin_step
     estimate = result.knowledge.model.states.mean(last_step.filtered).tolist()
@@ -383,7 +382,7 @@ def _timing_record(flight: History) -> JsonObject:
 
 
 def _write_report(folder: Path) -> None:
-    from twin_master.report.page import write_report
+    from twin_master.report.page import write_report  # it loads matplotlib
 
     write_report(folder)
 

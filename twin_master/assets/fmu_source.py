@@ -461,8 +461,8 @@ class FmuSource(AssetSource):
             return None
         if isinstance(self._scenario.belief, AssetBelief):
             raise MissionInputError(
-                "an asset that carries its own damage cannot be asked what the twin should expect "
-                "of each state: name a model for the twin in the table `belief`."
+                "an asset with damage of its own cannot predict the observations of each state: "
+                "name a model for the twin in the table `belief`."
             )
         names_by_sort = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", names_by_sort)

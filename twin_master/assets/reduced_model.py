@@ -225,8 +225,8 @@ class NamedStructure(AssetSource):
         other_units = sorted(set(observation.sensor_units) - {"1", UNITS[role]})
         if other_units:
             raise MissionInputError(
-                f"{self.full_name} shows `{role}` in {UNITS[role]}, and `observation.unit` says "
-                f"{comma_list(other_units)}: write the former."
+                f"{self.full_name} gives `{role}` in {UNITS[role]}, but `observation.unit` is "
+                f"{comma_list(other_units)}: write {UNITS[role]}."
             )
         if observation.count != counts[role]:
             raise MissionInputError(

@@ -186,7 +186,7 @@ def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) 
         )
     if overrides.strain_library and (overrides.binding or overrides.library):
         raise MissionInputError(
-            "--strain-library is asset and model itself, and no FMU: give it without --binding and "
+            "--strain-library replaces both asset and model: give it without --binding and "
             "--library."
         )
     if overrides.fmu and asset["kind"] in ("coupled", "ssp"):
@@ -195,8 +195,8 @@ def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) 
         )
     if file_count and asset.get("patch"):
         raise MissionInputError(
-            "`asset.patch` goes into the FMU that is packed of a design, and another asset is "
-            "flown: leave it out."
+            "`asset.patch` belongs to an FMU that is packed from a design, but another asset "
+            "flies: leave `asset.patch` out."
         )
 
 

@@ -241,8 +241,8 @@ class StrainLibraryBelief(BeliefSection):
         """
         if not scenario.asset.is_fmu:
             raise MissionInputError(
-                "a strain library flies, and the twin is to believe one: set `belief.kind` to "
-                "`asset`."
+                "the asset is a strain library already: set `belief.kind` to `asset`, so that the "
+                "twin believes it."
             )
         return _source_of_file(scenario, Path(self.file))
 

@@ -128,9 +128,9 @@ def _with_packed_kind(scenario: Scenario, kind: PackedKind) -> Scenario:
         components.append(component.model_copy(update={"packed": kind}) if is_packed else component)
     if not any(component.design is not None for component in components):
         raise MissionInputError(
-            f"--kind {kind} says how FMUs are packed from a design, and the scenario "
-            f"{scenario.mission.name} has none of a design (the kind of its asset is "
-            f"`{asset.kind}`): leave --kind out."
+            f"--kind {kind} says how FMUs are packed from a design, but the scenario "
+            f"{scenario.mission.name} packs none (the kind of its asset is `{asset.kind}`): leave "
+            "--kind out."
         )
     return scenario.with_changes("asset", component=tuple(components))
 

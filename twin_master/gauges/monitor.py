@@ -112,7 +112,8 @@ class WatchfulEstimator:
         controls = np.array([control_index])
         faults = self.watch.faults
         state = None
-        if before is not None and self._continues(before):
+        # The state of the watch holds for the predictions of one model only.
+        if before is not None and before.arrays.get(MODEL_KEY) == faults.model_key:
             state = faults.restore(before)
         checked = self.watch.exclude_useless_readings(
             state, np.asarray(observation)[None], controls
@@ -138,10 +139,6 @@ class WatchfulEstimator:
             suspicion=replace(suspicion, hypotheses=probabilities),
             hypotheses=hypotheses,
         )
-
-    def _continues(self, before: Carried) -> bool:
-        """Return whether the previous step was watched with this model's predictions."""
-        return bool(before.arrays.get(MODEL_KEY) == self.watch.faults.model_key)
 
 
 def gauge_watch_of(estimator: Estimator) -> GaugeWatch | None:

@@ -118,9 +118,12 @@ class TwinParts:
             If a name is not that of an object.
         """
         parts = self
-        if isinstance(self.policy, str) and _is_name_of_policy(self.policy):
-            policy = cast(GivenPolicy, object_by_name("policy", self.policy))
-            parts = replace(parts, policy=policy)
+        if isinstance(self.policy, str):
+            # Any other text is the path of a policy file.
+            entry_points = plug_in_names(ENTRY_POINT_GROUPS["policy"])
+            if ":" in self.policy or self.policy in entry_points:
+                policy = cast(GivenPolicy, object_by_name("policy", self.policy))
+                parts = replace(parts, policy=policy)
         if isinstance(self.sensor_model, str):
             sensor_model = cast(GivenSensorModel, object_by_name("sensor_model", self.sensor_model))
             parts = replace(parts, sensor_model=sensor_model)
@@ -244,11 +247,6 @@ class TwinParts:
 
 NO_PARTS = TwinParts()
 """All parts are those of the scenario."""
-
-
-def _is_name_of_policy(text: str) -> bool:
-    """Return whether a text is the name of a policy and not the path of a file."""
-    return ":" in text or text in plug_in_names(ENTRY_POINT_GROUPS["policy"])
 
 
 def _is_estimator(part: object) -> bool:

@@ -197,6 +197,9 @@ def add_run_table(page: Page, run: Run, seed: object) -> None:
     sensors = f"{len(run.sensors.titles)}"
     if run.sensors.named:
         sensors += f": {', '.join(run.sensors.titles)}"
+    policy = run.scenario.planner.policy_name
+    if "policy" in run.config.get("inputs", {}):
+        policy = "given by the user"
     states = run.model.states
     rows = [
         (f"{run.step_word}s flown", f"{run.step_count}"),
@@ -205,20 +208,13 @@ def add_run_table(page: Page, run: Run, seed: object) -> None:
         ("controls", ", ".join(run.controls)),
         (f"{run.sensors.word}s", sensors),
         ("seed", f"{seed}"),
-        ("policy", _policy_in_words(run)),
+        ("policy", policy),
         ("asset", f"{run.tree.attrs.get('asset', '')}"),
         ("model that the twin believes", f"{run.tree.attrs.get('twin_model', '')}"),
         ("log evidence of the observations", f"{run['filtered/log_evidence'].sum():.0f} nat"),
         *_monitor_rows(run),
     ]
     _add_table(page, "run", [PageColumn("item"), PageColumn("value")], _with_value(rows))
-
-
-def _policy_in_words(run: Run) -> str:
-    """Return the name of the policy, or that it was given."""
-    if "policy" in run.config.get("inputs", {}):
-        return "given by the user"
-    return run.scenario.planner.policy_name
 
 
 def _with_value(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -215,8 +215,8 @@ class ScenarioTables(Section):
             )
             yield (
                 action.cost > 0.0 and self.rewards.control_weight == 0.0,
-                f"action `{action.name}` has a cost, and `rewards.control_weight` 0 takes no cost "
-                "of controls into account: give it none, or a weight above 0",
+                f"action `{action.name}` has a cost, which has no effect with "
+                "`rewards.control_weight` 0: leave out the cost, or give a weight above 0",
             )
             for state in (*action.inspects, *action.repairs):
                 key = f"action.{action.name}"
@@ -240,8 +240,8 @@ class ScenarioTables(Section):
             follows_repairs = is_random or self.asset.kind == WATCHED_KIND
             yield (
                 bool(action.repairs) and not follows_repairs,
-                f"action `{action.name}` repairs, which a truth of the kind `random_growth` "
-                f"follows, and the kind is `{truth.kind}`",
+                f"action `{action.name}` repairs the state, which needs `truth.kind` "
+                f"`random_growth`, but it is `{truth.kind}`",
             )
 
     def _truth_checks(self) -> Iterator[Check]:

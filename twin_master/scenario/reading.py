@@ -199,7 +199,7 @@ def load_scenario(scenario_or_file: LoadedScenario | str | Path) -> LoadedScenar
     if obstacle:
         scenario = scenario.model_copy(update={"notice": None})
         remark = (
-            f"This twin gives no notices: {obstacle}; `notice = false` says that it is meant so."
+            f"This twin gives no notices: {obstacle}; write `notice = false` if this is intended."
         )
         return LoadedScenario(scenario, path, content_hash, remark)
     scenario = scenario.model_copy(update={"notice": Noticing()})
@@ -212,7 +212,7 @@ def obstacle_to_notices(scenario: Scenario) -> str:
     if observation.modes is not None:
         return "observations of modes have a covariance of their own"
     if scenario.inspection_readings:
-        return "a scenario with inspections asks for them by `[notice]`"
+        return "a scenario with inspections needs a table `[notice]` for them"
     if observation.average_over_draws == "inside":
         return (
             "the average over the draws is taken `inside`, so that each sensor has a parameter of "
@@ -226,7 +226,7 @@ def obstacle_to_notices(scenario: Scenario) -> str:
     if belief_size > MOST_NUMBERS_BY_DEFAULT:
         return (
             f"they take {belief_size:,} numbers a step, more than {MOST_NUMBERS_BY_DEFAULT:,} "
-            "(`[notice]` takes them)"
+            "(a table `[notice]` allows them)"
         )
     return ""
 

@@ -46,7 +46,7 @@ def _limit_validator(limit: int, reason: str) -> AfterValidator:
 PerSensor = Positive | tuple[Positive, ...]
 """One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
-_AT_MOST_LARGEST_COUNT = _limit_validator(LARGEST_COUNT, "for the twin holds arrays of that length")
+_AT_MOST_LARGEST_COUNT = _limit_validator(LARGEST_COUNT, "as the twin has arrays of that length")
 _LARGEST_COUNT_IN_SCHEMA = {"maximum": LARGEST_COUNT}
 Count = Annotated[
     int,
@@ -61,7 +61,7 @@ Step = Annotated[
 Seed = Annotated[
     int,
     Field(strict=True, ge=0),
-    _limit_validator(LARGEST_SEED, "for the files of a run hold no larger integer"),
+    _limit_validator(LARGEST_SEED, "as the files of a run hold no larger integer"),
 ]
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
@@ -251,7 +251,7 @@ def repeated_name_check(what: str, names: Sequence[str]) -> Check:
         All names.
     """
     is_repeated = len(set(names)) != len(names)
-    message = f"each {what} needs a name of its own, and the names are {', '.join(names)}"
+    message = f"each {what} needs a name of its own, but the names are {', '.join(names)}"
     return is_repeated, message
 
 

@@ -21,7 +21,6 @@ from reporting.json_file import plain
 from twin_master.errors import TwinMasterError
 from twin_master.report.reading import (
     NORMAL_95,
-    PrintedSensors,
     printed_factors,
     printed_sensors,
 )
@@ -83,7 +82,10 @@ class FlightPage:
         self._factor_scales = np.array([factor.scale for factor in self._factors])
         sensors = printed_sensors(flight.scenario)
         self._shows_deviations = not sensors.unit
-        self._sensors = _as_deviations(sensors) if self._shows_deviations else sensors
+        if self._shows_deviations:
+            units = ("standard deviations",) * len(sensors.titles)
+            sensors = replace(sensors, quantity="deviation", units=units, scale=1.0)
+        self._sensors = sensors
         self._open_requests: dict[SendText, Request] = {}
         self._error = ""
 
@@ -317,12 +319,6 @@ class FlightPage:
             # The margin is two standard deviations
             "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * margin),
         }
-
-
-def _as_deviations(sensors: PrintedSensors) -> PrintedSensors:
-    """Return the sensors with readings in standard deviations of the expected reading."""
-    units = ("standard deviations",) * len(sensors.titles)
-    return replace(sensors, quantity="deviation", units=units, scale=1.0)
 
 
 def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:

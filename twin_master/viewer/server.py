@@ -131,10 +131,6 @@ def package_text(package: str, name: str, media_type: str) -> ServedText:
     return ServedText(lambda: file.read_text(encoding="utf-8"), media_type)
 
 
-def _do_nothing() -> None:
-    """Do nothing; the default for `poll`."""
-
-
 def is_always_wanted() -> bool:
     """Return True; the default for `is_wanted`, with which a server runs until interrupted."""
     return True
@@ -146,7 +142,7 @@ def serve_texts(
     on_ready: Callable[[str], None],
     is_wanted: Callable[[], bool],
     handlers: Sequence[Rule] = (),
-    poll: Callable[[], None] = _do_nothing,
+    poll: Callable[[], None] = lambda: None,
 ) -> None:
     """Serve texts to browsers of this machine until `is_wanted` returns False.
 

@@ -336,7 +336,7 @@ def test_an_ssp_file_keeps_the_parameters_of_the_scenario(folder):
         ("level_turns", (), {"calibration": "none.nc"}, "is missing"),
         ("level_turns", ((BOUND, f'{BOUND}patch = "q.json"\n'),), {}, r"q\.json cannot be read"),
         ("level_turns", (FLOWN_PATCH, HIDDEN), {}, r"effect\.hiden\.active"),
-        ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` goes into the FMU"),
+        ("level_turns", (FLOWN_PATCH,), {"fmu": "x.fmu"}, r"`asset\.patch` belongs to an FMU"),
         ("model_mismatch", (), {"fmu": "x.fmu"}, "binding"),
         ("three_fmus", (), {"fmu": "x.fmu"}, "the scenario couples several"),
         ("three_fmus", (), {"fmu": "x.fmu", "ssp": "x.ssp"}, "give only one of an SSP file"),
