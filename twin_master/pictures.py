@@ -150,10 +150,10 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
         stored_unit = str(group["filtered"].to_dataset()["mean"].attrs["units"])
         has_one_unit = ", " not in stored_unit  # factors may differ in their unit
         scale, unit = printed_state(stored_unit) if has_one_unit else (1.0, "SI")
-        believed = scale * group["filtered"].to_dataset()["mean"].sel(region=factor).values
+        believed_states = scale * group["filtered"].to_dataset()["mean"].sel(region=factor).values
         truth = scale * group["truth"].to_dataset()["state"].sel(region=factor).values
-        steps = np.flatnonzero(~np.isnan(believed).all(axis=0))
-        quantiles = np.nanquantile(believed[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+        steps = np.flatnonzero(~np.isnan(believed_states).all(axis=0))
+        quantiles = np.nanquantile(believed_states[:, steps], [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
         style.band(panel, steps, quantiles[0], quantiles[4], style.PRESENT)
         style.band(panel, steps, quantiles[1], quantiles[3], style.PRESENT)
         panel.plot(steps, quantiles[2], color=style.PRESENT, label="believed, median of the twins")

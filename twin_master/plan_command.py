@@ -313,7 +313,7 @@ def design(
     record: Record = {
         "sensors": chosen_titles,
         "information": list(choice.information),
-        "of_all": choice.of_all,
+        "of_all": choice.information_of_all,
         "not_separated": not_separated,
     }
     if worth:
@@ -420,7 +420,7 @@ def _write_design_picture(
         positions = positions[:, np.sort(axes_by_extent[:2])]
     figure = design_figure(
         list(choice.information),
-        choice.of_all,
+        choice.information_of_all,
         chosen_titles,
         positions,
         choice.sensors,

@@ -407,14 +407,14 @@ class LibrarySource(AssetSource):
         )
 
     def _check_same_texts(
-        self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]
+        self, verb: str, library_labels: Sequence[str], scenario_labels: Sequence[str]
     ) -> None:
         """Refuse a library whose labels differ from those of the scenario, in number or order."""
-        if list(of_library) != list(of_scenario):
+        if list(library_labels) != list(scenario_labels):
             raise MissionInputError(
                 f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "
-                f"{', '.join(of_library) or 'none'}, and the scenario with its binding asks for "
-                f"{', '.join(of_scenario) or 'none'}: {_ADVICE}"
+                f"{', '.join(library_labels) or 'none'}, and the scenario with its binding asks "
+                f"for {', '.join(scenario_labels) or 'none'}: {_ADVICE}"
             )
 
     def check(self) -> None:

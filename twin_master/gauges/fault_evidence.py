@@ -84,13 +84,13 @@ def correct_beliefs(
                 recovered_squares = priors.degrees_of_freedom + beliefs.recovered_squares[twin, g]
                 log_scale_ratio += np.log(model_squares[g] / recovered_squares)
         number_products(observation.degrees_after, observation.product)
-        of_faults = pairs_of_faults(beliefs, twin)
-        considered = pairs_of_hypotheses(beliefs, twin, of_faults)
-        standardize(predictions, observations, twin, precision, considered, observation)
+        fault_pairs = pairs_of_faults(beliefs, twin)
+        considered_pairs = pairs_of_hypotheses(beliefs, twin, fault_pairs)
+        standardize(predictions, observations, twin, precision, considered_pairs, observation)
 
         recovered_evidence = update_sound_gauges(
             observation,
-            considered,
+            considered_pairs,
             priors.degrees_of_freedom,
             beliefs.recovered[twin],
             beliefs.recovered_squares[twin],
@@ -99,7 +99,7 @@ def correct_beliefs(
         log_evidence.recovered[twin] = recovered_evidence.log_evidence + 0.5 * log_scale_ratio
         evidence = update_sound_gauges(
             observation,
-            considered,
+            considered_pairs,
             priors.degrees_of_freedom,
             beliefs.model[twin],
             beliefs.model_squares[twin],
@@ -107,7 +107,7 @@ def correct_beliefs(
         )
         log_evidence.model[twin] = evidence.log_evidence
         model = model_likelihood(
-            observation, of_faults, model_squares, density, evidence.log_factor
+            observation, fault_pairs, model_squares, density, evidence.log_factor
         )
         update_gauge_faults(observation, model, priors, beliefs, twin, log_evidence.gauge[twin])
         log_evidence.free_gains[twin] = update_free_gains(

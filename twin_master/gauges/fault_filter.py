@@ -108,17 +108,17 @@ class FaultFilter:
         """Return the predictions of all pairs, given those of the chosen draws (E', S, U, G)."""
         draws, states, controls, sensors = values.shape
         shape = (controls, states, draws, sensors)
-        of_pairs = (controls, states * draws, sensors)
+        shape_of_pairs = (controls, states * draws, sensors)
         deviation = self._sensor_model.independent_standard_deviation.swapaxes(0, 1)  # (U, S, G)
         inverse_deviation = np.broadcast_to(1.0 / deviation[:, :, None], shape)
         interval = self._sensor_model.interval.transpose(1, 3, 0, 2)  # (U, F, S, G)
         scaled_interval = interval[:, :, :, None] * inverse_deviation[:, None]
         factors = interval.shape[1]
         return Predictions(
-            value=(values.transpose(2, 1, 0, 3) * inverse_deviation).reshape(of_pairs),
-            inverse_deviation=inverse_deviation.reshape(of_pairs),
+            value=(values.transpose(2, 1, 0, 3) * inverse_deviation).reshape(shape_of_pairs),
+            inverse_deviation=inverse_deviation.reshape(shape_of_pairs),
             log_inverse_deviation=np.ascontiguousarray(-np.log(deviation)),
-            interval=scaled_interval.reshape(controls, factors, *of_pairs[1:]),
+            interval=scaled_interval.reshape(controls, factors, *shape_of_pairs[1:]),
         )
 
     def _log_gauge_prior(self) -> Float:

@@ -47,7 +47,7 @@ class FreeGainWeights(NamedTuple):
 
 
 @compiled
-def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
+def _considered_positions(model: ModelLikelihood, belief: Single) -> Index:
     """Return the positions in `model.pair` of the pairs whose belief is not negligible.
 
     Negligible entries of the belief (N,) become zero.
@@ -55,13 +55,13 @@ def _believed_pairs(model: ModelLikelihood, belief: Single) -> Index:
     for i in range(len(belief)):
         if belief[i] < NEGLIGIBLE_UNDER_FAULT:
             belief[i] = 0.0
-    believed = np.empty(len(model.pair), np.int64)
+    positions = np.empty(len(model.pair), np.int64)
     count = 0
     for j in range(len(model.pair)):
         if belief[model.pair[j]] > 0.0:
-            believed[count] = j
+            positions[count] = j
             count += 1
-    return believed[:count]
+    return positions[:count]
 
 
 @compiled
@@ -97,7 +97,7 @@ def weigh_free_gains(
     model: ModelLikelihood,
     densities: GaugeDensities,
     free_probability: Float,
-    believed: Index,
+    positions: Index,
     belief: Single,
 ) -> FreeGainWeights:
     """Return the weights of the pairs under free gains, relative to the reference pair.
@@ -110,12 +110,12 @@ def weigh_free_gains(
         The densities of the gauges with a gain, and then those without.
     free_probability : (G,) array
         The probability that a gauge has a gain of its own.
-    believed : (n,) array
+    positions : (n,) array
         The positions in `model.pair` of the pairs with a belief that is not negligible.
     belief : (N,) array
     """
     gauges = len(free_probability)
-    count = len(believed)
+    count = len(positions)
     factors = exchange_factors(observation, model, densities)
     factor = np.empty(2 * gauges)
     for g in range(gauges):
@@ -140,14 +140,14 @@ def weigh_free_gains(
         np.empty(2 * gauges, np.float32),
     )
     for m in range(count):
-        i = model.pair[believed[m]]
+        i = model.pair[positions[m]]
         for g in range(gauges):
             residual[g] = observation.residual[i, g]
             prediction[g] = observation.prediction[i, g]
             residual[gauges + g] = residual[g]
             prediction[gauges + g] = prediction[g]
         exchange_densities(factors, residual, prediction, square, ratio, work)
-        product = belief[i] * model.density[believed[m]]
+        product = belief[i] * model.density[positions[m]]
         for g in range(gauges):
             free_density = factor[g] * ratio[g]
             mixture = free_density + factor[gauges + g] * ratio[gauges + g]
@@ -164,7 +164,7 @@ def weigh_free_gains_in_logs(
     model: ModelLikelihood,
     densities: GaugeDensities,
     free_probability: Float,
-    believed: Index,
+    positions: Index,
     belief: Single,
     weights: FreeGainWeights,
 ) -> float:
@@ -179,12 +179,14 @@ def weigh_free_gains_in_logs(
         The log of the largest density, which has the weight 1, minus `model.log_density`.
     """
     gauges = len(free_probability)
-    count = len(believed)
+    count = len(positions)
     log_density = np.empty(count)
-    log_density_of_sound_gauges(observation, model.pair[believed], model.scale_squares, log_density)
+    log_density_of_sound_gauges(
+        observation, model.pair[positions], model.scale_squares, log_density
+    )
     largest = -np.inf
     for m in range(count):
-        i = model.pair[believed[m]]
+        i = model.pair[positions[m]]
         for g in range(gauges):
             log_free = log_exchanged_density(observation, model, densities, g, i)
             log_fixed = log_exchanged_density(observation, model, densities, gauges + g, i)
@@ -198,7 +200,7 @@ def weigh_free_gains_in_logs(
             weights.free_square[m, g] = innovation * innovation / variance
         largest = max(largest, log_density[m])
     for m in range(count):
-        belief_in_pair = belief[model.pair[believed[m]]]
+        belief_in_pair = belief[model.pair[positions[m]]]
         weights.weight[m] = belief_in_pair * np.exp(log_density[m] - largest)
     return float(largest - model.log_density)
 
@@ -230,31 +232,31 @@ def update_free_gains(
         The log evidence, up to the same constant as that of the model; minus infinity if the belief
         is negligible everywhere.
     """
-    believed = _believed_pairs(model, belief)
-    count = len(believed)
+    positions = _considered_positions(model, belief)
+    count = len(positions)
     if count == 0:
         return -np.inf
     densities = free_gain_densities(priors, statistics, twin)
     free_probability = np.empty(len(observation.present))
     for g in range(len(free_probability)):  # rounding may exceed one
         free_probability[g] = min(max(statistics.free_probability[twin, g], 0.0), 1.0)
-    weights = weigh_free_gains(observation, model, densities, free_probability, believed, belief)
+    weights = weigh_free_gains(observation, model, densities, free_probability, positions, belief)
     log_scale = model.log_density
     total = 0.0
     for m in range(count):
         total += weights.weight[m]
     if not LEAST_TOTAL < total < 1.0 / LEAST_TOTAL:
         log_scale += weigh_free_gains_in_logs(
-            observation, model, densities, free_probability, believed, belief, weights
+            observation, model, densities, free_probability, positions, belief, weights
         )
         total = 0.0
         for m in range(count):
             total += weights.weight[m]
     for m in range(count):
         weights.weight[m] /= total
-        belief[model.pair[believed[m]]] = weights.weight[m]
+        belief[model.pair[positions[m]]] = weights.weight[m]
     _update_statistics(
-        observation, model, priors.free_gain_deviation, believed, weights, statistics, twin
+        observation, model, priors.free_gain_deviation, positions, weights, statistics, twin
     )
     return float(log_scale + np.log(total))
 
@@ -264,7 +266,7 @@ def _update_statistics(
     observation: StandardizedObservation,
     model: ModelLikelihood,
     deviation: float,
-    believed: Index,
+    positions: Index,
     weights: FreeGainWeights,
     statistics: FreeGainStatistics,
     twin: int,
@@ -273,8 +275,8 @@ def _update_statistics(
 
     Parameters
     ----------
-    believed : (n,) array
-        Which of the pairs of `model` the fault believes in.
+    positions : (n,) array
+        The positions in `model.pair` of the pairs with a belief that is not negligible.
     """
     gauges = len(observation.present)
     free_probability = np.zeros(gauges)
@@ -282,8 +284,8 @@ def _update_statistics(
     free_squares = np.zeros(gauges)
     sum_cc = np.zeros(gauges)
     sum_cx = np.zeros(gauges)
-    for m in range(len(believed)):
-        i = model.pair[believed[m]]
+    for m in range(len(positions)):
+        i = model.pair[positions[m]]
         weight = weights.weight[m]
         for g in range(gauges):
             x = observation.residual[i, g]

@@ -214,7 +214,7 @@ class GaugeWatch:
         notices = self._report_useless_readings(state, checked, step)
         if step == 0:
             own_likelihood = self._notices.report_own_likelihood(self._sensor_model)
-            notices = [own_likelihood + of_twin for of_twin in notices]
+            notices = [own_likelihood + twin_notices for twin_notices in notices]
         self._raise_alarms(state, notices, step)
         self._report_followed_hypothesis(state, notices, step)
         self._advise_controls(state, notices, model_belief, step)

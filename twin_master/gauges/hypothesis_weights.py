@@ -215,8 +215,8 @@ class HypothesisWeights:
         # Nothing is known about a fault that began in this step under the other controls: it shows
         # there with the prior probability.
         hidden *= (1.0 - free_gains_begin)[..., None]
-        of_fault = np.maximum(advanced[..., FAULTS] + hidden, _LEAST_PROBABILITY)
-        self.showing += (begun / of_fault)[..., None] * (SHOWS_ELSEWHERE - self.showing)
+        fault_probability = np.maximum(advanced[..., FAULTS] + hidden, _LEAST_PROBABILITY)
+        self.showing += (begun / fault_probability)[..., None] * (SHOWS_ELSEWHERE - self.showing)
         return np.asarray(ended)
 
     def update(self, log_ratio: Float) -> None:

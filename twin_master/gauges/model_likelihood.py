@@ -52,7 +52,7 @@ def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
     In all other pairs the beliefs of gauge faults become zero.
     """
     _, pairs, faults = beliefs.gauge.shape
-    considered = np.empty(pairs, np.int64)
+    considered_pairs = np.empty(pairs, np.int64)
     count = 0
     for i in range(pairs):
         believing_faults = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
@@ -60,13 +60,13 @@ def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
             for r in range(faults):
                 believing_faults += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
         if believing_faults > 0:
-            considered[count] = i
+            considered_pairs[count] = i
             count += 1
         elif beliefs.gauge_is_nonzero[twin, i]:
             for r in range(faults):
                 beliefs.gauge[twin, i, r] = 0.0
             beliefs.gauge_is_nonzero[twin, i] = False
-    return considered[:count]
+    return considered_pairs[:count]
 
 
 @compiled
@@ -76,14 +76,14 @@ def pairs_of_hypotheses(beliefs: Beliefs, twin: int, pairs_of_faults: Index) -> 
     is_considered = np.zeros(pairs, np.bool_)
     for i in pairs_of_faults:
         is_considered[i] = True
-    considered = np.empty(pairs, np.int64)
+    considered_pairs = np.empty(pairs, np.int64)
     count = 0
     for i in range(pairs):
         largest = max(beliefs.model[twin, i], beliefs.recovered[twin, i])
         if is_considered[i] or largest >= NEGLIGIBLE_UNDER_MODEL:
-            considered[count] = i
+            considered_pairs[count] = i
             count += 1
-    return considered[:count]
+    return considered_pairs[:count]
 
 
 @compiled

@@ -42,10 +42,10 @@ def posterior_of_draws(values: ArrayLike, prior: ArrayLike, weight: ArrayLike) -
     with np.errstate(divide="ignore", invalid="ignore"):
         log_evidence = np.log(posterior_weight) - np.log(prior_weight)
     largest = np.max(log_evidence[np.isfinite(log_evidence)])
-    considered = np.flatnonzero(log_evidence >= largest - _LARGEST_LOG_RATIO)
-    if len(distinct) < _FEWEST_FOR_SPLINE or len(considered) < 2:
+    relevant_draws = np.flatnonzero(log_evidence >= largest - _LARGEST_LOG_RATIO)
+    if len(distinct) < _FEWEST_FOR_SPLINE or len(relevant_draws) < 2:
         return posterior_of_points(distinct, posterior_weight)
-    return _interpolated_posterior(distinct, prior_weight, log_evidence, considered)
+    return _interpolated_posterior(distinct, prior_weight, log_evidence, relevant_draws)
 
 
 def posterior_of_points(values: Float, weight: Float) -> Learnt:
@@ -62,7 +62,7 @@ def posterior_of_points(values: Float, weight: Float) -> Learnt:
 
 
 def _interpolated_posterior(
-    values: Float, prior: Float, log_evidence: Float, considered: NDArray[np.intp]
+    values: Float, prior: Float, log_evidence: Float, relevant_draws: NDArray[np.intp]
 ) -> Learnt:
     """Return the posterior with the log evidence interpolated between the draws.
 
@@ -74,14 +74,14 @@ def _interpolated_posterior(
         Their probabilities before the observations.
     log_evidence : (E,) array
         The log evidence of each draw.
-    considered : (n,) array of int
+    relevant_draws : (n,) array of int
         The draws whose evidence is not negligible, two or more.
     """
     from scipy.interpolate import CubicSpline  # slow to import; only a twin that learns needs it
 
-    # The considered draws with one neighbour on either side.
-    begin = max(int(considered[0]) - 1, 0)
-    end = min(int(considered[-1]) + 2, len(values))
+    # The relevant draws with one neighbour on either side.
+    begin = max(int(relevant_draws[0]) - 1, 0)
+    end = min(int(relevant_draws[-1]) + 2, len(values))
 
     # Each draw stands for the interval that ends half way to its neighbours. The interval of an
     # outermost draw is symmetric about it.
@@ -97,7 +97,7 @@ def _interpolated_posterior(
 
     # Posterior mass of the cells. The log evidence of negligible neighbours may be minus infinity;
     # it is raised to a finite floor for the spline.
-    floor = np.min(log_evidence[considered]) - _LARGEST_LOG_RATIO
+    floor = np.min(log_evidence[relevant_draws]) - _LARGEST_LOG_RATIO
     spline = CubicSpline(values[begin:end], np.maximum(log_evidence[begin:end], floor))
     log_evidence_on_grid = spline(middle)
     mass = prior_mass * np.exp(log_evidence_on_grid - log_evidence_on_grid.max())

@@ -410,10 +410,10 @@ def _quantiles_by_state(probability: Float, first_moment: Float, second_moment: 
     """
     quantiles = np.empty((len(probability), len(_LEVELS), first_moment.shape[-1]))
     for b in range(len(probability)):
-        considered = np.flatnonzero(probability[b] > _NEGLIGIBLE_PROBABILITY)
-        weight = probability[b, considered]
-        mean = first_moment[b, considered] / weight[:, None]
-        variance = np.maximum(second_moment[b, considered] / weight[:, None] - mean**2, 0.0)
+        relevant = np.flatnonzero(probability[b] > _NEGLIGIBLE_PROBABILITY)
+        weight = probability[b, relevant]
+        mean = first_moment[b, relevant] / weight[:, None]
+        variance = np.maximum(second_moment[b, relevant] / weight[:, None] - mean**2, 0.0)
         quantiles[b] = mixture_quantiles(weight / weight.sum(), mean, np.sqrt(variance), _LEVELS)
     return quantiles
 
@@ -429,23 +429,23 @@ def _joint_with_marginal(joint: Float, belief: Float) -> Float:
     return np.asarray(belief * hypothesis_given_state)
 
 
-def concatenate_expectations(parts: Iterable[Expectation]) -> Expectation:
+def concatenate_expectations(expectations: Iterable[Expectation]) -> Expectation:
     """Return the expectations of successive spans of a mission as one, along their leading axis."""
-    return _join_expectations(parts, np.concatenate)
+    return _join_expectations(expectations, np.concatenate)
 
 
-def stack_expectations(parts: Iterable[Expectation]) -> Expectation:
+def stack_expectations(expectations: Iterable[Expectation]) -> Expectation:
     """Return expectations stacked along a new leading axis."""
-    return _join_expectations(parts, np.array)
+    return _join_expectations(expectations, np.array)
 
 
 def _join_expectations(
-    parts: Iterable[Expectation], join: Callable[[list[Float]], Float]
+    expectations: Iterable[Expectation], join: Callable[[list[Float]], Float]
 ) -> Expectation:
     """Return one expectation whose arrays are joined from those of all parts."""
-    parts = list(parts)
+    expectations = list(expectations)
     arrays = {
-        field.name: join([getattr(part, field.name) for part in parts])
+        field.name: join([getattr(expectation, field.name) for expectation in expectations])
         for field in fields(Expectation)
     }
     return Expectation(**arrays)

@@ -306,11 +306,11 @@ class LearningFilter:
         if weight is None:
             weight = np.exp(carried.arrays["log_belief"])
         hypothesis_weight = weight.sum(axis=1)
-        is_considered = hypothesis_weight > _NEGLIGIBLE_WEIGHT * hypothesis_weight.sum()
-        considered = np.flatnonzero(is_considered)
+        is_relevant = hypothesis_weight > _NEGLIGIBLE_WEIGHT * hypothesis_weight.sum()
+        relevant = np.flatnonzero(is_relevant)
 
         # Regression of offset and gain error, in units of their prior standard deviations.
-        fit = self._gauges.fit(carried.arrays["statistics"][considered])
+        fit = self._gauges.fit(carried.arrays["statistics"][relevant])
         offset_deviation = self._gauges.offset_deviation
         gain_deviation = self._gauges.gain_deviation
         squared_noise_scale = self._gauges.squared_noise_scale(fit, carried.arrays["count"])
@@ -320,8 +320,8 @@ class LearningFilter:
         covariance = offset_deviation * gain_deviation * fit.covariance
         gain_variance = gain_deviation**2 * fit.gain_variance
         return StaticHypotheses(
-            weight=weight[considered],
-            draw=self._draw_of_hypothesis[considered],
+            weight=weight[relevant],
+            draw=self._draw_of_hypothesis[relevant],
             offset=offset_deviation * fit.offset,
             gain=gain_deviation * fit.gain,
             offset_variance=squared_noise_scale * offset_variance,

@@ -39,9 +39,9 @@ class Earnings:
     needless: Float
 
     @classmethod
-    def concatenate(cls, parts: Sequence["Earnings"]) -> "Earnings":
+    def concatenate(cls, spans: Sequence["Earnings"]) -> "Earnings":
         """Return the earnings of successive spans of one flight."""
-        joined = {name: np.concatenate([vars(part)[name] for part in parts]) for name in FIELDS}
+        joined = {name: np.concatenate([vars(span)[name] for span in spans]) for name in FIELDS}
         return cls(**joined)
 
 

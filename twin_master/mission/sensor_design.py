@@ -202,13 +202,13 @@ class SensorDesign:
         The indices of the chosen sensors. Each adds the most information to those before it.
     information : tuple of float
         The information of the first sensor, of the first two, and so on, in bits.
-    of_all : float
+    information_of_all : float
         The information of all candidate sensors together, in bits.
     """
 
     sensors: tuple[int, ...]
     information: tuple[float, ...]
-    of_all: float
+    information_of_all: float
 
 
 def choose_sensors(

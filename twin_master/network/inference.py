@@ -152,7 +152,7 @@ def filter_many(
         The first step whose observation is impossible, or -1. Later beliefs of such a twin are not
         defined.
     """
-    twins, steps, size = log_likelihood.shape
+    twins, steps, state_count = log_likelihood.shape
     result = Filtered(
         forecast=np.empty_like(log_likelihood),
         filtered=np.empty_like(log_likelihood),
@@ -163,7 +163,7 @@ def filter_many(
     forward_pass(
         transition.forward_lists,
         control,
-        np.full((twins, size), log_before),
+        np.full((twins, state_count), log_before),
         np.full(twins, control_before),
         log_likelihood,
         result.forecast,

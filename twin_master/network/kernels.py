@@ -177,12 +177,12 @@ def forward_pass(
         To be filled: the first step whose observation is impossible, or -1. Later steps of such a
         twin are not filled.
     """
-    twins, steps, size = log_likelihood.shape
-    first = np.empty(size)
-    work = np.empty((2, size))
+    twins, steps, state_count = log_likelihood.shape
+    first = np.empty(state_count)
+    work = np.empty((2, state_count))
     for twin in range(twins):
         failed[twin] = -1
-        for state in range(size):
+        for state in range(state_count):
             first[state] = _exp(log_first[twin, state])
         before = first
         log_before = log_first[twin]
@@ -192,7 +192,7 @@ def forward_pass(
             # Forecast.
             control_in_force = control[twin, t - 1] if t > 0 else control_before[twin]
             if control_in_force < 0:
-                for state in range(size):
+                for state in range(state_count):
                     forecast_now[state] = before[state]
                     log_now[state] = log_before[state]
             else:
@@ -201,7 +201,7 @@ def forward_pass(
                 )
             # Times the likelihood.
             largest = -np.inf
-            for state in range(size):
+            for state in range(state_count):
                 log_now[state] += log_likelihood[twin, t, state]
                 largest = max(largest, log_now[state])
             if largest == -np.inf:
@@ -212,12 +212,12 @@ def forward_pass(
             before = filtered[twin, t]
             log_before = log_now
             total = 0.0
-            for state in range(size):
+            for state in range(state_count):
                 before[state] = _exp(log_now[state] - largest)
                 total += before[state]
             evidence = largest + np.log(total)
             log_evidence[twin, t] = evidence
-            for state in range(size):
+            for state in range(state_count):
                 before[state] /= total
                 log_now[state] -= evidence
 
@@ -251,15 +251,15 @@ def backward_pass(
     smoothed : (B, T, S) array
         To be filled: p(D_t | o_0..o_{T-1}).
     """
-    twins, steps, size = log_filtered.shape
-    forecast = np.empty(size)
-    ratio = np.empty(size)
-    work = np.empty((2, size))
-    log_forecast = np.empty(size)
-    log_ratio = np.empty(size)
-    log_back = np.empty(size)
+    twins, steps, state_count = log_filtered.shape
+    forecast = np.empty(state_count)
+    ratio = np.empty(state_count)
+    work = np.empty((2, state_count))
+    log_forecast = np.empty(state_count)
+    log_ratio = np.empty(state_count)
+    log_back = np.empty(state_count)
     for twin in range(twins):
-        for state in range(size if steps else 0):
+        for state in range(state_count if steps else 0):
             smoothed[twin, steps - 1, state] = filtered[twin, steps - 1, state]
         for t in range(steps - 2, -1, -1):
             now = smoothed[twin, t]
@@ -270,7 +270,7 @@ def backward_pass(
             # Ratio of the smoothed belief of the later step to its forecast.
             underflows = False
             apply_blocks(forward, control_in_force, before, forecast, work[0])
-            for state in range(size):
+            for state in range(state_count):
                 underflows |= later[state] > 0.0 and forecast[state] < SAFE
                 ratio[state] = later[state] / max(forecast[state], SAFE)
             # The ratio, carried back through the transition.
@@ -279,12 +279,12 @@ def backward_pass(
                 _move_belief(
                     forward, control_in_force, before, log_now, forecast, log_forecast, work
                 )
-                for state in range(size):
+                for state in range(state_count):
                     log_ratio[state] = -np.inf
                     if later[state] > 0.0:
                         log_ratio[state] = np.log(later[state]) - log_forecast[state]
                     largest = max(largest, log_ratio[state])
-                for state in range(size):
+                for state in range(state_count):
                     log_ratio[state] -= largest  # because the ratios themselves may overflow
                     ratio[state] = _exp(log_ratio[state])
                 _move_belief(backward, control_in_force, ratio, log_ratio, now, log_back, work)
@@ -292,7 +292,7 @@ def backward_pass(
                 apply_blocks(backward, control_in_force, ratio, now, work[0])
             # Times the filtered belief, and normalisation.
             total = 0.0
-            for state in range(size):
+            for state in range(state_count):
                 if underflows:
                     now[state] = _exp(log_now[state] + (log_back[state] + largest))
                 elif before[state] >= SAFE:
@@ -300,7 +300,7 @@ def backward_pass(
                 elif now[state] > 0.0:
                     now[state] = _exp(log_now[state] + np.log(now[state]))
                 total += now[state]
-            for state in range(size):
+            for state in range(state_count):
                 now[state] /= total
 
 

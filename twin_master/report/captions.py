@@ -31,19 +31,19 @@ def state_units(run: Run) -> str:
     return ", ".join(dict.fromkeys(units))
 
 
-def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigure:
+def caption_mission(run: Run, figure: Figure, present_row: int, name: str) -> ReportFigure:
     """Return a figure of `mission_figure` with its title and caption.
 
     Parameters
     ----------
-    now : int
+    present_row : int
         The row of the present step in the run's arrays, from 0 to T - 1. Its printed number is
         larger by the number of the run's first step.
     name : str
         The name of the figure: `MISSION_NOW` or `MISSION_WHOLE`.
     """
-    is_last_step = now == run.step_count - 1
-    step_number = run.first_step + now
+    is_last_step = present_row == run.step_count - 1
+    step_number = run.first_step + present_row
     present_step = f"{run.step_word} {step_number}"
     if name == MISSION_NOW:
         title = f"The mission as the twin sees it at {present_step}"
@@ -68,22 +68,22 @@ def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigu
         past="in hindsight" if is_last_step else "as seen at the time",
         later_observations="" if is_last_step else f"hollow: not yet made at {present_step}; ",
         later_controls="" if is_last_step else "; triangles: flown later",
-        decision=_decision_sentence(run, now),
+        decision=_decision_sentence(run, present_row),
         truth="" if run.true_state is None else truth_sentence,
     )
     return report_figure._replace(name=name)
 
 
-def _decision_sentence(run: Run, now: int) -> str:
-    """Return the sentence on the control chosen at the end of the step in row `now`."""
-    probability = run["filtered/decision_probability"][now]
+def _decision_sentence(run: Run, present_row: int) -> str:
+    """Return the sentence on the control chosen at the end of the step in row `present_row`."""
+    probability = run["filtered/decision_probability"][present_row]
     chosen_control = int(np.argmax(probability))
     if run.decides_on_prediction:
         state = f"predicted for that {run.step_word}"
     else:
         state = "as just observed"
     return (
-        f"At the end of {run.step_word} {run.first_step + now} the twin decided on "
+        f"At the end of {run.step_word} {run.first_step + present_row} the twin decided on "
         f"{run.controls[chosen_control]} for the next one: the policy asks for it with probability "
         f"{probability[chosen_control]:.2f} in the state {state}."
     )

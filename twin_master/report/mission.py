@@ -115,14 +115,14 @@ def _sensitivities(run: Run, expected_values: Float) -> Float:
 
 
 @style.publication_style()
-def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> Figure:
+def mission_figure(run: Run, present_row: int, sensors: Sequence[int] | None = None) -> Figure:
     """Draw states, control, sensors and rewards of a mission as the twin knows them at one step.
 
     Each panel shows the estimates of the past, the present step, and the predicted steps.
 
     Parameters
     ----------
-    now : int
+    present_row : int
         The row of the present step in the run's arrays, from 0 to T - 1.
     sensors : sequence of int, optional
         The indices of the sensors to draw, from 0; by default those of `choose_sensors`.
@@ -135,8 +135,8 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
     for column_number, column in enumerate(columns):
         for row, draw_panel in enumerate(column):
             axes = grid[row][column_number]
-            _draw_zones(axes, run, now, with_headings=row == 0)
-            style.panel_label(axes, next(labels), draw_panel(axes, run, now))
+            _draw_zones(axes, run, present_row, with_headings=row == 0)
+            style.panel_label(axes, next(labels), draw_panel(axes, run, present_row))
             if row == len(column) - 1:
                 axes.set_xlabel(run.step_word)
             else:
@@ -171,13 +171,13 @@ def _panels_in_columns(run: Run, sensors: Sequence[int]) -> tuple[list[Panel], l
     return left_column, right_column
 
 
-def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
+def _draw_zones(axes: Axes, run: Run, present_row: int, *, with_headings: bool) -> None:
     """Set up the axes of a panel, and mark the present step and the zone of predicted steps.
 
     With headings, the zones are named above the panel if they are wide enough.
     """
     first_step = run.first_step
-    present_step = first_step + now
+    present_step = first_step + present_row
     last_step = present_step + run.horizon
     axes.set_xlim(first_step - 0.8, last_step + 0.8)
     axes.axvspan(
@@ -200,7 +200,7 @@ def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
         ha="right",
         color=style.PRESENT,
     )
-    if now > _LONG_PAST * (last_step - first_step):
+    if present_row > _LONG_PAST * (last_step - first_step):
         axes.text(first_step - 0.8, height, "past", transform=above, ha="left", color=style.PAST)
     if run.horizon > _NARROW_ZONE * (last_step - first_step):
         axes.text(
@@ -213,7 +213,9 @@ def _draw_zones(axes: Axes, run: Run, now: int, *, with_headings: bool) -> None:
         )
 
 
-def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | None) -> None:
+def _draw_course(
+    axes: Axes, run: Run, present_row: int, course: Course, truth: Float | None
+) -> None:
     """Draw a course from the first step to the last predicted one, and the true values if known.
 
     Parameters
@@ -222,22 +224,22 @@ def _draw_course(axes: Axes, run: Run, now: int, course: Course, truth: Float | 
         The true value in each step; None if it is not known.
     """
     steps = run.first_step + np.arange(len(course.mean))
-    _draw_part(axes, steps, course, slice(now + 1), color=style.PAST, label="past")
+    _draw_part(axes, steps, course, slice(present_row + 1), color=style.PAST, label="past")
     _draw_part(
         axes,
         steps,
         course,
-        slice(now + 1, None),
+        slice(present_row + 1, None),
         color=style.PREDICTION,
         label="prediction",
         line=_PREDICTED_LINE,
     )
-    mean = float(course.mean[now])
-    lower = float(course.lower[now])
-    upper = float(course.upper[now])
+    mean = float(course.mean[present_row])
+    lower = float(course.lower[present_row])
+    upper = float(course.upper[present_row])
     if np.isfinite(mean):
         style.interval(
-            axes, steps[now], mean, lower, upper, **_PRESENT_MARK, zorder=4, label="present"
+            axes, steps[present_row], mean, lower, upper, **_PRESENT_MARK, zorder=4, label="present"
         )
     if truth is not None:
         drawn_truth = truth[: len(steps)]
@@ -264,43 +266,43 @@ def _draw_part(
     axes.plot(part_steps, course.mean[rows][has_value], color=color, label=label, **(line or {}))
 
 
-def _past_and_predicted(run: Run, variable: str, index: int, now: int) -> Float:
-    """Return estimates up to the step in row `now` and predictions after it, (n,), SI.
+def _past_and_predicted(run: Run, variable: str, index: int, present_row: int) -> Float:
+    """Return estimates up to the step in row `present_row` and predictions after it, (n,), SI.
 
     Past estimates are smoothed, given all observations, if the step is the last one; otherwise they
     are filtered, each given the observations up to its own step.
     """
-    past_group = "smoothed" if now == run.step_count - 1 else "filtered"
-    past_values = run[f"{past_group}/{variable}"][: now + 1, ..., index]
-    predicted_values = run[f"predicted/{variable}"][now, ..., index]
+    past_group = "smoothed" if present_row == run.step_count - 1 else "filtered"
+    past_values = run[f"{past_group}/{variable}"][: present_row + 1, ..., index]
+    predicted_values = run[f"predicted/{variable}"][present_row, ..., index]
     return np.concatenate((past_values, predicted_values))
 
 
-def _quantity_course(run: Run, sensor: int, now: int) -> Course:
+def _quantity_course(run: Run, sensor: int, present_row: int) -> Course:
     """Return the noise-free value at a sensor with its 95 % intervals, in SI units."""
     return Course(
-        mean=_past_and_predicted(run, "quantity_mean", sensor, now),
-        lower=_past_and_predicted(run, "quantity_lower", sensor, now),
-        upper=_past_and_predicted(run, "quantity_upper", sensor, now),
+        mean=_past_and_predicted(run, "quantity_mean", sensor, present_row),
+        lower=_past_and_predicted(run, "quantity_lower", sensor, present_row),
+        upper=_past_and_predicted(run, "quantity_upper", sensor, present_row),
     )
 
 
-def _state_course(run: Run, index: int, now: int) -> Course:
+def _state_course(run: Run, index: int, present_row: int) -> Course:
     """Return the mean of a factor and two standard deviations around it, in printed units.
 
     The band is clipped to the range of the levels. Past values are moments of the smoothed belief
     p(D_t | o_0..o_now), predicted ones of p(D_{now+h} | o_0..o_now) for h steps ahead.
     """
     factor = run.factors[index]
-    if now == run.step_count - 1:
+    if present_row == run.step_count - 1:
         past_mean = run["smoothed/mean"]
         past_deviation = run["smoothed/standard_deviation"]
     else:
-        belief = run.smoothed_until(now)
+        belief = run.smoothed_until(present_row)
         past_mean = run.model.states.mean(belief)
         past_deviation = run.model.states.standard_deviation(belief)
-    predicted_mean = run["predicted/mean"][now]
-    predicted_deviation = run["predicted/standard_deviation"][now]
+    predicted_mean = run["predicted/mean"][present_row]
+    predicted_deviation = run["predicted/standard_deviation"][present_row]
     mean = factor.scale * np.vstack((past_mean, predicted_mean))[:, index]
     deviation = factor.scale * np.vstack((past_deviation, predicted_deviation))[:, index]
     lowest_level = factor.levels[0]
@@ -312,18 +314,18 @@ def _state_course(run: Run, index: int, now: int) -> Course:
     )
 
 
-def _draw_state(index: int, axes: Axes, run: Run, now: int) -> str:
+def _draw_state(index: int, axes: Axes, run: Run, present_row: int) -> str:
     """Draw the belief of one factor of the state, and return the title of the panel."""
     factor = run.factors[index]
     axes.plot(
-        run.step_numbers[: now + 1],
-        factor.scale * run["filtered/mean"][: now + 1, index],
+        run.step_numbers[: present_row + 1],
+        factor.scale * run["filtered/mean"][: present_row + 1, index],
         color=style.PRESENT,
         linewidth=0.9,
         label="as seen at the time",
     )
     truth = None if run.true_state is None else factor.scale * run.true_state[:, index]
-    _draw_course(axes, run, now, _state_course(run, index, now), truth)
+    _draw_course(axes, run, present_row, _state_course(run, index, present_row), truth)
     lowest_level = factor.levels[0]
     highest_level = factor.levels[-1]
     margin = 0.075 * (highest_level - lowest_level)
@@ -334,29 +336,29 @@ def _draw_state(index: int, axes: Axes, run: Run, now: int) -> str:
     return capital(factor.title)
 
 
-def _draw_sensor(sensor: int, axes: Axes, run: Run, now: int) -> str:
+def _draw_sensor(sensor: int, axes: Axes, run: Run, present_row: int) -> str:
     """Draw readings and expected values of a sensor, and return the title of the panel."""
     sensors = run.sensors
-    readings = sensors.scale * run.observations[: now + 1 + run.horizon, sensor]
+    readings = sensors.scale * run.observations[: present_row + 1 + run.horizon, sensor]
     steps = run.step_numbers[: len(readings)]
-    _draw_readings(axes, steps, readings, now)
+    _draw_readings(axes, steps, readings, present_row)
     true_quantity = run.get(f"truth/{sensors.quantity}")
     truth = None if true_quantity is None else sensors.scale * true_quantity[:, sensor]
-    course = _quantity_course(run, sensor, now).scaled(sensors.scale)
-    _draw_course(axes, run, now, course, truth)
+    course = _quantity_course(run, sensor, present_row).scaled(sensors.scale)
+    _draw_course(axes, run, present_row, course, truth)
     axes.margins(y=0.12)
     unit = sensors.units[sensor]
     axes.set_ylabel(unit if sensors.named else f"{sensors.quantity} ({unit})")
     return capital(sensors.titles[sensor])
 
 
-def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
+def _draw_readings(axes: Axes, steps: Index, readings: Float, present_row: int) -> None:
     """Draw readings as dots, and lost readings as crosses at the bottom.
 
-    Readings after the step in row `now`, which the twin did not have yet, are hollow dots.
+    Readings after the step in row `present_row`, which the twin did not have yet, are hollow dots.
     """
-    is_until_now = steps <= steps[now]
-    is_later = steps > steps[now]
+    is_until_now = steps <= steps[present_row]
+    is_later = steps > steps[present_row]
     is_rasterized = len(steps) > _MANY_DOTS
     axes.plot(
         steps[is_until_now],
@@ -376,14 +378,14 @@ def _draw_readings(axes: Axes, steps: Index, readings: Float, now: int) -> None:
         axes.plot(lost_steps, near_bottom, **cross, transform=transform, label="lost")
 
 
-def _draw_control(axes: Axes, run: Run, now: int) -> str:
+def _draw_control(axes: Axes, run: Run, present_row: int) -> str:
     """Draw flown and predicted controls, a row for each control, and return the panel's title.
 
     Triangles mark the controls that were flown after the present step.
     """
     for control in range(len(run.controls)):
-        _draw_control_row(axes, run, control, now)
-    later_rows = np.arange(now + 1, min(now + 1 + run.horizon, run.step_count))
+        _draw_control_row(axes, run, control, present_row)
+    later_rows = np.arange(present_row + 1, min(present_row + 1 + run.horizon, run.step_count))
     if len(later_rows):
         axes.plot(
             run.step_numbers[later_rows],
@@ -402,28 +404,28 @@ def _draw_control(axes: Axes, run: Run, now: int) -> str:
     return "Control: flown | predicted probability"
 
 
-def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
+def _draw_control_row(axes: Axes, run: Run, control: int, present_row: int) -> None:
     """Draw the steps in which a control was flown, and its probability in the predicted steps.
 
     In a short mission each step is a bar; in a long one, successive steps are one bar.
     """
-    present_step = run.step_numbers[now]
+    present_step = run.step_numbers[present_row]
     row_span = (control, _BAR_HEIGHT)
-    has_gaps = now + run.horizon < _MANY_STEPS
+    has_gaps = present_row + run.horizon < _MANY_STEPS
     width = 0.8 if has_gaps else 1.0
-    past_steps = run.step_numbers[:now][run.control_index[:now] == control]
+    past_steps = run.step_numbers[:present_row][run.control_index[:present_row] == control]
     if has_gaps:
         spans = list(past_steps[:, None])
     else:
         spans = np.split(past_steps, np.flatnonzero(np.diff(past_steps) > 1) + 1)
     bars = [(span[0] - width / 2, span[-1] - span[0] + width) for span in spans if len(span)]
     axes.broken_barh(bars, row_span, facecolors=style.PAST, linewidth=0)
-    if run.control_index[now] == control:
+    if run.control_index[present_row] == control:
         bar = (present_step - width / 2, width)
         axes.broken_barh([bar], row_span, facecolors=style.PRESENT, linewidth=0)
     axes.bar(
         present_step + 1.0 + np.arange(run.horizon),
-        _BAR_HEIGHT * run["predicted/control_probability"][now, :, control],
+        _BAR_HEIGHT * run["predicted/control_probability"][present_row, :, control],
         width=width,
         bottom=control,
         color=style.PREDICTION,
@@ -433,14 +435,14 @@ def _draw_control_row(axes: Axes, run: Run, control: int, now: int) -> None:
     axes.axhline(control, color=style.REFERENCE, linewidth=0.6)
 
 
-def _draw_reward(reward: int, axes: Axes, run: Run, now: int) -> str:
+def _draw_reward(reward: int, axes: Axes, run: Run, present_row: int) -> str:
     """Draw a reward, and return the title of the panel."""
     # The 95 % interval is that of a normal distribution.
-    mean = _past_and_predicted(run, "reward_mean", reward, now)
-    deviation = _past_and_predicted(run, "reward_standard_deviation", reward, now)
+    mean = _past_and_predicted(run, "reward_mean", reward, present_row)
+    deviation = _past_and_predicted(run, "reward_standard_deviation", reward, present_row)
     half_width = NORMAL_95 * deviation
     course = Course(mean, mean - half_width, mean + half_width)
-    _draw_course(axes, run, now, course, None)
+    _draw_course(axes, run, present_row, course, None)
     axes.margins(y=0.15)
     low, high = axes.get_ylim()
     if high - low < 1e-6:  # the reward is constant but for rounding

@@ -110,7 +110,7 @@ def _name_corners(axes: Axes) -> None:
 @style.publication_style()
 def design_figure(
     information: Sequence[float],
-    of_all: float,
+    information_of_all: float,
     names: Sequence[str],
     places: Float | None,
     chosen_sensors: Sequence[int],
@@ -122,7 +122,7 @@ def design_figure(
     ----------
     information : sequence of float
         The expected information of the first chosen sensor, of the first two, and so on [bit].
-    of_all : float
+    information_of_all : float
         The expected information of all candidates together [bit].
     names : sequence of str
         The names of the chosen sensors.
@@ -136,7 +136,7 @@ def design_figure(
     figure = style.new_figure(2.6)
     width_ratios = [1] if places is None else [2, 3]
     panels = figure.subplots(1, len(width_ratios), squeeze=False, width_ratios=width_ratios)[0]
-    _draw_information(panels[0], information, of_all, names)
+    _draw_information(panels[0], information, information_of_all, names)
     if places is not None:
         _draw_chosen_sensors(panels[1], places, chosen_sensors, outlines)
     figure.tight_layout()
@@ -144,12 +144,12 @@ def design_figure(
 
 
 def _draw_information(
-    axes: Axes, information: Sequence[float], of_all: float, names: Sequence[str]
+    axes: Axes, information: Sequence[float], information_of_all: float, names: Sequence[str]
 ) -> None:
     """Draw the information [bit] of the first n chosen sensors over n, and of all candidates."""
     number = np.arange(1, len(information) + 1)
     axes.plot(number, information, "o-", color=style.PRESENT)
-    axes.axhline(of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
+    axes.axhline(information_of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
     axes.set(xlabel="sensors", ylabel="expected information [bit]", ylim=(0.0, None))
     axes.set_xticks(number, names, rotation=60)
     axes.legend(loc="lower right")

@@ -158,8 +158,8 @@ class ModesSection(Section):
         covariance = np.zeros((feature_count, feature_count))
         observed_block = np.ix_(self.feature_indices, self.feature_indices)
         for mode, mode_covariance in enumerate(mode_covariances):
-            of_mode = slice(mode * features_per_mode, (mode + 1) * features_per_mode)
-            covariance[of_mode, of_mode] = mode_covariance[observed_block]
+            mode_block = slice(mode * features_per_mode, (mode + 1) * features_per_mode)
+            covariance[mode_block, mode_block] = mode_covariance[observed_block]
         return covariance
 
 

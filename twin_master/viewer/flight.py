@@ -380,20 +380,22 @@ class Flight:
 
     def beliefs_in(self, records: Sequence[StepRecord]) -> StepBeliefs:
         """Return the beliefs of the twin in n steps, each at the time of the step."""
-        parts = []
+        beliefs_of_groups = []
         # Groups of successive steps with the same knowledge
         for _, records_of_group in groupby(records, lambda record: id(self._knowledge_in(record))):
             same_knowledge_records = list(records_of_group)
-            parts.append(
+            beliefs_of_groups.append(
                 self._beliefs_under(
                     self._knowledge_in(same_knowledge_records[0]), same_knowledge_records
                 )
             )
         return StepBeliefs(
-            probability=np.concatenate([part.probability for part in parts]),
-            is_believed=np.concatenate([part.is_believed for part in parts]),
-            expected=concatenate_expectations(part.expected for part in parts),
-            control_probability=np.concatenate([part.control_probability for part in parts]),
+            probability=np.concatenate([beliefs.probability for beliefs in beliefs_of_groups]),
+            is_believed=np.concatenate([beliefs.is_believed for beliefs in beliefs_of_groups]),
+            expected=concatenate_expectations(beliefs.expected for beliefs in beliefs_of_groups),
+            control_probability=np.concatenate(
+                [beliefs.control_probability for beliefs in beliefs_of_groups]
+            ),
         )
 
     def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
@@ -427,15 +429,15 @@ class Flight:
         joint : (n, S, U) array
             The beliefs over states and controls.
         """
-        parts = []
+        expectations = []
         observations = self.observations_in(records)
         for record, joint_of_step, observed_row in zip(records, joint, observations, strict=True):
             # Only the control in force has a probability that is not zero
             control = slice(record["control_index"], record["control_index"] + 1)
             learnt = _learnt_quantities(record)
             belief = joint_of_step[None, :, control]  # (1, S, 1)
-            parts.append(expectation.from_marginals(learnt, belief, control, observed_row))
-        return concatenate_expectations(parts)
+            expectations.append(expectation.from_marginals(learnt, belief, control, observed_row))
+        return concatenate_expectations(expectations)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
         """Return the predictions of the twin for the n steps after one step.

@@ -346,7 +346,7 @@ def test_a_belief_in_another_unit_than_that_of_the_model_is_refused():
     given = {"role": "displacement", "count": 1, "titles": "", "unit": "mm"}
     changes: dict[str, Any] = {"asset": "", "truth": "", "observation": given}
     watched = loaded_from(merged(table_of("bracket"), changes), "bracket")
-    with pytest.raises(MissionInputError, match=r"`displacement` in m, and `observation\.unit` says mm"):
+    with pytest.raises(MissionInputError, match=r"`displacement` in m, but `observation\.unit` is mm"):
         believed_source(resolve_scenario(watched)).check()
 
 
