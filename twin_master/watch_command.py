@@ -201,7 +201,12 @@ def watch(
             progress=terminal.progress(),
         )
         _print_end_of_watch(folder, watches[0], report=not no_report)
-    complaint = watches[0].intake.complaint()
+    _exit_on_complaint(watches[0])
+
+
+def _exit_on_complaint(watched: "Watch") -> None:
+    """End the command with exit code 1 if the observations of a watch were not in order."""
+    complaint = watched.intake.complaint()
     if complaint:
         raise terminal.error_exit(complaint)
 

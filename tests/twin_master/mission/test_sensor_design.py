@@ -77,7 +77,7 @@ def test_three_of_twelve_are_those_of_an_exhaustive_search():
     best = max(information, key=lambda gauges: information[gauges])
     assert tuple(sorted(chosen.sensors)) == best
     assert chosen.information[-1] == pytest.approx(information[best], rel=1e-12)
-    assert chosen.of_all > chosen.information[-1] > chosen.information[0] > 0.0
+    assert chosen.information_of_all > chosen.information[-1] > chosen.information[0] > 0.0
 
 
 def test_more_sensors_than_there_are_cannot_be_chosen():
