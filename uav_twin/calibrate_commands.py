@@ -85,12 +85,8 @@ def print_calibration(
 
     Parameters
     ----------
-    result : Calibration
-        The result of the calibration.
     written_file : Path or None
         The file of the calibration, if one was written.
-    json : bool
-        Whether to print JSON.
     report : bool
         Whether a report was written beside the file.
     """
@@ -110,14 +106,14 @@ def print_calibration(
 
 
 def _print_posterior(result: "Calibration") -> None:
-    """Print prior and posterior of the parameters of a calibration, and their correlations."""
+    """Print priors, posteriors and correlations of the parameters of a calibration."""
     from calibration.result.text import printed_calibration
 
     terminal.show(printed_calibration(result))
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:
-    """Return the calibration as plain data for JSON: parameters, quantities, and their origin."""
+    """Return a calibration as plain data for JSON: parameters, quantities, and their origin."""
     # Only a wing has a design. It is calibrated from a laboratory's folder, and every other model
     # from a campaign.
     name_of_source = "campaign" if result.design is None else "laboratory"
@@ -322,17 +318,17 @@ def calibrate_ringdown(
 
 
 class RingDownRow(NamedTuple):
-    """A figure of a mode from ring-downs, beside the published one.
+    """A value that ring-downs give for a mode, beside the published one.
 
     Attributes
     ----------
     figure, unit : str
-        The name of the figure, and its unit.
+        The name of the value, and its unit.
     average : tuple of float
         The mean over the trials, the standard deviation between trials, and the standard error of
         the mean.
     paper : float
-        The value that the paper publishes.
+        The published value.
     """
 
     figure: str
@@ -458,16 +454,10 @@ def calibrate_simulate(
 def _bench_of_reduced_model(
     design: "WingDesign", truth: "DigitalState", frequency_error: tuple[float, float]
 ) -> "AbstractContextManager[TestBench]":
-    """Return a test bench that measures the reduced model of a wing, as a context manager.
+    """Return a context with a test bench that measures the reduced model of a wing.
 
-    Parameters
-    ----------
-    design : WingDesign
-        The design of the wing.
-    truth : DigitalState
-        The true parameters of the wing.
-    frequency_error : (float, float)
-        The relative differences of its first two natural frequencies from those of the model.
+    `frequency_error` are the relative differences of the true first two natural frequencies from
+    those of the model.
     """
     from calibration.virtual_wing import VirtualWing
     from fe.reduction.model_cache import reduced_model
@@ -476,7 +466,7 @@ def _bench_of_reduced_model(
 
 
 def _bench_of_fmu(fmu: Path, truth: "DigitalState") -> "AbstractContextManager[TestBench]":
-    """Return a test bench that measures the FMU of a wing, as a context manager."""
+    """Return a context with a test bench that measures the FMU of a wing."""
     from twin_master.assets.virtual_experiments import FmuTestBench
 
     return FmuTestBench(fmu, truth)

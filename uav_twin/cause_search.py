@@ -1,7 +1,6 @@
-"""The search for the cause of an alarm of a watch: `uav-twin discrepancy run` in its own process.
+"""The search for the cause of a watch's alarm: `uav-twin discrepancy run` in its own process.
 
-This package hands the search in where a watch is begun, because `twin_master` does not import
-`discrepancy`.
+This package passes the search to a watch, because `twin_master` does not import `discrepancy`.
 """
 
 import functools
@@ -33,14 +32,14 @@ class _SearchProcess:
         return self._process.poll() is not None
 
     def stop(self) -> None:
-        """End the process, if it still runs, and wait until it has ended."""
+        """Terminate the process if it still runs, and wait for its end."""
         if not self.has_ended():
             self._process.terminate()
             self._process.wait()
 
 
 class DiscrepancySearch:
-    """Starts `uav-twin discrepancy run` for an alarm; it is a `CauseSearch` of `twin_master`.
+    """Starts `uav-twin discrepancy run` for an alarm; a `CauseSearch` of `twin_master`.
 
     Parameters
     ----------
@@ -52,9 +51,9 @@ class DiscrepancySearch:
         self._command = command
 
     def start(self, request: SearchRequest) -> RunningSearch:
-        """Start a search and return without waiting for its end.
+        """Start a search without waiting for its end.
 
-        The process has a session of its own, so that Ctrl-C in the terminal does not end it.
+        The process has its own session, so that Ctrl-C in the terminal does not end it.
         """
         options = {
             "--from-run": request.run_folder,
@@ -82,13 +81,7 @@ class DiscrepancySearch:
 def with_discrepancy_search(
     function: Callable[_Parameters, _Result],
 ) -> Callable[_Parameters, _Result]:
-    """Return a function whose argument `cause_search` is a `DiscrepancySearch` by default.
-
-    Parameters
-    ----------
-    function : callable
-        A function of `twin_master` with a keyword argument `cause_search`.
-    """
+    """Make a `DiscrepancySearch` the default `cause_search` of a function of `twin_master`."""
 
     @functools.wraps(function)
     def with_search(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:

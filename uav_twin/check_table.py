@@ -1,4 +1,4 @@
-"""How commands print the checks of a model, and how they end if a limit is broken."""
+"""Prints the checks of a model, and ends the command if a limit is exceeded."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ def print_checks(checks: Sequence[Check]) -> None:
 
 
 def _row(check: Check) -> tuple[str, ...]:
-    """Return the cells of a check; limit and verdict are left out if the check has no limit."""
+    """Return the cells of a check; one without a limit has no verdict either."""
     value = f"{check.value:,}" if isinstance(check.value, int) else f"{check.value:.3g}"
     figure = f"{value} {check.note}".rstrip()
     if check.limit is None:
@@ -25,7 +25,7 @@ def _row(check: Check) -> tuple[str, ...]:
 
 
 def exit_if_broken(checks: Sequence[Check]) -> None:
-    """End the command with exit code 1 if a check exceeds its limit; the message names all such."""
+    """End the command with exit code 1 and a message if any check exceeds its limit."""
     broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
     if broken:
         raise terminal.error_exit(

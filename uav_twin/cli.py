@@ -54,20 +54,15 @@ def _common_options(
         ),
     ] = False,
 ) -> None:
-    """Accept the options that precede every command; `--version` acts by its callback."""
+    """Accept the options before every command; `--version` acts by its callback."""
 
 
 def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as the command that runs if a group is called by its name alone.
 
     For example, `uav-twin calibrate` runs it, and `uav-twin calibrate simulate` does not. Typer
-    calls the function before each command of the group, too. Then it only refuses options that are
-    its own, as in `calibrate --seed 3 simulate`, because they would have no effect.
-
-    Parameters
-    ----------
-    function : callable
-        The command, with Typer's annotations.
+    also calls the function before each command of the group. It then only refuses its own options,
+    as in `calibrate --seed 3 simulate`, where they would have no effect.
     """
 
     def command_of_group(context: typer.Context, **options: object) -> None:
@@ -100,17 +95,7 @@ app.callback()(_common_options)
 
 
 def _add_group(name: str, panel: str, text: str) -> typer.Typer:
-    """Add a group of commands to the command line, and return it.
-
-    Parameters
-    ----------
-    name : str
-        The name of the group on the command line.
-    panel : str
-        The heading in the help under which the group is listed.
-    text : str
-        The description of the group in the help.
-    """
+    """Add a group of commands under a heading (`panel`) of the help, and return it."""
     group = typer.Typer(no_args_is_help=True, help=text)
     app.add_typer(group, name=name, rich_help_panel=panel)
     return group
@@ -121,17 +106,8 @@ def _add_group_command(
 ) -> typer.Typer:
     """Add a group of commands that is also a command itself, and return the group.
 
-    Parameters
-    ----------
-    name : str
-        The name of the group on the command line.
-    panel : str
-        The heading in the help under which the group is listed.
-    text : str
-        The description of the group in the list of commands. Its own help is the docstring of the
-        function.
-    function : callable
-        The command that runs if the group is called by its name alone.
+    `text` describes the group in the list of commands; its own help is the docstring of `function`,
+    which runs if the group is called by its name alone.
     """
     group = typer.Typer()
     group.callback(invoke_without_command=True)(_command_of_group(function))

@@ -93,8 +93,8 @@ def _parameter_row(parameter: "EffectParameter") -> tuple[str, ...]:
 def _exponent_row(exponent: "ShapeParameter") -> tuple[str, ...]:
     """Return the cells of an exponent of an effect's law.
 
-    The effect itself has a fixed exponent (`canonical`); it is a free parameter only if the search
-    tries other members of the family of the effect.
+    The effect itself has a fixed exponent (`canonical`); the search varies it only to try other
+    members of the family.
     """
     prior = exponent.prior
     prior_text = f"{exponent.canonical:g}; freed: {prior.low:g} to {prior.high:g}"
@@ -157,13 +157,13 @@ def example(
 
 
 def campaign_size(campaign: "Campaign") -> str:
-    """Return how many trials and channels a campaign has, as a text."""
+    """Return the number of trials and channels of a campaign as a text."""
     trials = counted(len(campaign.trials), "trial")
     return f"{trials}, {counted(len(campaign.channels), 'channel')}"
 
 
 def shell_arguments(campaign: Path, model: str | None) -> str:
-    """Return a campaign and its model as the arguments of a further command."""
+    """Return a campaign and its model as arguments of a further command."""
     model_option = [] if model is None else ["--model", model]
     return shlex.join([str(campaign), *model_option])
 
@@ -171,20 +171,9 @@ def shell_arguments(campaign: Path, model: str | None) -> str:
 def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of an effect that is hidden in an example.
 
-    Parameters
-    ----------
-    text : str
-        The option: ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,... Parameters without a value
-        have the one of `_usual_values`. Without a place the effect acts at its first place.
-    model : Model
-        The model of the example.
-    campaign : Campaign
-        The example without the effect.
-
-    Raises
-    ------
-    CatalogueError
-        If there is no such effect, place or parameter.
+    The option is ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,... Parameters without a value
+    have that of `_usual_values`; without a place the effect acts at its first one. A
+    `CatalogueError` is raised if there is no such effect, place or parameter.
     """
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
@@ -213,8 +202,8 @@ def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> 
 def _usual_values(effect: "Effect") -> dict[str, float]:
     """Return a typical value of each parameter of an effect: the median of its prior.
 
-    A magnitude that may have either sign has the median zero, with which the effect would be
-    absent. It gets the value one standard deviation above the median instead.
+    A magnitude that may have either sign has the median zero, without effect; the value one
+    standard deviation above it is returned instead.
     """
     values = {}
     for parameter in effect.parameters:
@@ -231,21 +220,8 @@ def _parameter_values(
 ) -> dict[str, float]:
     """Return the values of an effect's parameters by name.
 
-    Parameters
-    ----------
-    text : str
-        The option as the user wrote it.
-    identifier : str
-        The effect.
-    numbers : list of str
-        "VALUE" in the order of the names, or "NAME=VALUE".
-    names : list of str
-        The names of the parameters.
-
-    Raises
-    ------
-    CatalogueError
-        If there are too many values, a name is unknown, or a value is not a finite number.
+    `numbers` are "VALUE" in the order of the names, or "NAME=VALUE". A `CatalogueError` is raised
+    if there are too many, a name is unknown, or a value is not a finite number.
     """
     if len(numbers) > len(names):
         raise CatalogueError(

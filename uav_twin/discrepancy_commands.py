@@ -152,18 +152,7 @@ def _origin_of_verdict(
 ) -> "Origin":
     """Return the origin of a verdict: campaign, model and further effects, with their hashes.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    choice : ModelChoice
-        The model that it is compared with.
-    effects : list of Path
-        The paths of files with further effects.
-    command : str
-        The command that repeats the investigation in any folder.
-    seed : int
-        The seed of all random draws.
+    `command` repeats the investigation in any folder.
     """
     from discrepancy.document import Origin
     from reporting.files import hash_file
@@ -185,14 +174,7 @@ def _origin_of_verdict(
 def _refuse_unfit_sources(
     campaign: Path | None, from_run: Path | None, from_step: int | None, to_step: int | None
 ) -> None:
-    """Check that the options name one source of records, and steps only for a mission.
-
-    Raises
-    ------
-    CampaignFileError
-        If both a campaign and a mission are given or neither of them, if steps are given without a
-        mission, or if the last step lies before the first one.
-    """
+    """Raise an error unless one source of records is given, and steps only with a mission."""
     if (campaign is None) == (from_run is None):
         raise CampaignFileError(
             "Give either the folder of a campaign or --from-run with that of a mission."
@@ -212,28 +194,10 @@ def _assess_campaign(
     calibrate: int | None,
     seed: int,
 ) -> tuple["Separability | None", "SelfCalibration | None"]:
-    """Return which effects a campaign can decide on, and how reliable the workflow is for it.
+    """Return what a campaign can decide, and how reliable the workflow is for it.
 
-    The reliability is measured on simulated campaigns of the same geometry.
-
-    Parameters
-    ----------
-    investigation : Investigation
-        The investigation of the campaign.
-    choice : ModelChoice
-        The model that the campaign is compared with.
-    catalogue : sequence of Effect
-        All effects that can be named.
-    calibrate : int or None
-        The number of simulated campaigns.
-    seed : int
-        The seed of the random draws.
-
-    Returns
-    -------
-    Separability or None, SelfCalibration or None
-        Both are None if the records could not be compared with the model. The self-calibration is
-        also None if `calibrate` is None.
+    The reliability is measured on `calibrate` simulated campaigns of the same geometry, and is None
+    if that is None. Both are None if the records could not be compared with the model.
     """
     from discrepancy.judgement.separability import compute_separability
     from discrepancy.model_choice import ModelKind
@@ -263,12 +227,9 @@ def _assess_campaign(
 
 
 def _write_search_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin") -> str:
-    """Write the hypotheses that an interrupted search has fitted so far.
+    """Write the hypotheses that an interrupted search has fitted; return a message with the file.
 
-    Returns
-    -------
-    str
-        The message to the user that names the file; empty if no hypothesis was fitted yet.
+    The message is empty if no hypothesis was fitted yet.
     """
     from discrepancy.verdict_so_far import write_so_far
 
@@ -281,19 +242,8 @@ def _print_conclusion(
 ) -> None:
     """Print the verdict of an investigation, where it is stored, and the next command.
 
-    If the verdict is that the data are faulty, the faults are printed to the error stream instead,
-    and the command ends with exit code 1.
-
-    Parameters
-    ----------
-    content : ReportInput
-        The results of the investigation.
-    folder : Path
-        The folder of the verdict.
-    report : Path or None
-        The file of the report, if one was written.
-    json : bool
-        Whether to print JSON.
+    If the data are faulty, the faults are printed to the error stream instead, and the command ends
+    with exit code 1.
     """
     from discrepancy.application import has_applicable_effects
     from discrepancy.files.verdict import VERDICT_NAME
@@ -327,17 +277,9 @@ def _read_campaign_and_model(
     last_step: int | None,
     model: str | None,
 ) -> "tuple[Campaign, ModelChoice]":
-    """Return the campaign, and the model that it is compared with.
+    """Return the campaign, or that of a run's steps, and the model that it is compared with.
 
-    Parameters
-    ----------
-    campaign, from_run : Path or None
-        The folder of a campaign, and that of a mission's run. Exactly one of them is given.
-    first_step, last_step : int or None
-        The first and the last step of the run that are compared; all steps by default.
-    model : str or None
-        The name or the file of the model. By default it is the model of the twin for a run, and
-        the shipped wing for a campaign.
+    By default, the model is that of the twin for a run, and the shipped wing for a campaign.
     """
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.model_choice import choice_of_run, choose_model
@@ -361,8 +303,8 @@ def _read_campaign_and_model(
 def use_one_thread() -> None:
     """Limit the linear algebra of this process to one thread, until the process ends.
 
-    The matrices are small, so that several threads would only wait for each other. Moreover, the
-    rounding of sums would depend on the number of threads.
+    The matrices are small, so that several threads would only wait for each other, and rounding
+    would depend on their number.
     """
     import scipy.linalg  # noqa: F401 - only libraries that are loaded already are limited
     from threadpoolctl import threadpool_limits
@@ -375,17 +317,7 @@ def _repeatable_command(
 ) -> str:
     """Return the command line that repeats the investigation from any working folder.
 
-    Parameters
-    ----------
-    source : Path
-        The folder of the campaign, or of the run.
-    effects : list of Path
-        The files of further effects.
-    from_run : bool
-        Whether the source is the folder of a run.
-    values : mapping of str to (str, int or None)
-        The values of further options by the name of the option, without dashes. None stands for an
-        option that was not given.
+    `values` has further options without dashes; None stands for one that was not given.
     """
     words = ["uav-twin", "discrepancy", "run"]
     if from_run:
@@ -400,10 +332,7 @@ def _repeatable_command(
 
 
 def _print_verdict(content: "ReportInput", folder: Path) -> None:
-    """Print a verdict.
-
-    If its folder contains a patch, the intervals of the parameters are read from there.
-    """
+    """Print a verdict; intervals of parameters are read from its patch if there is one."""
     from discrepancy.files.verdict import PATCH_NAME, read_patch
     from discrepancy.report.printed import verdict_lines
 
@@ -462,9 +391,9 @@ def _print_check(
     faults: "Sequence[DataFault]",
     separability: "Separability | None",
 ) -> None:
-    """Print the faults of a campaign's data, and which effects the campaign can decide on.
+    """Print the faults of a campaign's data, and what the campaign can decide.
 
-    The latter is left out if it is None, because a fault is fatal.
+    The latter is None if a fault is fatal.
     """
     from discrepancy.report.printed import check_lines
 
@@ -477,19 +406,9 @@ def _check_record(
     faults: "Sequence[DataFault]",
     separability: "Separability | None",
 ) -> dict[str, Any]:
-    """Return the faults of a campaign, and which effects it can decide on, as plain data.
+    """Return the faults of a campaign, and what it can decide, as plain data.
 
-    Parameters
-    ----------
-    data : Campaign
-        The campaign after the checks of its data.
-    model : str
-        The name of the model.
-    faults : sequence of DataFault
-        The faults that were found in the data.
-    separability : Separability or None
-        The detectability of each effect, and the groups of effects that the campaign cannot tell
-        apart; None if a fault is fatal. A magnitude that is detectable at no value is null.
+    `separability` is None if a fault is fatal. A magnitude that is detectable at no value is null.
     """
     detectability = () if separability is None else separability.detectability
     return {

@@ -250,7 +250,7 @@ def import_files(
 
 
 def _write_imported(imported: "LaboratoryImport", folder: Path) -> None:
-    """Write the campaign of an import, and say its size and what it assumes of its sensors."""
+    """Write the campaign of an import, and print its size and what is assumed of its sensors."""
     from discrepancy.campaign.writing import write_campaign
 
     campaign = imported.campaign(folder.resolve().name)
@@ -265,7 +265,7 @@ def _write_imported(imported: "LaboratoryImport", folder: Path) -> None:
 
 
 def _check_folder(folder: Path, *, replace_it: bool) -> None:
-    """Refuse a folder that is not empty, unless it shall be replaced and holds an import alone."""
+    """Raise an error if a folder is not empty, unless it has only an import to be replaced."""
     if not replace_it:
         refuse_filled(folder)
     if not folder.exists():
@@ -282,20 +282,15 @@ def _check_folder(folder: Path, *, replace_it: bool) -> None:
 def _ask_and_confirm(
     command: ImportCommand, imported: "LaboratoryImport", folder: Path
 ) -> "LaboratoryImport":
-    """Ask what is open, and whether to write the folder; return the import with the answers.
+    """Ask for missing information, and whether to write the folder; return the completed import.
 
-    Raises
-    ------
-    CampaignFileError, CampaignDataError
-        If no campaign can be made with the answers.
-    typer.Exit
-        If the user stops the dialogue, or wants nothing to be written.
+    The command ends if the user stops the dialogue or wants nothing to be written.
     """
     dialogue = ImportDialogue(command, imported)
     has_asked = dialogue.ask_all()
     if has_asked:
         _print_laboratory_import(dialogue.understanding)
-    dialogue.understanding.campaign(folder.resolve().name)  # wrong files are told before
+    dialogue.understanding.campaign(folder.resolve().name)  # report errors of the files first
     if has_asked:
         dialogue.print_repetition()
     if not dialogue.confirm(f"Write {folder}?"):
@@ -310,13 +305,9 @@ def _held_out_answer(text: str) -> str:
 
 
 def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
-    """Return the values of an option by subject.
+    """Return the values of an option by subject, from texts SUBJECT=VALUE or VALUE.
 
-    Parameters
-    ----------
-    texts : sequence of str
-        The texts of the option, each SUBJECT=VALUE or VALUE. The subject is a column or a file; it
-        is the empty text for a value that holds for all of them.
+    The subject is a column or a file; it is empty for a value that holds for all of them.
     """
     answers = {}
     for text in texts:
@@ -332,15 +323,13 @@ def understand_files(
 
     Parameters
     ----------
-    files : list of Path
-        The files.
     answers : dict of str to (dict of str to str)
         The values of the options, by the name of the option and then by its subject, which is a
         column or a file.
     model : str or None
-        The name or the file of a model. Columns with the name of an output of the model are
-        understood as measurements of this output. The model is loaded only after the files were
-        read, so that their mistakes are found first.
+        The name or the file of a model. Columns with the name of an output are taken as
+        measurements of this output. The model is loaded after the files were read, so that errors
+        in the files are reported first.
     """
     from discrepancy.campaign.importing import LaboratoryImport
     from discrepancy.campaign.sheet import read_sheets
@@ -371,7 +360,7 @@ _DECIMAL_MARKS = {".": "points", ",": "commas"}
 
 
 def _print_laboratory_import(imported: "LaboratoryImport") -> None:
-    """Print how each file and each column is understood, a column with one cell as an example."""
+    """Print how each file and column is understood, with one cell as an example."""
     decimal_signs = imported.decimals
     for sheet in imported.sheets:
         kind = imported.kinds[sheet.name] or "?"
@@ -402,9 +391,9 @@ def _print_laboratory_import(imported: "LaboratoryImport") -> None:
 
 
 def _row_of_example(cells: Sequence[str]) -> int:
-    """Return the row of the first cell of a column that is not zero, -1 (the last) if all are.
+    """Return the row of the first cell that is not zero, or -1 (the last) if all are.
 
-    The decimal mark may be unknown, so that cells are texts: not zero means a digit 1 to 9.
+    The decimal mark may be unknown, so cells are texts: any digit 1 to 9 counts.
     """
     nonzero_rows = (row for row, cell in enumerate(cells) if re.search("[1-9]", cell))
     return next(nonzero_rows, -1)

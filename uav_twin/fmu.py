@@ -246,17 +246,7 @@ def build(
 
 
 def _build_script(script: str, target: Path, *, replace: bool) -> None:
-    """Pack a model script as an FMU, and print the file that was written.
-
-    Parameters
-    ----------
-    script : str
-        The name of a shipped script, or the path of a script.
-    target : Path
-        The path of the FMU to write.
-    replace : bool
-        Whether to replace an existing file.
-    """
+    """Pack a model script, shipped or of the user, as an FMU, and print the file."""
     from fmu_asset.packing.script import build_script_fmu
 
     source = asset_scripts().get(script, Path(script))
@@ -276,10 +266,9 @@ def _build_wing(
     activate: bool,
     replace: bool,
 ) -> None:
-    """Pack a wing as an FMU, and print the file that was written.
+    """Pack a wing as an FMU, and print the file; see `fmu build` for the options.
 
-    The parameters are the options of `fmu build`, with the platforms as a list. All options are
-    checked before the reduced model of the wing is computed, which can take minutes.
+    All options are checked before the wing is reduced, which can take minutes.
     """
     from calibration.result.file import Tailoring, load_calibration, tailoring
     from fe.wing.design import load_design
@@ -348,13 +337,8 @@ def info(
 def _fact_rows(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the rows (name, value) of the table of facts about an FMU.
 
-    They are the entries of the record that are single values, then the platforms, then the effects
-    that a patch has added to the FMU, each with "on" or "off" for its switch.
-
-    Parameters
-    ----------
-    record : mapping of str to object
-        The facts, as `describe_fmu` returns them.
+    They are the single values of the record, then the platforms, then the effects that a patch has
+    added, each with "on" or "off".
     """
     rows = [
         (name.replace("_", " "), str(value))
@@ -374,11 +358,7 @@ def _fact_rows(record: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _variable_row(variable: "VariableInfo") -> list[str]:
-    """Return the cells of a variable in the table of variables.
-
-    The items of an enumeration are added to its description. A cell is empty if the FMU does not
-    give its value.
-    """
+    """Return the cells of a variable; the items of an enumeration are added to its description."""
     description = variable.description
     if variable.items:
         items = f"items: {variable.item_list}"
@@ -443,13 +423,7 @@ def export(
 
 
 def _refuse_what_is_no_system(what: str) -> None:
-    """Refuse an FMU, an SSP file or a structure in the place of the scenario that flies it.
-
-    Raises
-    ------
-    SspError
-        If the argument is such a file; the message says which scenario flies it.
-    """
+    """Raise an error if an FMU, an SSP file or a structure is given instead of a scenario."""
     from fe.structure.design import is_structure
 
     takes = "`ssp export` takes a scenario, which says what is connected, or a wing design"
@@ -472,15 +446,12 @@ def _refuse_what_is_no_system(what: str) -> None:
 
 
 def _is_design(what: str) -> bool:
-    """Return whether an argument names a wing design, and not a scenario.
-
-    It does if it is the name of the shipped design, or a TOML file with a table `planform`.
-    """
+    """Return whether an argument is the shipped design or a TOML file with a table `planform`."""
     return what == "uav_wing" or "planform" in _table_of_file(what)
 
 
 def _table_of_file(path: str) -> Mapping[str, object]:
-    """Return the table of a TOML file; empty if there is no such file, or it is not TOML."""
+    """Return the content of a TOML file; empty if there is none, or it is not TOML."""
     from reporting.toml_file import read_toml
 
     try:
@@ -508,10 +479,7 @@ def check_system(file: SspArgument, *, json: JsonOption = False) -> None:
 
 
 def _print_system(file: Path, result: "SspCheck") -> None:
-    """Print the warnings about a system of FMUs, and its content if no problem was found.
-
-    The content is the number of connections and parameters, and the order of evaluation.
-    """
+    """Print the warnings about a system of FMUs, and its content if there is no problem."""
     if result.left_out:
         terminal.say(f"warning: {result.left_out}")
     for loop in result.loops:

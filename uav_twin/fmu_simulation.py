@@ -144,7 +144,7 @@ def _history_or_located_crash(
     open_asset: Callable[[], "FmiAsset"],
     run: Callable[["FmiAsset"], "ObservationHistory"],
 ) -> "ObservationHistory":
-    """Return the history of a run; if the FMU crashes, find the step and what was refused."""
+    """Return the history of a run; after a crash, raise an error that names the exact step."""
     from fmu_asset.checks.crash import located_crash
 
     try:
@@ -161,17 +161,7 @@ def _refuse_options_that_contradict(
     *,
     has_experiment_options: bool,
 ) -> None:
-    """Refuse options of `fmu simulate` that do not go together.
-
-    Parameters
-    ----------
-    binding, inputs : Path or None
-        The files of --binding and --inputs.
-    interpolation : str or None
-        The value of --interpolation.
-    has_experiment_options : bool
-        Whether --stop-time, --step-size or --set is given.
-    """
+    """Raise an error if options of `fmu simulate` do not go together."""
     if (binding is None) != (inputs is None):
         raise FmuInputError(
             "--binding and --inputs go together: one names the columns of the other."
@@ -266,7 +256,7 @@ def simulate_system(
             CoupledAsset,
             wiring,
             _with_interpolation(experiment.binding, interpolation),
-            algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
+            algorithm=algorithm,  # type: ignore[arg-type]  # it checks this itself
             iterations=iterations,
             isolated=not in_process,
             parameters=experiment.parameters,
@@ -278,7 +268,7 @@ def simulate_system(
 
 
 def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
-    """Refuse result files of an unknown format, and existing files that may not be replaced.
+    """Raise an error for result files of an unknown format, or that may not be replaced.
 
     This is checked before the simulation, so that its result is not lost.
     """
@@ -294,7 +284,7 @@ def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bo
 def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
     """Return the values of `--set NAME=VALUE` by name.
 
-    They stay texts, because only the type of the variable says how its value is read.
+    They stay texts, because only the type of the variable decides how its value is read.
     """
     values: dict[str, str] = {}
     for text in texts:
@@ -309,15 +299,7 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
-    """Return a binding with the interpolation of inputs that the user chose.
-
-    Parameters
-    ----------
-    binding : Binding
-        The binding of the FMU's variables to roles.
-    kind : str or None
-        The value of `--interpolation`; None leaves the binding as it is.
-    """
+    """Return the binding with the given interpolation of inputs, if any."""
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
@@ -334,22 +316,7 @@ def _write_and_print_history(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Write, draw and print a simulated history.
-
-    The files of `--out` and `--plot` are written. If neither is given, a table of the outputs is
-    printed instead.
-
-    Parameters
-    ----------
-    asset : FmiAsset
-        The FMU, at the end of the simulation.
-    history : ObservationHistory
-        The outputs of the FMU over time.
-    file : Path
-        The file of the FMU.
-    out, plot : Path or None
-        The files for the history and for its picture.
-    """
+    """Write a simulated history to `out`, draw it to `plot`, or print it as a table."""
     from fmu_asset.client.history_files import write_history
     from reporting.files import hash_file
 
@@ -381,14 +348,14 @@ class HistoryColumn(NamedTuple):
     values: "FloatArray"
 
     def cells(self) -> tuple[str, ...]:
-        """Return the cells of a table: name, first, least, largest and last value, unit."""
+        """Return the cells of a table: name, first, smallest, largest and last value, unit."""
         values = self.values
         figures = (values[0], values.min(), values.max(), values[-1])
         return (self.name, *(f"{figure:.6g}" for figure in figures), self.unit)
 
 
 def _history_columns(asset: "FmiAsset", history: "ObservationHistory") -> list[HistoryColumn]:
-    """Return a column for each observed output of an asset, then for each recorded variable."""
+    """Return a column for each observation of an asset, then for each recorded variable."""
     binding = asset.binding
     units = [unit for vector in binding.observation.values() for unit in vector.units]
     columns = [
@@ -407,8 +374,8 @@ def _draw_history(
 ) -> None:
     """Draw the outputs over time, with one panel for each unit, and write the picture.
 
-    At most `_MOST_PANELS` panels with `_MOST_LINES` lines each are drawn; a legend says how many
-    lines are left out.
+    At most `_MOST_PANELS` panels with `_MOST_LINES` lines each are drawn; a legend counts the
+    omitted lines.
     """
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
 
@@ -538,10 +505,9 @@ def sample(
 
 
 def _print_library(outcome: "SamplingOutcome") -> None:
-    """Print the file of an observation library, its shape, and the effort of the sampling.
+    """Print the file and shape of an observation library, and the effort of its sampling.
 
-    The effort is the number of processes, the time, and, after an interruption, the number of
-    blocks that were kept and not sampled again.
+    After an interruption, the number of blocks that were not sampled again is added.
     """
     library = outcome.library
     shape = " x ".join(map(str, library.values.shape))

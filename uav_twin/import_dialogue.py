@@ -1,8 +1,8 @@
-"""The dialogue of `uav-twin discrepancy import`: one question at a time, and the command that repeats it.
+"""The dialogue of `discrepancy import`: one question at a time, and a command that repeats it.
 
-The answers are those of the options of the command. So whatever was answered can be written as a
-command, which repeats the import without a question or goes on with an interrupted dialogue.
-"""  # noqa: E501
+The answers are those of the command's options. So all answers can be written as a command, which
+repeats the import without questions or continues an interrupted dialogue.
+"""
 
 import shlex
 from collections.abc import Sequence
@@ -24,16 +24,14 @@ HOW_TO_ANSWER = (
 
 
 class ImportCommand:
-    """The command of an import, to which the answers of the user are added.
+    """The command of an import, to which the user's answers are added.
 
     Parameters
     ----------
-    files : sequence of Path
-        The files of the laboratory, as they were given.
     out : Path or None
-        The folder of the campaign, if it was given.
+        None if it was not given.
     model : str or None
-        The model, if it was given.
+        None if it was not given.
     """
 
     def __init__(self, files: Sequence[Path], out: Path | None, model: str | None) -> None:
@@ -48,10 +46,8 @@ class ImportCommand:
 
         Parameters
         ----------
-        understanding : LaboratoryImport
-            The import with its answers.
         ask_nothing : bool
-            Whether the command asks nothing, even at a terminal.
+            Whether the command asks no question, even at a terminal.
         """
         words = list(self._words)
         for option, answers in understanding.answers.items():
@@ -63,14 +59,7 @@ class ImportCommand:
 
 
 class ImportDialogue:
-    """Asks at a terminal what the files and the options of a command leave open.
-
-    Parameters
-    ----------
-    command : ImportCommand
-        The command of the import.
-    understanding : LaboratoryImport
-        The import before the first question.
+    """Asks at a terminal for what files and options do not say.
 
     Attributes
     ----------
@@ -84,14 +73,12 @@ class ImportDialogue:
 
     @property
     def open_count(self) -> int:
-        """The number of questions that are open now; an answer may raise further questions."""
+        """The number of questions still to ask; an answer may raise further ones."""
         questions = sum(len(subjects) for subjects in self.understanding.questions.values())
         return questions + sum(len(texts) for texts in self.understanding.assumptions.values())
 
     def ask_all(self) -> bool:
-        """Ask all open questions; return whether there were any.
-
-        Assumptions are defaults that the user may change; they are asked, too.
+        """Ask all questions, also about assumed defaults; return whether there were any.
 
         Raises
         ------
@@ -108,7 +95,7 @@ class ImportDialogue:
         return has_questions
 
     def confirm(self, question: str) -> bool:
-        """Ask whether to do something, and return the answer; an empty line is a yes."""
+        """Ask a yes-or-no question, and return the answer; an empty line means yes."""
         try:
             return typer.confirm(question, default=True)
         except typer.Abort:
@@ -120,9 +107,9 @@ class ImportDialogue:
         terminal.say(f"To repeat it without questions: {command}")
 
     def _ask_next(self) -> None:
-        """Ask the next question; questions without a default come first.
+        """Ask the next question, beginning with those without a default.
 
-        After an invalid answer the error is printed, and the question stays open.
+        After an invalid answer the error is printed, and the question is asked again.
         """
         # Questions and assumptions have the key (option, form of its value)
         if self.understanding.questions:
@@ -146,7 +133,7 @@ class ImportDialogue:
             typer.secho(str(error), fg="red", err=True)
 
     def _stop(self) -> typer.Exit:
-        """Print the command that goes on with the dialogue, and return the end of this one."""
+        """Print the command that continues the dialogue, and return the exit of this one."""
         command = self._command.with_answers(self.understanding, ask_nothing=False)
         terminal.say("")
         terminal.say(f"Nothing was written. To go on with these answers: {command}")

@@ -9,7 +9,7 @@ from reporting.command_options import JsonOption
 
 
 def _complete_format(incomplete: str) -> list[str]:
-    """Return the formats whose names begin with what was typed."""
+    """Return the formats whose names begin with the typed text."""
     from uav_twin.formats import FORMATS
 
     return [name for name in FORMATS if name.startswith(incomplete)]

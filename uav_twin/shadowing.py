@@ -1,4 +1,4 @@
-"""Refuse files of the user that hide a package of this project, because Python finds them first."""
+"""Refuses files of the user that hide a package of this project because Python finds them first."""
 
 from functools import cache
 from importlib.util import find_spec
@@ -22,14 +22,12 @@ class ShadowedPackageError(ImportError):
 
 @cache
 def refuse_shadowing() -> None:
-    """Check that Python imports the packages of this project, and not others of the same name.
-
-    The check is made once in a process.
+    """Check, once in a process, that Python imports this project's packages and no namesakes.
 
     Raises
     ------
     ShadowedPackageError
-        If another file or folder would be imported: it lies beside the script of the user, or was
+        If another file or folder would be imported, because it lies beside the user's script or was
         imported before.
     """
     project = Path(__file__).resolve().parent.parent
@@ -45,7 +43,7 @@ def refuse_shadowing() -> None:
 
 
 def _import_location(name: str) -> Path | None:
-    """Return the file or folder that Python would import for a name; None if it finds nothing."""
+    """Return the file or folder that Python would import for a name; None if there is none."""
     try:
         spec = find_spec(name)
     except ValueError:  # a module was imported that was not made from a file

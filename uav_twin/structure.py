@@ -46,13 +46,12 @@ FREQUENCY_LIMIT = 1e-6
 def find_structure(file: Path) -> Path:
     """Return the path of a structure file, given as a path or as the name of a shipped structure.
 
-    If the argument is neither, it is returned as it is, so that the reader of the file refuses it.
+    An argument that is neither is returned unchanged, so that the reader of the file refuses it.
 
     Raises
     ------
     DesignFileError
-        If the argument is neither, but similar to the name of a shipped structure. The message
-        names this structure.
+        If the argument resembles the name of a shipped structure, which the message then suggests.
     """
     if file.exists():
         return file
@@ -74,7 +73,7 @@ def is_structure_file(design: Path) -> bool:
 
 
 def _in_bytes(gibibytes: float | None) -> float | None:
-    """Return a limit of memory in bytes, given in GiB; None if there is none."""
+    """Return a memory limit [GiB] in bytes; None stays None."""
     return None if gibibytes is None else 2.0**30 * gibibytes
 
 
@@ -83,15 +82,8 @@ def _assemble_mesh(
 ) -> "Structure":
     """Return the full finite element model of a structure with a mesh.
 
-    Parameters
-    ----------
-    file : Path
-        The structure file, or the name of a shipped structure.
-    memory_limit : float or None
-        The largest memory [GiB] that the model may take.
-    mass_as_stiffness : bool
-        Whether to integrate the mass matrix with the points of the stiffness matrix, as CalculiX
-        does.
+    With `mass_as_stiffness`, the mass matrix is integrated with the points of the stiffness matrix,
+    as in CalculiX. The memory limit is in GiB.
     """
     from fe.structure.operators import load_and_assemble
 
@@ -102,15 +94,7 @@ def _assemble_mesh(
 
 
 def _assemble(file: Path, memory_limit: float | None) -> "AffineStructure":
-    """Return the full model of a structure with a mesh or with matrices.
-
-    Parameters
-    ----------
-    file : Path
-        The structure file, or the name of a shipped structure.
-    memory_limit : float or None
-        The largest memory [GiB] that the model may take.
-    """
+    """Return the full model of a structure with a mesh or with matrices; memory limit in GiB."""
     from fe.structure.operators import assemble_structure
 
     with stage("Reading and assembling"):
@@ -232,19 +216,9 @@ def field(
 
 
 def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the values that `--at` sets, by name.
+    """Return the values that options `--at NAME=VALUE` set, by name.
 
-    Parameters
-    ----------
-    texts : sequence of str
-        The options, each NAME=VALUE; a name may occur once.
-    ranges : mapping of str to (float, float)
-        The least and the largest value of each name.
-
-    Raises
-    ------
-    BadParameter
-        If a text is not of this form, or a value lies outside its range.
+    An error is raised unless each name occurs once and each value lies in its range.
     """
     values: dict[str, float] = {}
     for text in texts:
@@ -314,7 +288,7 @@ def reduce(
 
 
 def _print_reduced_model(model: "ReducedModel") -> None:
-    """Print the ranges of a reduced model's inputs, and the sizes of its bases and outputs."""
+    """Print the ranges of a reduced model's inputs, and the numbers of its vectors and outputs."""
     kinds = _input_kinds(model)
     rows = []
     for (name, (low, high)), nominal_value in zip(
@@ -341,10 +315,7 @@ def _input_kinds(model: "ReducedModel") -> dict[str, str]:
 
 
 def _print_errors(errors: "MeasuredErrors") -> None:
-    """Print the largest errors of a reduced model.
-
-    An error is NaN, and is left out, if the model has no such output.
-    """
+    """Print the largest errors of a reduced model, except NaN for outputs that it does not have."""
     values = {
         "strains, of the largest": errors.strain,
         "displacements, of the largest": errors.displacement,

@@ -25,10 +25,8 @@ def structure_record(structure: AffineStructure, modes: int) -> JsonObject:
 
     Parameters
     ----------
-    structure : AffineStructure
-        The structure, from a mesh or from matrices.
     modes : int
-        The number of natural frequencies to compute. None is computed for a structure without mass.
+        The number of natural frequencies; none is computed for a structure without mass.
     """
     design = structure.design
     if isinstance(structure, Structure):
@@ -53,7 +51,7 @@ def structure_record(structure: AffineStructure, modes: int) -> JsonObject:
 
 
 def _load_facts(structure: AffineStructure, name: str, response: AffineResponse) -> JsonObject:
-    """Return the facts about a load, and about the static response to this load alone."""
+    """Return the facts about a load, and the static response to it alone."""
     strains = response.strain.tolist()
     displacements = response.output.tolist()
     return {
@@ -67,7 +65,7 @@ def _load_facts(structure: AffineStructure, name: str, response: AffineResponse)
 
 
 def _mesh_facts(structure: Structure) -> JsonObject:
-    """Return the facts that only a structure from a mesh has: mesh, mass, box and parts."""
+    """Return the facts that only a structure from a mesh has: mesh, mass, extent and parts."""
     mesh = structure.mesh
     mass, centre = mass_and_centre(structure)
     return {
@@ -90,22 +88,20 @@ def _mesh_facts(structure: Structure) -> JsonObject:
 
 @dataclass(frozen=True)
 class StructurePart:
-    """A row in the list of materials, supports, loads and other parts of a structure.
+    """A row in the list of materials, supports, loads and other parts.
 
     Attributes
     ----------
     what : str
         The kind of part, such as "material".
-    name : str
-        The name of the part.
     set : str or None
-        The set of elements or nodes of the mesh to which the part is assigned.
+        The set of elements or nodes to which the part is assigned.
     count : int
-        The number of elements, nodes, faces or places of the part.
+        How many of `of` the part has.
     of : str
         What is counted, such as "elements".
     note : str
-        A remark that is printed beside the figures.
+        A remark beside the count.
     """
 
     what: str
@@ -155,13 +151,7 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
 
 
 def print_structure(record: JsonRecord) -> None:
-    """Print the facts about a structure: its content, parts, natural frequencies and loads.
-
-    Parameters
-    ----------
-    record : mapping of str to object
-        The facts, as `structure_record` returns them.
-    """
+    """Print what `structure_record` returns: content, parts, natural frequencies and loads."""
     rows = _mesh_rows(record) if "mesh" in record else _matrix_rows(record)
     terminal.print_table(("fact", "value", "unit"), rows)
     for remark in record["remarks"]:
@@ -180,7 +170,7 @@ def print_structure(record: JsonRecord) -> None:
 
 
 def _matrix_rows(record: JsonRecord) -> list[tuple[str, ...]]:
-    """Return the rows (fact, value, unit) of the table of a structure from matrices."""
+    """Return the rows (fact, value, unit) of a structure from matrices."""
     return [
         ("name", record["name"]),
         ("matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"),
@@ -189,7 +179,7 @@ def _matrix_rows(record: JsonRecord) -> list[tuple[str, ...]]:
 
 
 def _mesh_rows(record: JsonRecord) -> list[tuple[str, ...]]:
-    """Return the rows (fact, value, unit) of the table of a structure from a mesh."""
+    """Return the rows (fact, value, unit) of a structure from a mesh."""
     length_unit = record["length_unit"]
     elements = f"{record['elements']:,} {record['kind']}"
     rows: list[tuple[str, ...]] = [
@@ -222,16 +212,13 @@ def _point_text(point: list[float]) -> str:
 
 
 def _part_row(part: JsonRecord) -> tuple[str, ...]:
-    """Return the cells of a part of a structure, given as the dictionary of a `StructurePart`."""
+    """Return the cells of a part, given as the dictionary of a `StructurePart`."""
     contents = f"{part['count']:,} {part['of']}"
     return (part["what"], part["name"], str(part["set"]), contents, part["note"])
 
 
 def _print_load(load: JsonRecord) -> None:
-    """Print a load, its largest displacement [mm], and the response of all sensors to it.
-
-    Strains are printed in microstrain, displacements in mm.
-    """
+    """Print a load, its largest displacement [mm], and the response of all sensors to it."""
     name = load["name"]
     if load["control"]:
         name = f"{name} at {load['control']} = {load['value']:g}"

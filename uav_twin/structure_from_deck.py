@@ -112,7 +112,7 @@ def from_deck(
 
 
 def _record(file: Path, report: "DeckReport") -> dict[str, object]:
-    """Return what the command found, as data."""
+    """Return the results of the command as data."""
     return {
         "structure": str(file),
         "unknowns": report.unknowns,
@@ -125,7 +125,7 @@ def _record(file: Path, report: "DeckReport") -> dict[str, object]:
 
 
 def _print_report(file: Path, report: "DeckReport", tolerance: float) -> None:
-    """Print the structure, how it agrees with CalculiX, and what is linearised or left out."""
+    """Print the structure, its agreement with CalculiX, and what is linearised or left out."""
     terminal.say(f"{file}: {report.unknowns:,} unknowns")
     for region in report.regions:
         terminal.say(

@@ -71,14 +71,9 @@ def suspects(
 
 
 def _rows(static: "Plan", with_releases: "Plan") -> list[dict[str, str]]:
-    """Return a row for each suspicion: its place, the least size that is seen, and look-alikes.
+    """Return a row for each suspicion: its place, the smallest visible size, and look-alikes.
 
-    Parameters
-    ----------
-    static : Plan
-        The plan of static loads alone.
-    with_releases : Plan
-        The plan of static loads and releases.
+    The first plan has static loads alone, the second one releases as well.
     """
     rows = []
     for at_rest, released in zip(
@@ -98,7 +93,7 @@ def _rows(static: "Plan", with_releases: "Plan") -> list[dict[str, str]]:
 
 
 def _look_alikes(plan: "Plan", detectability: "Detectability") -> str:
-    """Return the suspicions that change the planned readings as one does."""
+    """Return the suspicions that change the planned readings in the same way as this one."""
     from discrepancy.report.decidability_text import confused_effects
 
     names = {row.effect.identifier: row.effect.name for row in plan.separability.detectability}
@@ -107,7 +102,7 @@ def _look_alikes(plan: "Plan", detectability: "Detectability") -> str:
 
 
 def _least_size(plan: "Plan", detectability: "Detectability") -> str:
-    """Return the least size of a suspicion that a plan shows, with its unit."""
+    """Return the smallest size of a suspicion that a plan shows, with its unit."""
     from discrepancy.files.verdict import primitive_intervals
     from fe.runtime.patch import SupportCompliance
 

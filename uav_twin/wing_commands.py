@@ -79,13 +79,7 @@ def wing(
 def _write_wing_fields(
     path: Path, wing_design: "WingDesign", state: "DigitalState"
 ) -> tuple[Path, Path]:
-    """Write the fields of a wing at a load factor of 3, and its modes, as two VTU files.
-
-    Returns
-    -------
-    (Path, Path)
-        The file of the fields, and that of the modes, which has the suffix `-modes` in its name.
-    """
+    """Write the fields of a wing at a load factor of 3, and its modes, as two VTU files."""
     from fe.reduction.model_cache import wing_fields, write_modes_vtu, write_wing_vtu
 
     fields = wing_fields(wing_design)
@@ -97,10 +91,7 @@ def _write_wing_fields(
 
 
 def _print_wing(record: dict[str, Any]) -> None:
-    """Print masses, stiffness and frequencies of a wing beside their published values.
-
-    The files that were written are printed, too.
-    """
+    """Print masses, stiffness and frequencies beside published values, and the written files."""
     rows = [
         ("mass of the structure", f"{record['structural_mass']:.4f}", "", "kg"),
         ("mass with two servos and pitot", f"{record['mass']:.4f}", "", "kg"),

@@ -58,7 +58,7 @@ def is_broker(observations: str) -> bool:
 def parse_broker(
     address: str, authority: Path | None = None, *, has_many_assets: bool = False
 ) -> Broker:
-    """Return the broker of an address.
+    """Return the broker at an address.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def parse_broker(
     authority : Path, optional
         The file with the certificate of the authority.
     has_many_assets : bool
-        Whether the topic is that of many assets. Such a topic ends with `/+`, which stands for the
-        name of each asset.
+        Whether the topic covers many assets. Such a topic ends with `/+`, which stands for the name
+        of an asset.
 
     Raises
     ------
@@ -121,14 +121,14 @@ def parse_broker(
 
 
 def _address_error(address: str) -> MissionInputError:
-    """Return the error for an address that is not that of a broker."""
+    """Return the error for an address that is not one of a broker."""
     return MissionInputError(
         f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`."
     )
 
 
 def _check_certificate(authority: Path, *, tls: bool) -> None:
-    """Refuse a certificate that is not a file, belongs to no `mqtts://`, or cannot be read."""
+    """Raise an error if a certificate is no readable file, or is given without `mqtts://`."""
     if not tls or not authority.is_file():
         raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
     with MissionInputError.instead_of(

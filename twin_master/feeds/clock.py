@@ -1,4 +1,4 @@
-"""The clock of a publisher: from the time, or the counted number, of a message to its step."""
+"""The clock of a publisher: from a message's time, or its number, to its step."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -44,16 +44,16 @@ _SECONDS_SINCE_1970 = 1e8, 1e11
 
 @dataclass(frozen=True)
 class Stretch:
-    """Steps that follow each other without a pause, so that their times count from one origin.
+    """Steps without a pause between them, whose times are counted from one origin.
 
     Attributes
     ----------
     first_step : int
         The first step of the stretch.
     first_time : int or float
-        The time of the message of this step [s], or its number by the counter of the publisher.
+        The time of the first step's message [s], or its number by the publisher's counter.
     after_jump : bool
-        Whether it begins after more than the longest gap, as after a clock was set.
+        Whether it follows a jump of the clock by more than the longest gap.
     """
 
     first_step: int
@@ -63,7 +63,7 @@ class Stretch:
 
 @dataclass
 class _RateWindow:
-    """The times of the last messages, from which the rate of the logger follows.
+    """The times of the last messages, which show the rate of the logger.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class _RateWindow:
     count: int = 1
 
     def add(self, time: float) -> None:
-        """Take in the time of a message, unless it is late."""
+        """Add the time of a message, unless it is late."""
         interval = time - self.last
         if interval <= 0.0:
             return
@@ -93,18 +93,18 @@ class _RateWindow:
 
 
 class Clock:
-    """The clock of a publisher, which may be set later, may pause, and may count in another unit.
+    """The clock of a publisher, which may be set, may pause, and may count in another unit.
 
-    The first message says where counting begins. After a pause, or after a jump of the clock, a new
-    stretch begins with the next step. The counter of a publisher is such a clock, too: it counts
-    steps in place of seconds.
+    Counting begins at the first message. After a pause, or a jump of the clock, a new stretch
+    begins with the next step. The counter of a publisher is such a clock, too: it counts steps
+    instead of seconds.
 
     Parameters
     ----------
     section : WatchSection
         The unit of times, and how far ahead a message may be.
     step_length : float or None
-        The length of a step [s], or the count of the counter in a step; None if it is not known.
+        The length of a step [s], or the counts in a step; None if it is unknown.
     between : {"steps", "rest"}
         Whether steps go on between messages, or the asset rests.
     counts_steps : bool
@@ -152,7 +152,7 @@ class Clock:
         self._rate_is_reported = state["rate_is_reported"]
 
     def steps_at(self, time: float, next_step: int, stream: StreamNotices) -> list[int]:
-        """Return the step of a message from its time; begin a new stretch if it needs one.
+        """Return the step of a message from its time; begin a new stretch if necessary.
 
         A message that is later than all before it is the next step if its time deviates from the
         expected one by at most `ORDER_TOLERANCE`. If it lies further ahead, steps are missing, or
@@ -163,15 +163,13 @@ class Clock:
         ----------
         time : float
             The time of the message [s], or its number.
-        next_step : int
-            The step that is expected next.
         stream : StreamNotices
-            Takes the notice of a pause or of a jump.
+            Receives the notice of a pause or a jump.
 
         Returns
         -------
         list of int
-            The step; for a late message the steps that it may belong to, the nearest one first.
+            The step; for a late message the possible steps, the nearest one first.
 
         Raises
         ------
@@ -208,12 +206,12 @@ class Clock:
         return self._late_steps(time, next_step)
 
     def _position(self, time: float, stretch: Stretch) -> float:
-        """Return the step, with a fraction, at a time by the count of a stretch."""
+        """Return the fractional step at a time, counted from the origin of a stretch."""
         assert self._step_length is not None, "times have no steps without the length of a step"
         return stretch.first_step + (time - stretch.first_time) / self._step_length
 
     def _begin_stretch(self, stretch: Stretch) -> None:
-        """Add a stretch, and forget the oldest one if there are too many."""
+        """Begin a stretch, and drop the oldest one if there are too many."""
         self._stretches = [*self._stretches, stretch][-_KEPT_STRETCHES:]
         if stretch.after_jump:
             self._rate = None
@@ -221,7 +219,7 @@ class Clock:
     def _later_step(
         self, time: float, position: float, next_step: int, stream: StreamNotices
     ) -> int:
-        """Return the step of a message that is later than all messages before it."""
+        """Return the step of a message that is later than all before it."""
         is_only_message = self._latest == self._stretches[-1].first_time
         limit = self._section.longest_gap
         if is_only_message:
@@ -247,14 +245,14 @@ class Clock:
         return next_step + missing_steps
 
     def _has_returned(self, time: float, next_step: int) -> bool:
-        """Return whether a clock that had jumped goes on with its count before the jump."""
+        """Return whether a clock that had jumped continues with its count before the jump."""
         if len(self._stretches) < 2 or not self._stretches[-1].after_jump:
             return False
         ahead = self._position(time, self._stretches[-2]) - next_step
         return -ORDER_TOLERANCE <= ahead <= self._section.longest_gap
 
     def _late_steps(self, time: float, next_step: int) -> list[int]:
-        """Return the steps to which a late message may belong, the nearest one first."""
+        """Return the possible steps of a late message, the nearest one first."""
         end = next_step
         for stretch in reversed(self._stretches):
             position = self._position(time, stretch)
@@ -275,16 +273,16 @@ class Clock:
         raise Refused(f"its {noun} lies {end - position:.0f} steps before the first")
 
     def note_time(self, time: float, *, is_assimilated: bool, stream: StreamNotices) -> None:
-        """Note the time of a message, and notify the operator if the logger has another rate.
+        """Record the time of a message, and notify the operator if the logger has another rate.
 
         Parameters
         ----------
         time : float
             The time of the message [s], or its number.
         is_assimilated : bool
-            Whether it is the message of a step; false if it was refused.
+            Whether it is the message of a step, and was not refused.
         stream : StreamNotices
-            Takes the notice.
+            Receives the notice.
         """
         if is_assimilated and (self._latest is None or time > self._latest):
             self._latest = time
@@ -327,7 +325,7 @@ class Clock:
         )
 
     def _unit_of_jump(self, time: float, position: float) -> str:
-        """Return the unit that fits a time far ahead, see `likely_unit`."""
+        """Return the likely unit of a time far ahead, see `likely_unit`."""
         if self._counts_steps:
             return ""
         stretch = self._stretches[-1]
@@ -346,12 +344,10 @@ class Clock:
         ----------
         time : float
             The time of a message [s], read in the stated unit.
-        next_step : int
-            The step that is expected next.
         distance : float
             The number of steps by which the time lies after the only one before it. It is 0 once
-            two times have agreed: then a distance of a thousand steps is a gap, and no sign of
-            another unit.
+            two times have agreed: then a distance of a thousand steps is a gap, and does not
+            suggest another unit.
         """
         low, high = _SECONDS_SINCE_1970
         expected_time = math.nan

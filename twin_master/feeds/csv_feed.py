@@ -42,14 +42,9 @@ class CsvFeed(RecordedFeed):
     def _read_header(self) -> list[str]:
         """Return the names of the columns from the first line of the file.
 
-        The file may have no header: it was begun a moment ago, or it was rotated by copying and
-        cutting it, so that it goes on with a row of readings. If it is followed, the header of the
-        newest rotated file that has one is returned then.
-
-        Raises
-        ------
-        MissionInputError
-            If no file has a header, or if they cannot be read.
+        A file that was just created, or was rotated by copying and truncating, may begin with a row
+        of readings. If it is followed, the header of the newest rotated file with one is returned
+        then. A `MissionInputError` is raised if no file has a header.
         """
         files = [self.path]
         if self.follow:
@@ -74,7 +69,7 @@ class CsvFeed(RecordedFeed):
         )
 
     def _has_readings(self, cells: Sequence[str]) -> bool:
-        """Return whether the cells of a row are readings, and not the names of columns.
+        """Return whether the cells of a row are readings, and not names of columns.
 
         They are if a cell is a number and not every cell is the name of a column.
         """
@@ -87,16 +82,14 @@ class CsvFeed(RecordedFeed):
             return False
 
     def _is_column(self, name: str) -> bool:
-        """Return whether a name is that of a sensor, or of another column."""
+        """Return whether a name is that of a sensor or of another column."""
         return name in OTHER_KEYS or self.reader.find_column(name) is not None
 
     def _set_columns(self, names: Sequence[str]) -> None:
         """Check the names of columns, and use them for the rows that follow.
 
-        Raises
-        ------
-        MissionInputError
-            If there are no names, if one is not a column, or if two mean the same column.
+        An error is raised if there are none, if one is not a column, or if two mean the same
+        column.
         """
         if not any(names):
             raise MissionInputError(
@@ -191,12 +184,9 @@ def _is_number(cell: str) -> bool:
 
 
 def _split_cells(line: bytes) -> list[str]:
-    """Return the cells of a row without blanks around them.
+    """Return the cells of a row, stripped of blanks.
 
-    Raises
-    ------
-    ValueError
-        If the line is not a row of CSV, or no UTF-8.
+    A `ValueError` is raised if the line is not a row of CSV, or not UTF-8.
     """
     text = line.decode("utf-8-sig").rstrip("\r\n")
     try:

@@ -51,7 +51,7 @@ class StepStatus(IntEnum):
 
 
 def beginning_of(content: bytes | Refused) -> str:
-    """Return the beginning of the text of a message, for the list of refused messages."""
+    """Return the beginning of a message's text, for the list of refused messages."""
     if isinstance(content, Refused):
         return ""
     return content[:_TEXT_CHARACTERS].decode("utf-8", "replace").rstrip("\n")
@@ -60,12 +60,7 @@ def beginning_of(content: bytes | Refused) -> str:
 class Feed:
     """A source of messages.
 
-    This class is a feed whose messages cannot be read twice: a resumed watch takes what comes next.
-
-    Parameters
-    ----------
-    items : iterable of FeedItem
-        The messages.
+    The messages of this base class cannot be read twice: a resumed watch takes what comes next.
     """
 
     replayable = False
@@ -84,7 +79,7 @@ class Feed:
         return 0
 
     def contains_position(self, position: Position) -> bool:
-        """Return whether a position belongs to this feed; false for a feed without positions."""
+        """Return whether a position belongs to this feed; False for a feed without positions."""
         return False
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
@@ -92,26 +87,22 @@ class Feed:
         return iter(self._items)
 
     def send_decision(self, decision: Decision) -> None:
-        """Send a decision to the publisher of the messages, if it listens."""
+        """Send a decision to the publisher of the messages, if it accepts them."""
 
     def release_file(self) -> None:
-        """Close the file of the feed, if it has one, until the next message is asked for."""
+        """Close the file of the feed, if any, until the next message is requested."""
 
     def close(self) -> None:
-        """Release the connection to the publisher of the messages, or close the file."""
+        """Disconnect from the publisher of the messages, or close the file."""
 
 
 class RecordedFeed(Feed):
-    """A file of lines, which can be read again.
+    """A file of lines that can be read again.
 
     Parameters
     ----------
-    path : Path
-        The path of the file.
-    scenario : Scenario
-        The scenario of the asset.
     follow : bool
-        Whether to wait at the end of the file for more, also in a file that takes its place.
+        Whether to wait at the end of the file for more, also in a file that replaces it.
 
     Attributes
     ----------
@@ -131,20 +122,20 @@ class RecordedFeed(Feed):
         self._lines_of_file: GrowingFile | None = None
 
     def contains_position(self, position: Position) -> bool:
-        """Return whether a position is in this file, or, if it is followed, in a rotated one."""
+        """Return whether a position is in this file or, if it is followed, in a rotated one."""
         with self.open_file(position) as file:
             return contains(file, position)
 
     def open_file(self, position: Position | None) -> BinaryIO:
-        """Open the file that contains a position, or else the file at the path; return it."""
+        """Open the file that contains a position, or else the file at the path."""
         file = find_file(self.path, position, follow=self.follow) or self.path
         return file.open("rb", buffering=0)
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield each message after a position, with the beginning of its text.
 
-        The message is None if no further one has come yet. `position` is moved on before
-        the last item of each line.
+        The message is None if no further one has come yet. `position` advances before the last
+        message of each line.
         """
         followed_path = self.path if self.follow else None
         lines = GrowingFile(self.open_file(position), position, followed_path)
@@ -168,12 +159,12 @@ class RecordedFeed(Feed):
                 yield message, beginning_of(line)
 
     def release_file(self) -> None:
-        """Close the file until the next message is asked for; see `GrowingFile.release`."""
+        """Close the file until the next message is requested; see `GrowingFile.release`."""
         if self.follow and self._lines_of_file is not None:
             self._lines_of_file.release()
 
     def close(self) -> None:
-        """Close the file, of which no further message is read."""
+        """Close the file; no further message is read."""
         if self._lines_of_file is not None:
             self._lines_of_file.close()
 
@@ -189,19 +180,13 @@ class RecordedFeed(Feed):
         line : bytes
             The line, with its line feed.
         begin : int
-            The position in the file at which the line begins [bytes].
+            Where the line begins in the file [bytes].
         """
         return line
 
 
 class LinesFeed(RecordedFeed):
-    """A file with a payload on each line: JSON, JSON of Telegraf, or line protocol.
-
-    Parameters
-    ----------
-    path, scenario, follow
-        As of `RecordedFeed`.
-    """
+    """A file with a payload in each line: JSON, JSON of Telegraf, or line protocol."""
 
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
         super().__init__(path, scenario, follow=follow)
@@ -237,7 +222,7 @@ class RunFeed(RecordedFeed):
         self._lines = "".join(f"{json.dumps(record)}\n" for record in records).encode()
 
     def _records_of(self, group: xr.Dataset) -> list[JsonObject]:
-        """Return a message for each step of the group `observed`, in the keys of JSON messages.
+        """Return a message for each step of the group `observed`, with the keys of JSON messages.
 
         A message contains the sensors, the step, and, if the group has them, the readings of
         inspections, the covariance of identified modes, and the control in force.
@@ -266,7 +251,7 @@ class RunFeed(RecordedFeed):
     def _check_shape(
         self, group: xr.Dataset, rows: Sequence[Sequence[float]], controls: Sequence[int]
     ) -> None:
-        """Refuse a group with another number of sensors, or with controls that are not known."""
+        """Raise an error for another number of sensors, or unknown controls."""
         count = self.scenario.observation.count
         lengths = {len(row) for row in rows}
         known_controls = range(len(self.scenario.control_names))
@@ -279,7 +264,7 @@ class RunFeed(RecordedFeed):
             )
 
     def _symmetric_matrix(self, triangle: Float) -> Float:
-        """Return the symmetric covariance (G, G) whose lower triangle is given row by row.
+        """Return the symmetric covariance (G, G) with this lower triangle, row by row.
 
         A missing covariance (NaN) becomes zero.
         """
@@ -302,9 +287,9 @@ def _add_finite_values(records: Sequence[JsonObject], name: str, values: Sequenc
 
 
 class FolderFeed(RecordedFeed):
-    """The journal of another run or watch, of any version: its observations as they came.
+    """The journal of another run or watch, of any version, with its observations as they came.
 
-    A damaged line is refused, and the lines after it are read on.
+    A damaged line is refused, and reading continues after it.
 
     Raises
     ------
@@ -326,14 +311,14 @@ class FolderFeed(RecordedFeed):
         """Return the observation in a line of the journal, or a refusal of the line.
 
         None is returned if the line has no observation, or if it is the incomplete last line of a
-        process that was killed.
+        killed process.
 
         Parameters
         ----------
         line : bytes
             The line, with its line feed if it is complete.
         begin : int
-            The position in the journal at which the line begins [bytes].
+            Where the line begins in the journal [bytes].
         """
         record = record_of_line(line, self.path)  # None if the checksum or the JSON is wrong
         if record is None and line.endswith(b"\n"):

@@ -29,7 +29,7 @@ def _read_messages(
 ) -> Iterator[FeedItem]:
     """Yield the messages in each payload, with the beginning of its text.
 
-    None in the place of a text means that nothing has come yet; so it does in the result.
+    None means, in the payloads and in the result, that nothing has come yet.
     """
     payloads = PayloadReader(scenario)
     for content in contents:
@@ -43,45 +43,37 @@ def _read_messages(
 def feed_of_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
     """Return the feed of a stream whose lines are JSON objects, or line protocol.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        The scenario of the asset. If it asks for a notice of silence, the stream is polled, so that
-        silence is noticed while nothing comes.
-    stream : file
-        The stream, open to be read as bytes.
+    If the scenario asks for a notice when no messages come, the stream is polled.
     """
     notices_silence = scenario.watch.quiet_after_seconds is not None
     return Feed(_read_messages(scenario, Pipe(stream, polls=notices_silence)))
 
 
 def feed_of_mappings(scenario: Scenario, messages: Iterable[Mapping[str, object]]) -> Feed:
-    """Return the feed of the messages of a program, which may have arrays in the place of lists."""
+    """Return the feed of a program's messages, which may have arrays instead of lists."""
     contents = (json.dumps(message, default=_as_list).encode() for message in messages)
     return Feed(_read_messages(scenario, contents))
 
 
 def _as_list(value: object) -> object:
-    """Return an array of numbers as nested lists, and a scalar of NumPy as a number."""
+    """Return an array as nested lists, and a scalar of NumPy as a number."""
     return np.asarray(value).tolist()
 
 
 def file_feed(
     path: Path, scenario: Scenario, *, follow: bool = False
 ) -> CsvFeed | LinesFeed | RunFeed | FolderFeed:
-    """Return the feed of a run folder, or of a file, whose form shows in its name or first line.
+    """Return the feed of a run folder or a file, recognised by its name or first line.
 
     A file is NetCDF if its name ends with `.nc`. One that begins with a JSON object or with line
     protocol has a payload on each line. Every other file is CSV.
 
     Parameters
     ----------
-    path : Path
-        The folder or the file.
     scenario : Scenario
         The scenario of the asset.
     follow : bool
-        Whether to wait at the end of a file of text for more.
+        Whether to wait at the end of a text file for more.
 
     Raises
     ------
@@ -106,9 +98,9 @@ def file_feed(
 
 
 def _has_payloads(path: Path) -> bool:
-    """Return whether each line of a file is a payload; CSV has a line of its columns first.
+    """Return whether each line of a file is a payload; a CSV file begins with column names.
 
-    The name of the file decides if nothing was written yet.
+    The name of the file decides if it is still empty.
     """
     with MissionInputError.instead_of(OSError, before=f"{path} cannot be read: ", after="."):
         beginning = first_line(path).decode("utf-8", "replace").lstrip()
@@ -130,16 +122,12 @@ def choose_feed(
     Parameters
     ----------
     observations : Observations or None
-        The observations that the user names. If None, the recording that the scenario names is
-        taken, and `default` if it names none.
-    scenario : Scenario
-        The scenario of the asset.
+        The observations that the user names. If None, the recording in the scenario is used, and
+        `default` if there is none.
     follow : bool
         Whether to wait at the end of a CSV file for more.
     authority : Path or None
-        The file with the certificate of the authority of a broker.
-    default : str or None
-        The observations if neither the user nor the scenario names any.
+        The certificate file of a broker's authority.
 
     Raises
     ------

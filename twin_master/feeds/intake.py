@@ -1,4 +1,4 @@
-"""From messages to readings: steps in order, missing steps, and late messages."""
+"""From messages to readings: order of the steps, missing steps, and late messages."""
 
 import time
 from collections import deque
@@ -42,20 +42,20 @@ _KINDS_OF_TIMES = ("begin", "pause", "clock", "rate")
 
 @dataclass
 class Counts:
-    """The counts of messages and steps of a watch, by what became of them.
+    """How many messages and steps of a watch were received, missing, late or refused.
 
     Attributes
     ----------
     received : int
-        The messages that were read.
+        Messages that were read.
     missing : int
-        The steps that were predicted through because no message came, minus those that came late.
+        Steps that were predicted through without a message, minus those whose message came late.
     late : int
-        The messages that came late and were assimilated in their step.
+        Late messages that were assimilated in their step.
     duplicates : int
-        The messages about an earlier step that added nothing to it.
+        Messages about an earlier step that added nothing to it.
     rejected : int
-        The messages that were refused.
+        Messages that were refused.
     """
 
     received: int = 0
@@ -71,12 +71,8 @@ class _QueuedReading:
 
     Attributes
     ----------
-    step : int
-        The step of the reading.
-    reading : Reading
-        The reading.
     status : StepStatus
-        Whether a message of the step has come, and with its control.
+        Whether the step has a message, and one with its control.
     """
 
     step: int
@@ -89,40 +85,39 @@ class _EndRequested(BaseException):
 
 
 class Intake:
-    """The messages of a feed as the source of observations of a twin.
+    """Turns the messages of a feed into the readings of a twin.
 
     A message belongs to the step that it names, or to that of its time, or to the next one; both
-    count from the first message. A
-    message about a step that was received before must agree with it: readings that the step lacks
-    are taken in, and a contradiction is refused. What was received can never be changed.
+    are counted from the first message. A message about a step that was received before must agree
+    with it: readings that the step lacks are added, and a contradiction is refused. Received
+    readings can never be changed.
 
     Parameters
     ----------
     scenario : Scenario
         The sensors, and how late and how far ahead a message may be.
     feed : Feed
-        The feed of the messages.
+        The source of the messages.
     rejected : Path or None
-        The file `rejected.jsonl`, to which refused messages are written; None writes none.
+        The file `rejected.jsonl` for refused messages; None writes none.
 
     Attributes
     ----------
     counts : Counts
-        The messages up to the last reading.
+        The counts up to the last reading.
     observation_step : int
         The step of the last reading.
     notices : list of Notice
-        The notices of the last reading: sensors of which no number comes any more, or comes again,
-        and those of `StreamNotices`.
+        The notices of the last reading: sensors that give no number any more, or again, and those
+        of `StreamNotices`.
     stream : StreamNotices
         The notices about the stream of messages.
     stops_at_refusals : bool
-        Whether `read` returns None once when the operator is to be told that messages are refused.
+        Whether `read` returns None once when the operator must learn that messages are refused.
     has_ended : bool
         Whether the feed has ended. If not, more may come after `read` has returned None.
     on_poll : callable or None
-        Called again and again while no reading comes. If it is None, `read` does not wait for
-        messages.
+        Called repeatedly while no reading comes. If it is None, `read` does not wait for messages.
     step_limit : int or None
         The number of steps after which the watch ends.
     end_is_requested : bool
@@ -182,7 +177,7 @@ class Intake:
         return self._feed.waiting_messages
 
     def state(self) -> JsonObject:
-        """Return the state from which a resumed watch goes on, for the journal."""
+        """Return the state for the journal, with which a resumed watch continues."""
         # After a gap the queue holds missing steps, then the message itself. A watch that is
         # resumed meanwhile reads this message again, so that it is not counted yet.
         is_read_again = self.has_queued_readings
@@ -202,17 +197,10 @@ class Intake:
         return state
 
     def journal_line(self, step: MissionStep, twin: Twin) -> JsonObject:
-        """Return the line of the journal with the last reading and what the twin concluded.
+        """Return the journal's line for the last reading and the conclusions of the twin.
 
         Every `SNAPSHOT_STEPS` steps the line also contains the state of the twin, from which a
         resumed watch goes on. Notices that the twin itself gives are not added a second time.
-
-        Parameters
-        ----------
-        step : MissionStep
-            The last reading, and the conclusions of the twin.
-        twin : Twin
-            The twin after this step.
         """
         concluded = step.twin_step
         record = step_record(step) | {
@@ -237,21 +225,17 @@ class Intake:
         return record
 
     def restore(self, state: JsonRecord | None) -> None:
-        """Restore the state of an earlier process of the watch, so that reading goes on after it.
+        """Restore the state of an earlier process of the watch.
 
-        Where reading goes on depends on the feed:
+        Where reading continues depends on the feed:
 
         - the file that was read before: at the recorded position;
         - another file: at its first message;
         - a feed that cannot be read twice, such as a pipe: at what comes next.
 
         Messages may have been written to `rejected.jsonl` after the state was recorded. The first
-        feed gives them again; for the others they are added to the counts here.
-
-        Parameters
-        ----------
-        state : mapping of str to object, or None
-            The state, as `state` returns it; None at the beginning of a watch.
+        kind of feed gives them again; for the others they are added to the counts here. The state
+        is None at the beginning of a watch.
         """
         feed_is_read_again = self._feed.replayable
         if state is not None:
@@ -272,21 +256,20 @@ class Intake:
         self.counts.received += rejected_later
 
     def request_end(self) -> None:
-        """Request the end of the watch.
+        """Request the end of the watch, which comes between two steps, never within one.
 
-        It ends between two steps, never within one. If it waits for a message, the waiting is
-        interrupted by an exception, which `read` catches.
+        If the watch is waiting for a message, an exception interrupts it, which `read` catches.
         """
         self.end_is_requested = True
         if self._is_waiting:
             raise _EndRequested
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading for the twin, waiting for messages until there is one.
+        """Return the next reading for the twin; wait for messages until there is one.
 
         None is returned if the feed has ended, if the end of the watch was requested, if the twin
-        has all its steps, if the operator is to be told of refusals (`stops_at_refusals`), or if
-        no message has come and there is no `on_poll`, without which nothing is waited for.
+        has all its steps, if the operator must be told of refusals (`stops_at_refusals`), or if
+        there is no message and no `on_poll`.
         """
         with suppress(_EndRequested):
             while not self.end_is_requested and not self._has_all_steps(twin):
@@ -307,17 +290,11 @@ class Intake:
         return None
 
     def _has_all_steps(self, twin: Twin) -> bool:
-        """Return whether the twin has assimilated as many steps as the watch is limited to."""
+        """Return whether the twin has assimilated as many steps as the limit of the watch."""
         return self.step_limit is not None and twin.steps >= self.step_limit
 
     def _receive_message(self, twin: Twin) -> bool:
-        """Ask the feed for its next message, and put its readings into the queue or refuse it.
-
-        Returns
-        -------
-        bool
-            Whether a message has come, even if it was refused.
-        """
+        """Queue the readings of the next message, or refuse it; return whether there was one."""
         item = self._next_item()
         self.has_ended = item is None
         message, self._text = item or (None, "")
@@ -342,9 +319,9 @@ class Intake:
         return True
 
     def _next_item(self) -> FeedItem | None:
-        """Return the next item of the feed; None if the feed has ended.
+        """Return the next item of the feed; None if it has ended.
 
-        The item contains no message if nothing has come yet.
+        The item has no message if nothing has come yet.
         """
         if self._messages is None:
             self._messages = self._feed.messages(self._position)
@@ -355,10 +332,10 @@ class Intake:
             self._is_waiting = False
 
     def _next_reading(self, twin: Twin) -> Reading:
-        """Take the first reading out of the queue, note it, and return it.
+        """Take the first reading from the queue, record it, and return it.
 
-        Noting it updates the notices, the counts, and the status of its step. The state before is
-        kept, because the twin may find the reading impossible.
+        Recording it updates the notices, the counts, and the status of its step. The state before
+        is kept, because the twin may find the reading impossible.
         """
         queued = self._queue.popleft()
         reading = queued.reading
@@ -381,15 +358,10 @@ class Intake:
         return reading
 
     def _note_revision(self, index: int, status: StepStatus) -> None:
-        """Count a late message, and update the status of the earlier step that it belongs to.
+        """Count a late message, and update the status of its step.
 
-        Parameters
-        ----------
-        index : int
-            The negative index of this step in the list of statuses: the step of the message minus
-            the next step of the twin, so that -1 is the last step.
-        status : StepStatus
-            The status that this message alone gives to its step.
+        `index` is the step of the message minus the next step of the twin, so -1 is the last step.
+        `status` is the status that this message alone gives to its step.
         """
         self.counts.late += 1
         if self._statuses[index] is StepStatus.MISSING:
@@ -398,9 +370,9 @@ class Intake:
         self._statuses[index] = max(status, self._statuses[index])
 
     def _note_accepted(self, step: int, reading: Reading) -> list[Notice]:
-        """Note that a message is accepted for its step; return the notices about the stream.
+        """Record that a message is accepted for its step; return the notices about the stream.
 
-        This counts the message if it has any reading. The reading may still be refused later, see
+        The message is counted if it has any reading. The reading may still be refused later, see
         `replace_impossible`.
         """
         is_blind = bool(np.isnan(reading.observed).all())
@@ -412,15 +384,15 @@ class Intake:
         return self.stream.accept(step, is_blind=is_blind, ignored=ignored)
 
     def complaint(self) -> str:
-        """Return a sentence that says why the messages of this process were of no use.
+        """Return why the messages of this process were of no use, as a sentence.
 
         The first of these cases that holds decides:
 
         - If no message came, the sentence is empty.
         - If the last messages were refused, and these are `REFUSALS_IN_A_ROW` or more or no other
-          message had a reading, it names the last reason.
-        - If no message had the reading of a sensor, it says so.
-        - Otherwise it is empty: the messages were of use.
+          message had a reading, it gives the last reason.
+        - If no message had a reading of a sensor, it says so.
+        - Otherwise it is empty.
         """
         if self._messages_received == 0:
             return ""
@@ -441,9 +413,9 @@ class Intake:
         return ""
 
     def _note_unreadable_sensors(self, reading: Reading) -> list[Notice]:
-        """Return a notice for each sensor that becomes unreadable, or that is readable again.
+        """Return a notice for each sensor that becomes unreadable, or is readable again.
 
-        The set of unreadable sensors is updated. A sensor stays in it until a reading of it comes.
+        A sensor counts as unreadable until a reading of it comes.
         """
         if reading.revises is not None:  # a late message does not show how the sensors are now
             return []
@@ -470,12 +442,10 @@ class Intake:
     def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that has probability zero in every state of the model.
 
-        What was noted when its message was accepted is undone.
+        What was recorded when its message was accepted is undone.
 
         Parameters
         ----------
-        reading : Reading
-            The observation.
         error : TwinMasterError
             The error of the twin, which becomes the reason of the refusal.
 
@@ -506,9 +476,8 @@ class Intake:
     def _step_of(self, twin: Twin, message: Message) -> int:
         """Return the step of a message.
 
-        It is the step that the message names, or else the step at the time that the message names,
-        or else the next step of the twin. A late message belongs to the nearest step that it does
-        not contradict.
+        It is the step that the message names, else the step at its time, else the next step of the
+        twin. A late message belongs to the nearest step that it does not contradict.
         """
         clock, time = self._time_of(message)
         if time is None:
@@ -521,27 +490,22 @@ class Intake:
         return steps[0]
 
     def _time_of(self, message: Message) -> tuple[Clock, float | None]:
-        """Return the clock that places a message, with the time of the message by this clock."""
+        """Return the clock that locates a message, and its time by this clock."""
         if message.step is not None:
             return self._counter, message.step
         return self._clock, message.time
 
     def _note_time(self, message: Message, *, is_assimilated: bool) -> None:
-        """Note the time of a message that was assimilated or refused; see `Clock.note_time`."""
+        """Record the time of a message; see `Clock.note_time`."""
         clock, time = self._time_of(message)
         if time is not None:
             clock.note_time(time, is_assimilated=is_assimilated, stream=self.stream)
 
     def _enqueue(self, twin: Twin, message: Message, step: int) -> None:
-        """Put a message into the queue of readings.
+        """Queue a message; refuse it if its step is too late or an earlier message contradicts it.
 
-        If its step lies ahead of the next step of the twin, an empty reading is queued before it
-        for each step between them. If its step was received before, the message revises it.
-
-        Raises
-        ------
-        Refused
-            If the step is too late, or if the message contradicts an earlier one.
+        If its step lies after the next step of the twin, an empty reading is queued for each step
+        between them. If its step was received before, the message revises it.
         """
         steps_ahead = step - twin.steps
         if step < twin.first_kept and steps_ahead < 0:
@@ -571,15 +535,10 @@ class Intake:
     def _enqueue_revision(
         self, twin: Twin, message: Message, step: int, status: StepStatus
     ) -> None:
-        """Put a message about an earlier step into the queue, if it adds anything to that step.
+        """Queue a message about an earlier step if it adds something; refuse a contradiction.
 
-        It adds something if it has readings that the step lacks, or another control than the one
-        that was assumed. Otherwise it is counted as a duplicate.
-
-        Raises
-        ------
-        Refused
-            If the message contradicts a reading or the control that was received of the step.
+        It adds something if it has readings that the step lacks, or another control than the
+        assumed one. Otherwise it is counted as a duplicate.
         """
         contradiction = self._contradiction(twin, message, step)
         if contradiction:
@@ -596,7 +555,7 @@ class Intake:
         self._queue.append(_QueuedReading(step, revision, status))
 
     def _contradiction(self, twin: Twin, message: Message, step: int) -> str:
-        """Return in which way a message contradicts what was received of a step; empty if not."""
+        """Return how a message contradicts what was received of a step; empty if it does not."""
         row = twin.observed(step)
         is_in_both = ~np.isnan(row) & ~np.isnan(message.observed)
         if not np.array_equal(row[is_in_both], message.observed[is_in_both]):

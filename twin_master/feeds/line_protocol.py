@@ -1,11 +1,11 @@
 r"""Points in the line protocol of InfluxDB, read and written.
 
-A line is ``measurement[,tag=value...] field=value[,field=value...] [timestamp]``. A backslash takes
-their meaning from the characters that separate: comma and blank in the measurement; these and ``=``
-in tags and names of fields; ``"`` and ``\`` in a text, which stands in double quotes. Before any
-other character a backslash means itself. A number is floating-point, ``12i`` an integer, ``12u``
-one without sign; ``t``, ``T``, ``true``, ``True``, ``TRUE`` and the like with f are truth values. A
-line that begins with ``#`` is a comment. (InfluxData, *Line protocol reference*.)
+A line is ``measurement[,tag=value...] field=value[,field=value...] [timestamp]``. A backslash
+escapes the characters that separate: comma and blank in the measurement; these and ``=`` in tags
+and names of fields; ``"`` and ``\`` in a text, which stands in double quotes. Before any other
+character a backslash is literal. A number is floating-point, ``12i`` an integer, ``12u`` an
+unsigned one; ``t``, ``T``, ``true``, ``True``, ``TRUE`` and the like with f are Booleans. A line
+that begins with ``#`` is a comment. (InfluxData, *Line protocol reference*.)
 """
 
 import re
@@ -34,25 +34,19 @@ _SHOWN_CHARACTERS = 40
 
 
 def looks_like_line_protocol(text: str) -> bool:
-    """Return whether a text begins as line protocol does; JSON and CSV begin otherwise."""
+    """Return whether a text begins like line protocol, unlike JSON and CSV."""
     return _LOOK.match(text) is not None
 
 
 class _Scanner:
-    """A line that is read from left to right.
-
-    Parameters
-    ----------
-    line : str
-        The line.
-    """
+    """A line that is read from left to right."""
 
     def __init__(self, line: str) -> None:
         self._line = line
         self._position = 0
 
     def take(self, pattern: re.Pattern[str], meaning: str) -> re.Match[str]:
-        """Return the next piece of the line, which must match a pattern."""
+        """Return the next piece of the line; raise an error unless it matches the pattern."""
         match = pattern.match(self._line, self._position)
         if match is None:
             remaining = self._line[self._position :][:_SHOWN_CHARACTERS]
@@ -62,7 +56,7 @@ class _Scanner:
         return match
 
     def skip(self, character: str) -> bool:
-        """Go beyond a character if it is the next one; return whether it is."""
+        """Skip a character if it is the next one; return whether it is."""
         if self.is_before(character):
             self._position += 1
             return True
@@ -73,7 +67,7 @@ class _Scanner:
         return self._line.startswith(character, self._position)
 
     def skip_blanks(self) -> bool:
-        """Go beyond blanks; return whether there are any."""
+        """Skip blanks; return whether there are any."""
         match = _BLANKS.match(self._line, self._position)
         if match is not None:
             self._position = match.end()
@@ -91,7 +85,7 @@ def parse_line(line: str) -> Point | None:
     Parameters
     ----------
     line : str
-        The line, with or without its line feed. Its timestamp stays in the unit of the writer.
+        The line, with or without its line feed. Its timestamp keeps the unit of the writer.
 
     Raises
     ------
@@ -126,14 +120,14 @@ def parse_line(line: str) -> Point | None:
 
 
 def _take_name(scanner: _Scanner, meaning: str) -> str:
-    """Return the next name of a line, and go beyond the `=` after it."""
+    """Return the next name of a line, and skip the `=` after it."""
     name = _unescape(scanner.take(_NAME, meaning)[0], ",= ")
     scanner.take(_EQUALS_SIGN, "`=`")
     return name
 
 
 def _refuse_repetition(name: str, values: Mapping[str, object]) -> None:
-    """Refuse a name that a line has already given a value."""
+    """Raise an error if a line has already a value for a name."""
     if name in values:
         raise ValueError(f"`{name[:_SHOWN_CHARACTERS]}` is given twice")
 
@@ -168,7 +162,7 @@ def write_line(point: Point) -> str:
     ------
     ValueError
         If it has no fields, or a name that line protocol cannot express: an empty one, one with a
-        line feed, or one with a backslash at its end or before a character that is escaped.
+        line feed, or one with a backslash at its end or before an escaped character.
     """
     if not point.fields:
         raise ValueError("a point needs at least one field")
@@ -193,7 +187,7 @@ def _escape(name: str, characters: str) -> str:
 
 
 def _value_text(value: FieldValue) -> str:
-    """Return the value of a field as line protocol writes it."""
+    """Return the value of a field in line protocol."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):

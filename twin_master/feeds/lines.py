@@ -16,15 +16,15 @@ from twin_master.feeds.message import LARGEST_MESSAGE, Refused
 
 
 class Position(TypedDict):
-    """The position in a file up to which a feed has read it, as it is stored in a journal.
+    """How far a feed has read a file, as a journal stores it.
 
     Attributes
     ----------
     beginning : str
-        The first digits of the SHA-256 of the first bytes of the file, which identify it under any
-        name. Earlier versions stored all digits.
+        The first digits of the SHA-256 of the file's first bytes, which identify it under any name.
+        Earlier versions stored all digits.
     read : int
-        The number of bytes up to the position.
+        The number of bytes read.
     """
 
     beginning: str
@@ -41,12 +41,12 @@ _DATE_SUFFIX = re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
 def rotated_files(path: Path) -> list[Path]:
-    """Return the rotated files of a log, the oldest first.
+    """Return the rotated files of a log, oldest first.
 
-    They had the name of the log before, or are copies of it. Their names are that of the log and a
-    number or a date, as logrotate and `logging.handlers` make them: `log.csv.1`,
-    `log.csv-20260501`, `log.csv.2026-05-01_12`. Telegraf writes date and seconds since 1970 before
-    the ending: `log.2026-05-01-1777629600.csv`.
+    They are former files or copies of the log. Their names consist of the log's name and a number
+    or a date, as logrotate and `logging.handlers` make them: `log.csv.1`, `log.csv-20260501`,
+    `log.csv.2026-05-01_12`. Telegraf writes date and seconds since 1970 before the extension:
+    `log.2026-05-01-1777629600.csv`.
     """
     dates = []
     numbers = []
@@ -80,16 +80,12 @@ def first_line(path: Path) -> bytes:
 
 
 def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | None:
-    """Return the file, among a log and its rotated files, that contains a position, or None.
+    """Return the file that contains a position, among a log and its rotated files, or None.
 
     Parameters
     ----------
-    path : Path
-        The file, which is looked at first.
-    position : Position or None
-        The position; None is in no file.
     follow : bool
-        Whether to look at the rotated files, too, the newest first.
+        Whether to search the rotated files, too, newest first.
     """
     files = [path]
     if follow:
@@ -104,8 +100,8 @@ def find_file(path: Path, position: Position | None, *, follow: bool) -> Path | 
 def contains(file: BinaryIO, position: Position | None) -> bool:
     """Return whether an open file contains a position.
 
-    It does if it is at least as long, and its first bytes have the hash of the position. The file
-    is read from its beginning, so that its own position changes.
+    It must be long enough, and its first bytes must have the hash of the position. The file is read
+    from its beginning, so that its own position changes.
     """
     if position is None or file.seek(0, os.SEEK_END) < position["read"]:
         return False
@@ -116,12 +112,12 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
 
 @lru_cache(1000)
 def _hash_of_beginning(beginning: bytes) -> str:
-    """Return the SHA-256 of the beginning of a file; it recognises a file that was renamed."""
+    """Return the SHA-256 of the beginning of a file, which identifies it after renaming."""
     return sha256(beginning).hexdigest()
 
 
 class Lines:
-    """The lines of a source of bytes that come in pieces; a line that is too long is refused.
+    """Splits a source of bytes into lines; a line that is too long is refused.
 
     The bytes after the last line feed are a line, too, once the source has ended.
 
@@ -138,17 +134,17 @@ class Lines:
     end = 0
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Yield the pieces as they come.
+        """Yield the bytes as they come.
 
         None is yielded while nothing comes, and a refusal if bytes were lost. An empty piece ends a
-        line that has no line feed.
+        line without a line feed.
         """
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[bytes | Refused | None]:
-        """Yield the lines, each with its line feed; None while no further line has come.
+        """Yield the lines with their line feeds, and None while no further line has come.
 
-        A line that is too long is yielded as a refusal, once its end has come.
+        A line that is too long is yielded as a refusal, once it is complete.
         """
         line: bytes | Refused = b""
         for piece in self.pieces():
@@ -184,10 +180,8 @@ class Pipe(Lines):
 
     Parameters
     ----------
-    stream : file
-        The stream.
     polls : bool
-        Whether to yield None while nothing has come; if not, the next piece is waited for.
+        Whether to yield None while nothing has come, instead of waiting.
     """
 
     def __init__(self, stream: IO[bytes], *, polls: bool) -> None:
@@ -207,7 +201,7 @@ class Pipe(Lines):
 
 
 class GrowingFile(Lines):
-    """The lines of a file from a position on; a file that is followed has no end.
+    """The lines of a file from a position on; a followed file has no end.
 
     Parameters
     ----------
@@ -216,9 +210,9 @@ class GrowingFile(Lines):
     position : Position, optional
         The position to begin at; the beginning of the file if the position is not in it.
     followed_path : Path, optional
-        The name to follow: reading goes on in the files that get this name later. A file that was
-        renamed is read to its end, then those that came after it. A file that was cut is read on in
-        its copy, to the end of the copy, and then again from its own beginning.
+        The name to follow: reading continues in the files that get this name later. A renamed file
+        is read to its end, then those that came after it. A truncated file is read on in its copy,
+        to the end of the copy, and then again from its own beginning.
     """
 
     def __init__(
@@ -233,7 +227,7 @@ class GrowingFile(Lines):
         self._start_reading(file, position)
 
     def _start_reading(self, file: BinaryIO, position: Position | None) -> None:
-        """Read a file from a position on, or from its beginning if it does not contain it."""
+        """Read a file from a position on, or from its beginning if the position is not in it."""
         self.end = 0
         if position is not None and contains(file, position):
             self.end = position["read"]
@@ -249,7 +243,7 @@ class GrowingFile(Lines):
         return {"beginning": beginning, "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
-        """Yield the pieces of the file; if its name is followed, also of files that replace it."""
+        """Yield the pieces of the file and, if its name is followed, of files that replace it."""
         try:
             if self._followed_path is None:
                 yield from self._pieces_to_end()
@@ -268,7 +262,7 @@ class GrowingFile(Lines):
             yield piece
 
     def _followed_pieces(self, path: Path) -> Iterator[bytes | Refused | None]:
-        """Yield the pieces of the file and of the files that get its name later, without end.
+        """Yield the pieces of the file and of files that get its name later, without end.
 
         None is yielded while nothing comes.
         """
@@ -293,14 +287,14 @@ class GrowingFile(Lines):
             yield piece or None
 
     def close(self) -> None:
-        """Close the file; nothing is read any more."""
+        """Close the file; no further line is read."""
         self._file.close()
 
     def release(self) -> None:
-        """Close a file that is followed until its next piece is asked for.
+        """Close a followed file until its next piece is requested.
 
-        So a process can follow more files than it may have open. A file that gets another name
-        meanwhile is found again; one that is removed meanwhile is read no further.
+        So a process can follow more files than it may have open. A file that is renamed meanwhile
+        is found again; one that is removed is not read any further.
         """
         if not self._file.closed:
             self._released_inode = os.fstat(self._file.fileno()).st_ino
@@ -308,13 +302,7 @@ class GrowingFile(Lines):
             self._file.close()
 
     def _reopen(self, path: Path) -> bool:
-        """Open the released file again, under the name that it has now; return whether it is there.
-
-        Parameters
-        ----------
-        path : Path
-            The name that is followed.
-        """
+        """Open the released file again, even if it was renamed; return whether it still exists."""
         for name in (path, *reversed(rotated_files(path))):
             with suppress(FileNotFoundError), ExitStack() as closing:
                 file = closing.enter_context(name.open("rb", buffering=0))
@@ -327,11 +315,11 @@ class GrowingFile(Lines):
         return False
 
     def _switch_after_loss(self, path: Path) -> Iterator[bytes | Refused | None]:
-        """Go on in a copy of a released file that was removed, or in what has taken its place.
+        """Continue in a copy of a released file that was removed, or in the file that replaced it.
 
-        None is yielded while there is neither, and after the first look, in which the file may only
-        have been missed because it was being renamed. If there is no copy, a refusal is yielded,
-        and reading goes on at the beginning of the new file.
+        None is yielded while there is neither, and after the first attempt, in which the file may
+        have been missed because it was just being renamed. If there is no copy, a refusal is
+        yielded, and reading continues at the beginning of the new file.
         """
         was_missed_before = self._was_missed
         self._was_missed = True
@@ -354,9 +342,10 @@ class GrowingFile(Lines):
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 
     def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
-        """Go on in the copy of a file that was cut, as logrotate does with `copytruncate`.
+        """Continue in the copy of a truncated file, as logrotate makes it with `copytruncate`.
 
-        If there is no copy, a refusal is yielded, and reading goes on at the beginning of the file.
+        If there is no copy, a refusal is yielded, and reading continues at the beginning of the
+        file.
         """
         copy = find_file(path, self.position, follow=True)
         if copy is None:
@@ -368,10 +357,10 @@ class GrowingFile(Lines):
         yield from self._switch_to(file, is_copy=copy is not None)
 
     def _switch_to(self, file: BinaryIO, *, is_copy: bool = False) -> Iterator[bytes]:
-        """Go on with another file.
+        """Continue with another file.
 
-        An incomplete line at the end of the former file continues in this one only if one of the
-        two is a copy of the other. If not, an empty piece ends the line.
+        An incomplete line at the end of the former file continues in this one only if one is a copy
+        of the other. Otherwise an empty piece ends the line.
         """
         line_goes_on = self._is_copy or is_copy
         position = self.position
@@ -382,15 +371,15 @@ class GrowingFile(Lines):
             yield b""
 
     def _was_cut(self) -> bool:
-        """Return whether the file was cut after it was read, even if it has grown again since."""
+        """Return whether the file was truncated after it was read, even if it has grown again."""
         if not is_same_beginning(self._file, self._beginning):
             return True
         return os.fstat(self._file.fileno()).st_size < self._file.tell()
 
     def _open_next(self, path: Path) -> BinaryIO | None:
-        """Return the file that follows this one under the name `path`, open to be read.
+        """Return the next file under the name `path`, open for reading.
 
-        None if this file still has the name, or if nothing was written into the next one yet.
+        None if this file still has the name, or if the next one is still empty.
         """
         with suppress(FileNotFoundError):  # in the middle of being renamed
             status = os.fstat(self._file.fileno())
@@ -411,23 +400,15 @@ class GrowingFile(Lines):
 
 
 def _inodes_of_log(path: Path) -> dict[Path, int]:
-    """Return the inode of each rotated file of a log, the oldest first, and of the log itself."""
+    """Return the inode of each rotated file of a log, oldest first, and of the log itself."""
     return {file: file.stat().st_ino for file in (*rotated_files(path), path)}
 
 
 def _first_written_after(inodes: dict[Path, int], inode: int, path: Path) -> Path | None:
-    """Return the first file of a log that is not empty and newer than the file with an inode.
+    """Return the first file of a log that is not empty and newer than the one with an inode.
 
-    If no file has the inode, only the log itself is considered.
-
-    Parameters
-    ----------
-    inodes : dict of Path to int
-        The inode of each file of the log, the oldest first.
-    inode : int
-        The inode of the file that was read to its end.
-    path : Path
-        The log itself.
+    If no file has the inode, only the log itself is considered. `inodes` lists the files, oldest
+    first.
     """
     later_files = [path]
     inodes_in_order = list(inodes.values())

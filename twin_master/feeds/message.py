@@ -58,7 +58,7 @@ class Refused(Exception):  # noqa: N818 - what it is, not what went wrong
 
 @dataclass(frozen=True)
 class Message(Reading):
-    """An observation as it was sent, in SI units; of modes, a row with their covariance.
+    """An observation as it was sent, in SI units; for modes, a row with their covariance.
 
     Attributes
     ----------
@@ -67,10 +67,10 @@ class Message(Reading):
     time : float or None
         The time [s] that the message names.
     assumed : bool
-        Whether its control was assumed when it was recorded, because no message had named it.
+        Whether its control was only assumed when it was recorded.
     ignored : dict of str to str
-        The names in it that are not sensors. The value of a name is the known name that it was
-        probably meant to be, in words; it is empty if there is none.
+        The names in it that are not sensors, each with the known name that was probably meant, in
+        words, or an empty text.
     """
 
     step: int | None = None
@@ -86,7 +86,7 @@ MessageContent = bytes | Mapping[str, object] | Message | Refused
 
 
 class SensorColumn(NamedTuple):
-    """The meaning of a key of a message, or of a column of a file.
+    """What a key of a message, or a column of a file, means.
 
     Attributes
     ----------
@@ -176,14 +176,14 @@ class MessageReader:
         self.likely_name = lru_cache(maxsize=1000)(self._find_likely_name)
 
     def _find_column(self, name: str) -> SensorColumn | None:
-        """Return the sensor that a name means, with the factor to SI; None if it is not a sensor.
+        """Return the sensor of a name, with the factor to SI; None if it is not a sensor.
 
         The name is that of a sensor, alone or followed by a unit, in brackets or after `_`.
 
         Raises
         ------
         Refused
-            If the unit in the name is not one of this sensor.
+            If the unit is not one of this sensor.
         """
         base = name
         unit = ""
@@ -205,10 +205,10 @@ class MessageReader:
         return SensorColumn(sensor, factors[unit or self._units[sensor]])
 
     def _unit_factors(self, sensor: int) -> dict[str, float]:
-        """Return the units in which a sensor may be sent, each with its factor to SI units.
+        """Return the units in which a sensor may be sent, each with its factor to SI.
 
-        They are the unit of the sensor with each SI prefix. In a unit with a power, such as m2,
-        the prefix has the power, too.
+        They are the unit of the sensor with each SI prefix. In a unit with a power, such as m2, the
+        prefix has that power, too.
         """
         unit = self._units[sensor]
         if unit == "1":
@@ -224,15 +224,15 @@ class MessageReader:
         return matches[0] if matches else ""
 
     def describe_unknown(self, names: Sequence[str], *, has_sensors: bool) -> str:
-        """Return a sentence that says which names are not sensors, and what sensors are called.
+        """Return a sentence that says which names are not sensors, and how sensors are named.
 
         Parameters
         ----------
         names : sequence of str
             At least one unknown name.
         has_sensors : bool
-            Whether the message also names sensors. Only then the sentence advises to ignore the
-            unknown names; without sensors nothing of the message would remain.
+            Whether the message also names sensors. Only then does the sentence advise to ignore the
+            unknown names.
         """
         shown_names = [name[:_SHOWN_CHARACTERS] for name in names[:_SHOWN_NAMES]]
         quoted_names = listing(f"`{name}`" for name in shown_names)
@@ -284,13 +284,7 @@ class MessageReader:
         return record
 
     def _read_record(self, record: Mapping[str, object]) -> Message:
-        """Return the observation in a parsed message.
-
-        Raises
-        ------
-        Refused
-            If a value is invalid, or if names of no sensor are not allowed.
-        """
+        """Return the observation in a parsed message; refuse invalid values and unknown names."""
         record = with_present_names(record, PRESENT_NAMES, "A message", Refused)
         readings = self._read_sensors(record)
         self._check_ignored_names(readings)
@@ -309,9 +303,9 @@ class MessageReader:
     def _read_sensors(self, record: Mapping[str, object]) -> _SensorReadings:
         """Return the readings of all sensors in a parsed message.
 
-        A value that is not a number or too large leaves the sensor without a reading
-        (`unreadable`). Names of no sensor are collected in `ignored`, and refused later if they are
-        not allowed.
+        A value that is not a number, or too large, leaves the sensor without a reading
+        (`unreadable`). Unknown names are collected in `ignored`, and refused later if they are not
+        allowed.
         """
         readings = _SensorReadings(np.full(self._width, np.nan))
         for name, value in self._named_values(record):
@@ -337,7 +331,7 @@ class MessageReader:
         return readings
 
     def _check_ignored_names(self, readings: _SensorReadings) -> None:
-        """Refuse a message if it has names of no sensor that must not be ignored."""
+        """Refuse a message with unknown names that must not be ignored."""
         if not readings.ignored:
             return
         if readings.nested_name and not readings.sensors:
@@ -352,7 +346,7 @@ class MessageReader:
             raise Refused(self.describe_unknown(list(readings.ignored), has_sensors=has_sensors))
 
     def _read_step(self, value: object) -> int | None:
-        """Return the step of a message, a whole number in any form; None if it names none."""
+        """Return the step of a message, a whole number in any form; None without one."""
         if value is None:
             return None
         step = value
@@ -366,10 +360,10 @@ class MessageReader:
         return step
 
     def _read_time(self, value: object) -> float | None:
-        """Return the time of a message [s]; None if it names none.
+        """Return the time of a message [s]; None without one.
 
         It is a number in the unit of the scenario, also in quotes, or a date and time by ISO 8601,
-        which counts from 1970 and is in UTC if it has no offset.
+        which is counted from 1970, in UTC if it has no offset.
         """
         if value is None:
             return None
@@ -388,7 +382,7 @@ class MessageReader:
         return time
 
     def _read_control(self, value: object) -> int | None:
-        """Return the index of the control in a message; None if it names none."""
+        """Return the index of the control in a message; None without one."""
         if value is None:
             return None
         if value not in self._controls:
@@ -398,8 +392,8 @@ class MessageReader:
     def _named_values(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
         """Yield the name and the value of each sensor in a parsed message.
 
-        A list of all sensors, under the key of their role, is split into its sensors, each with the
-        name `ROLE_NUMBER_UNIT`. Keys that begin with `_` are left out.
+        A list under the key of the role is split into sensors with the names `ROLE_NUMBER_UNIT`.
+        Keys that begin with `_` are skipped.
         """
         role = self._observation.role
         unit = record.get("unit", "")
@@ -416,12 +410,9 @@ class MessageReader:
                 yield name, value
 
     def _read_covariance(self, value: object) -> Float:
-        """Return the lower triangle, row by row, of the covariance matrix of all sensors, SI.
+        """Return the lower triangle, row by row, of the sensors' covariance matrix in SI units.
 
-        Raises
-        ------
-        Refused
-            If the value is not a symmetric, positive semidefinite matrix of the right size.
+        It must be symmetric and positive semidefinite.
         """
         count = self._observation.count
         try:
@@ -454,19 +445,10 @@ class MessageReader:
             return math.nan
 
     def _describe_unreadable(self, value: object, number: float, column: SensorColumn) -> str:
-        """Return, in words, the value that was given in the place of a reading.
+        """Return, in words, the value that is no reading, given also in SI units.
 
         A strain that is too large and has no unit was probably sent in microstrain: then the text
         says how to give the unit.
-
-        Parameters
-        ----------
-        value : object
-            The value in the message.
-        number : float
-            The value in SI units; NaN if it is not a number.
-        column : SensorColumn
-            The sensor, with the factor to SI units.
         """
         if not math.isfinite(number):
             return json.dumps(value)[:30]

@@ -1,7 +1,8 @@
 """The session of the twin at an MQTT broker (extra `uav-twin[mqtt]`, paho-mqtt).
 
-The twin is a client; it opens no port. The broker is asked to send no larger message than is read,
-and no more messages than can wait here. Further ones wait at the broker, or are dropped there.
+The twin is a client; it opens no port. The broker is asked to send no larger messages than are
+read, and no more messages than can wait here. Further ones wait at the broker, or are dropped
+there.
 """
 
 import json
@@ -60,27 +61,27 @@ _PROPERTIES_BYTES = 10_000
 
 
 class DecisionPublisher(Protocol):
-    """What publishes the decisions of an asset over a session."""
+    """Publishes the decisions of an asset through a session."""
 
     def publish(self) -> None:
-        """Send decisions, as many as the session can take."""
+        """Send as many decisions as the session accepts."""
 
     def note_answer(self, message_id: int, refusal: str | None) -> None:
-        """Note the answer of the broker to a decision.
+        """Record the broker's answer to a decision.
 
         Parameters
         ----------
         message_id : int
             The number that `Session.send` has returned.
         refusal : str or None
-            Why the broker refuses the decision; None if it has taken it.
+            Why the broker refuses the decision; None if it has accepted it.
         """
 
     def resend_unacknowledged(self) -> None:
-        """Note that decisions without an answer must be sent again."""
+        """Mark decisions without an answer to be sent again."""
 
     def end_pause(self) -> None:
-        """Send decisions again at once, even if the broker has refused one a moment ago."""
+        """Send decisions again at once, even if the broker has just refused one."""
 
 
 class Session:
@@ -88,12 +89,10 @@ class Session:
 
     Parameters
     ----------
-    broker : Broker
-        The broker, and the topic of the observations.
     name : str
         The name of the mission or of the group of assets.
     folder : Path
-        The folder with the file of the client name, which nobody else can guess.
+        The folder of the file with the client name, which nobody else can guess.
     note : callable
         Called with a sentence when the connection is lost or found, and when the broker refuses
         something.
@@ -103,9 +102,9 @@ class Session:
     Attributes
     ----------
     unread : deque of MQTTMessage
-        Messages that have come and were not given by `receive` yet.
+        Messages that `receive` has not returned yet.
     publishers : dict of DecisionPublisher to None
-        Those that have decisions to publish, in their order.
+        Publishers with decisions to send, in order.
     """
 
     def __init__(
@@ -171,8 +170,7 @@ class Session:
     def _connect(self) -> None:
         """Connect with a new client.
 
-        Nothing of a former client is needed: what was not acknowledged is known to the publishers
-        and to the broker.
+        Nothing of a former client is needed: publishers and broker know what was not acknowledged.
         """
         from paho.mqtt import client as paho
         from paho.mqtt.enums import CallbackAPIVersion
@@ -253,7 +251,7 @@ class Session:
         reasons: "list[ReasonCode]",
         _properties: "Properties | None",
     ) -> None:
-        """Note that the broker sends observations from now on, and let all publishers send.
+        """Record that observations will come from now on, and let all publishers send.
 
         If the broker refuses the subscription, the connection is dropped later, with this cause.
         """
@@ -283,7 +281,7 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties | None",
     ) -> None:
-        """Note why the connection was lost, unless the cause is known already."""
+        """Record why the connection was lost, unless a cause is known already."""
         self._failure = self._failure or f"the {self._where} is away ({reason})"
 
     def _on_publish(
@@ -294,21 +292,17 @@ class Session:
         reason: "ReasonCode",
         _properties: "Properties",
     ) -> None:
-        """Hand the answer of the broker to the publisher that sent the message."""
+        """Pass the broker's answer to the publisher that sent the message."""
         publisher = self._publisher_of_message.pop(message_id, None)
         if publisher is not None:
             publisher.note_answer(message_id, str(reason) if reason.is_failure else None)
 
     def _drop_connection(self, failure: str) -> None:
-        """Drop the connection, and plan when to try again.
+        """Drop the connection, and schedule the next attempt.
 
-        A failure before the first subscription ends the watch with an error. Messages that were
-        not acknowledged are forgotten here: the broker sends them again.
-
-        Parameters
-        ----------
-        failure : str
-            The cause, if no callback of the client has noted one.
+        A failure before the first subscription ends the watch with an error. `failure` is the cause
+        if no callback has recorded one. Messages that were not acknowledged are forgotten: the
+        broker sends them again.
         """
         failure = self._failure or failure
         self._failure = ""
@@ -327,14 +321,9 @@ class Session:
         self._publisher_of_message.clear()
 
     def _exchange(self, wait: float) -> None:
-        """Exchange packets with the broker; if there is no connection, try to connect.
+        """Exchange packets with the broker, waiting a limited time [s]; connect first if necessary.
 
-        After an exchange, decisions that wait are sent, and the heartbeat if it is due.
-
-        Parameters
-        ----------
-        wait : float
-            How long to wait at most if nothing comes [s].
+        Afterwards waiting decisions are sent, and the heartbeat if it is due.
         """
         self._next_exchange = time.monotonic() + EXCHANGE_SECONDS
         client = self._client
@@ -364,9 +353,9 @@ class Session:
     def _read_and_write(self, client: "Client", wait: float) -> "MQTTErrorCode":
         """Read all packets that have come, and write those that wait; return paho's error code.
 
-        The loop of paho itself waits by `select`, which knows no file beyond the first 1,024 of a
+        The loop of paho itself waits by `select`, which is limited to the first 1,024 files of a
         process; the watch of a fleet may follow thousands of files. Some brokers send more than
-        they were asked for, so that nothing is read while `_UNREAD_BYTES` wait here.
+        they were asked for, so nothing is read while `_UNREAD_BYTES` wait here.
         """
         error = client.loop_misc()
         if not error and client.want_write():
@@ -380,19 +369,18 @@ class Session:
 
     @property
     def _has_room(self) -> bool:
-        """Whether further messages may come into memory."""
+        """Whether further messages may be read into memory."""
         if len(self.unread) <= _UNREAD_MESSAGES:
             return True
         return sum(len(message.payload) for message in self.unread) < _UNREAD_BYTES
 
     def _pace(self) -> JsonObject:
-        """Return whether messages are processed as fast as they come, since the last heartbeat.
+        """Return how busy the watch is, and whether it keeps up with the messages.
 
-        Brokers send only so many messages before the first is acknowledged, so that the number of
-        those that wait here does not tell how many wait there. Whether all were processed at some
-        time does. The operator is told once if this does not happen between two heartbeats.
-        A heartbeat that is sent early, because the connection was just made, tells what the last
-        one told.
+        It keeps up if all messages were processed at some time since the last heartbeat: a broker
+        sends only so many messages before the first is acknowledged, so the number that waits here
+        does not show how many wait there. The operator is notified once. A heartbeat that is sent
+        early, because the connection was just made, repeats the last result.
         """
         now = time.monotonic()
         elapsed = max(now - self._pace_begin, 1e-3)
@@ -416,7 +404,7 @@ class Session:
         return pace
 
     def _try_to_connect(self, wait: float) -> "Client | None":
-        """Return a new client; None if it is too early for an attempt, or if it fails."""
+        """Return a new client; None if it is too early for an attempt, or the attempt fails."""
         pause = self._next_attempt - time.monotonic()
         if pause > 0.0:
             time.sleep(min(pause, wait))
@@ -429,14 +417,14 @@ class Session:
         return self._client
 
     def receive(self, wait: float) -> "Iterator[MQTTMessage | None]":
-        """Yield the messages as they come, without end.
+        """Yield the messages as they come, without end; None after a time without any.
 
         A message is acknowledged when the next one is asked for, or earlier by `acknowledge`.
 
         Parameters
         ----------
         wait : float
-            The time [s] without a message after which None is given.
+            This time [s].
         """
         while True:
             while self.unread:
@@ -464,21 +452,12 @@ class Session:
         self._last_message = None
 
     def send(self, topic: str, decision: Decision, publisher: DecisionPublisher) -> int:
-        """Send a decision without waiting for the answer of the broker.
-
-        Parameters
-        ----------
-        topic : str
-            The topic of the observations of the asset.
-        decision : dict
-            The decision.
-        publisher : DecisionPublisher
-            Gets the answer of the broker.
+        """Send a decision on the topic of an asset, without waiting for the broker's answer.
 
         Returns
         -------
         int
-            The number of the message, which comes with the answer.
+            The number of the message; the publisher receives it with the answer.
         """
         assert self._client is not None, "`can_send` says whether there is a connection"
         message = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1)
@@ -488,7 +467,7 @@ class Session:
     def close(self) -> None:
         """Send the last decisions, and disconnect; the broker keeps the session.
 
-        This waits at most `_GOODBYE_SECONDS` for the broker to take the decisions.
+        This waits at most `_GOODBYE_SECONDS` for the broker to accept the decisions.
         """
         has_crashed = sys.exc_info()[0] is not None
         end = time.monotonic() + _GOODBYE_SECONDS
@@ -510,15 +489,7 @@ class Session:
         return bool(self.publishers) or bool(self._publisher_of_message)
 
     def _say_goodbye(self, client: "Client", state: str) -> None:
-        """Publish the last heartbeat, and disconnect so that the broker sees an orderly end.
-
-        Parameters
-        ----------
-        client : Client
-            The client of the connection.
-        state : str
-            The state in the heartbeat: "ended", or "lost" after an error.
-        """
+        """Publish the last heartbeat with a state, "ended" or "lost", and disconnect in order."""
         connection = client.socket()
         if connection is None:
             return

@@ -1,4 +1,4 @@
-"""What a publisher sends at once, in any form: our JSON, JSON of Telegraf, or line protocol."""
+"""A publisher's payload in any form: our JSON, JSON of Telegraf, or line protocol."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -25,12 +25,7 @@ _FIELDS = "fields"
 
 
 class PayloadReader:
-    """Reads what a publisher sends at once; its form is found by its look.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        The scenario of the asset.
+    """Reads payloads; their form is recognised by their beginning.
 
     Attributes
     ----------
@@ -44,8 +39,8 @@ class PayloadReader:
     def read(self, content: MessageContent) -> list[Message | Refused]:
         """Return the messages in a payload, in their order, or the reasons why there are none.
 
-        A JSON object is one message. Metrics of Telegraf, and lines of line protocol, are a message
-        for each time that they have. The list is empty if there are only comments.
+        A JSON object is one message. Metrics of Telegraf, and lines of line protocol, give a
+        message for each of their times. The list is empty if there are only comments.
         """
         try:
             if isinstance(content, bytes):
@@ -70,7 +65,7 @@ class PayloadReader:
         return text if looks_like_line_protocol(text) else None
 
     def _read_lines(self, text: str) -> list[Message | Refused]:
-        """Return the messages in lines of line protocol; a wrong line is refused alone."""
+        """Return the messages in lines of line protocol; an invalid line is refused alone."""
         refusals: list[Message | Refused] = []
         points = []
         for line in text.split("\n"):
@@ -84,7 +79,7 @@ class PayloadReader:
         return refusals + self._read_points(points)
 
     def _read_points(self, points: Sequence[Point]) -> list[Message | Refused]:
-        """Return the message of each time that some points have."""
+        """Return a message for each time of some points."""
         try:
             records = records_of_points(points)
         except Refused as refusal:
@@ -92,7 +87,7 @@ class PayloadReader:
         return [self._read_record(record) for record in records]
 
     def _read_record(self, record: TimedRecord) -> Message | Refused:
-        """Return the message in the values of a time, which is used where they name no step."""
+        """Return the message for the values at a time, unless they name a step or time."""
         message = self.reader.read(record.values)
         if isinstance(message, Refused) or record.timestamp is None:
             return message
@@ -114,13 +109,12 @@ def is_of_telegraf(record: Mapping[str, object]) -> bool:
 def points_of_telegraf(record: Mapping[str, object]) -> list[Point]:
     """Return the points in a metric or a batch of metrics.
 
-    Nested fields are called by the names on the way to them, with `_` between, as Telegraf itself
-    flattens JSON.
+    Nested fields are named by the path to them, joined by `_`, as Telegraf itself flattens JSON.
 
     Raises
     ------
     Refused
-        If an entry of a batch is not a metric, or if a timestamp is not a number.
+        If an entry of a batch is not a metric, or a timestamp is not a number.
     """
     metrics = record.get(_BATCH)
     if not isinstance(metrics, list):

@@ -1,4 +1,4 @@
-"""Points of a time series: what a line of line protocol and a metric of Telegraf have in common."""
+"""Points of a time series, in line protocol or as metrics of Telegraf."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -25,13 +25,11 @@ class Point:
     Attributes
     ----------
     measurement : str
-        The name of what is measured.
-    fields : dict of str to FieldValue
-        The values, by the names of the fields.
+        The measured quantity.
     tags : dict of str to str
-        Where the values come from.
+        The source of the values.
     timestamp : int, float or None
-        The time since 1970 in s, ms, us or ns; None if the point has no time.
+        The time since 1970 in s, ms, us or ns; None without a time.
     """
 
     measurement: str
@@ -41,7 +39,7 @@ class Point:
 
 
 def seconds_since_1970(timestamp: float) -> float:
-    """Return a timestamp in seconds; its size shows in which unit it counts from 1970.
+    """Return a timestamp in seconds; its magnitude shows its unit.
 
     Raises
     ------
@@ -63,15 +61,7 @@ def seconds_since_1970(timestamp: float) -> float:
 
 @dataclass
 class TimedRecord:
-    """The values of all points of a time, under the keys of a JSON message.
-
-    Attributes
-    ----------
-    values : dict of str to object
-        The values.
-    timestamp : int, float or None
-        The timestamp of the points.
-    """
+    """The values of all points at one time, under the keys of a JSON message."""
 
     values: dict[str, object]
     timestamp: float | None
@@ -80,13 +70,13 @@ class TimedRecord:
 def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
     """Return a record for each time of some points, in the order of the points.
 
-    A field is called by its own name; one that is called `value`, by its measurement. Of the tags,
-    `control` alone is read.
+    The key of a field is its own name, or the measurement if the field is called `value`. Of the
+    tags, only `control` is read.
 
     Raises
     ------
     Refused
-        If two points of a time have different values of the same name.
+        If two points at one time have different values under one name.
     """
     record_of_time: dict[float | None, TimedRecord] = {}
     for point in points:
@@ -99,7 +89,7 @@ def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
 
 
 def _add_value(record: TimedRecord, name: str, value: FieldValue) -> None:
-    """Add a value to a record, and refuse it if the record has another one under its name."""
+    """Add a value to a record; refuse it if the record has another value under its name."""
     former_value = record.values.setdefault(name, value)
     if former_value is not value and former_value != value:
         raise Refused(

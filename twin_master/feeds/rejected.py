@@ -1,4 +1,4 @@
-"""The file `rejected.jsonl` of a watch, with the messages that were refused."""
+"""The file `rejected.jsonl` with the refused messages of a watch."""
 
 import json
 from pathlib import Path
@@ -12,13 +12,7 @@ _TEXT_CHARACTERS = 200
 
 
 class RejectedFile:
-    """The messages that were refused, a line of JSON each.
-
-    Parameters
-    ----------
-    path : Path or None
-        The file; None if refused messages are not written down.
-    """
+    """The refused messages, one line of JSON each; a path of None writes none."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
@@ -30,11 +24,11 @@ class RejectedFile:
         Parameters
         ----------
         message_number : int
-            The number of the message among those of the watch, from 1.
+            The number of the message in the watch, from 1.
         reason : str
             Why it was refused.
         text : str
-            The text of the message; only its beginning is kept.
+            The text of the message; only its beginning is stored.
         """
         if self._path is None or self._line_count >= REJECTED_KEPT:
             return
@@ -47,14 +41,14 @@ class RejectedFile:
             file.write(json.dumps(record, ensure_ascii=True) + "\n")
 
     def resume(self, journalled_count: int, *, feed_is_read_again: bool) -> int:
-        """Drop the lines that a resumed watch will write again, and a line that a kill cut off.
+        """Drop lines that a resumed watch will write again, and a line that a kill cut off.
 
         Parameters
         ----------
         journalled_count : int
             The number of refused messages up to the last line of the journal.
         feed_is_read_again : bool
-            Whether the messages after that line are read again, and refused again.
+            Whether the messages after that line are read, and refused, again.
 
         Returns
         -------

@@ -10,7 +10,7 @@ REFUSALS_IN_A_ROW = 3
 """Number of messages refused in a row after which the operator gets a notice."""
 TIME_UNITS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 """Units of times, each a thousandth of the one before it, and their names."""
-_MOST_SLIPS = 24
+_MOST_MISSPELLINGS = 24
 """Largest number of ignored names that a watch reports, so that they do not fill the journal."""
 
 
@@ -31,11 +31,6 @@ def unit_advice(unit: str) -> str:
 class StreamNotices:
     """Notices about the messages of a stream: gaps, pauses, clocks, refusals, unknown names.
 
-    Parameters
-    ----------
-    words : NoticeWording
-        The words for steps and sensors.
-
     Attributes
     ----------
     is_blind : bool
@@ -43,7 +38,7 @@ class StreamNotices:
     refused_in_a_row : int
         The number of messages that were refused since one was accepted.
     last_reason : str
-        The reason why the last of them was refused.
+        Why the last of them was refused.
     """
 
     def __init__(self, words: NoticeWording) -> None:
@@ -52,7 +47,7 @@ class StreamNotices:
         self._gap_end = -1  # the step after the last gap that was reported
         self._clock_is_reported = False
         self.is_blind = False
-        self._reported_slips: list[str] = []
+        self._reported_misspellings: list[str] = []
         self.refused_in_a_row = 0
         self.last_reason = ""
         self._refused_steps: list[int | None] = []
@@ -76,7 +71,7 @@ class StreamNotices:
             "gap_end": self._gap_end if waiting else None,
             "clock": self._clock_is_reported,
             "blind": self.is_blind,
-            "names": list(self._reported_slips),
+            "names": list(self._reported_misspellings),
             "refused": refusal_record if self.refused_in_a_row else None,
         }
         # A journal leaves out what is zero, false or empty
@@ -87,7 +82,7 @@ class StreamNotices:
         self._gap_end = state.get("gap_end", -1)
         self._clock_is_reported = state.get("clock", False)
         self.is_blind = state.get("blind", False)
-        self._reported_slips = list(state.get("names", ()))
+        self._reported_misspellings = list(state.get("names", ()))
         refusal_record = state.get("refused", {})
         self.refused_in_a_row = refusal_record.get("count", 0)
         self._refused_steps = list(refusal_record.get("steps", ()))
@@ -104,7 +99,7 @@ class StreamNotices:
         next_step : int
             The first step after it with a message.
         unit : str
-            The unit that the times of the messages seem to have, see `Clock.likely_unit`.
+            The unit in which the times seem to be given, see `Clock.likely_unit`.
         """
         if next_step == self._gap_end:  # reported before the watch was taken up again
             return
@@ -131,7 +126,7 @@ class StreamNotices:
         Parameters
         ----------
         step : int
-            The step of the first message that has a number.
+            The step of the first message with a number.
         number : int
             This number.
         """
@@ -215,15 +210,13 @@ class StreamNotices:
 
         Parameters
         ----------
-        next_step : int
-            The next step.
         distance : float
             The number of steps by which the message lies after the one before it; negative if it
             lies earlier.
         unit : str
-            The unit that the times seem to have.
+            The unit in which the times seem to be given.
         noun : str
-            What the message is counted by, its time or its number.
+            "time" or "number": how the message is counted.
         widening : int
             The number of steps through which the belief is predicted before the message.
         rests : bool
@@ -254,19 +247,11 @@ class StreamNotices:
         self._pending.append(Notice("clock", sentence))
 
     def note_clock_agreement(self) -> None:
-        """Note that two messages agree, so that a later pause or jump is reported again."""
+        """Record that two messages agree, so that a later pause or jump is reported again."""
         self._clock_is_reported = False
 
     def note_refusal(self, step: int | None, reason: str) -> None:
-        """Note a refused message.
-
-        Parameters
-        ----------
-        step : int or None
-            The step of the message, if it is known.
-        reason : str
-            Why it was refused.
-        """
+        """Record a refused message, with its step if that is known, and the reason."""
         self.refused_in_a_row += 1
         self.last_reason = reason
         if len(self._refused_steps) < REFUSALS_IN_A_ROW:
@@ -274,19 +259,18 @@ class StreamNotices:
 
     @property
     def has_refusals_to_report(self) -> bool:
-        """Whether enough messages were refused in a row, and the operator was not notified yet."""
+        """Whether enough messages were refused in a row without a notice to the operator."""
         return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_reported
 
     def report_refusals(self, next_step: int) -> Notice:
         """Return the notice that all messages since the last step were refused.
 
-        The notice is remembered as given, so that `has_refusals_to_report` is false until a message
-        is accepted again.
+        It is given once, until a message is accepted again.
 
         Parameters
         ----------
         next_step : int
-            The step that is expected next. If it is 0, no message was accepted yet.
+            The step that is expected next; 0 if no message was accepted yet.
         """
         self._refusals_are_reported = True
         count = self.refused_in_a_row
@@ -301,15 +285,11 @@ class StreamNotices:
         return Notice("refused", sentence, value=float(count))
 
     def _likely_cause(self, next_step: int) -> str:
-        """Return a sentence with the likely cause if the refused messages belong to past steps.
+        """Return a sentence with the likely cause if refused messages belong to past steps.
 
         Two patterns are known: all messages name the same step (a counter that stands still), or
-        rising steps that were watched before (a counter that has begun again).
-
-        Returns
-        -------
-        str
-            The sentence, after a space; empty if the steps fit neither pattern.
+        rising steps that were watched before (a counter that has restarted). Otherwise the text is
+        empty.
         """
         steps = [step for step in self._refused_steps if step is not None]
         if len(steps) < REFUSALS_IN_A_ROW or max(steps) >= next_step:
@@ -331,19 +311,15 @@ class StreamNotices:
         return ""
 
     def accept(self, step: int, *, is_blind: bool, ignored: Mapping[str, str]) -> list[Notice]:
-        """Note that a message is accepted; return the notices that are given with its step.
-
-        The count of refused messages is reset to zero.
+        """Record that a message is accepted; return the notices for its step.
 
         Parameters
         ----------
-        step : int
-            The step of the message.
         is_blind : bool
             Whether the message has no reading of any sensor.
         ignored : dict of str to str
-            The names in the message that are not sensors. The value of a name is the known name
-            that it was probably meant to be, in words; it is empty if there is none.
+            The names in the message that are not sensors, each with the known name that was
+            probably meant, in words, or an empty text.
         """
         when = f"{self._words.step.capitalize()} {step}"
         notices = self.pop_pending()
@@ -357,7 +333,7 @@ class StreamNotices:
         if is_blind and not self.is_blind:
             notices.append(self._blind_notice(when, ignored))
         self.is_blind = is_blind
-        notices += self._report_slips(when, ignored)
+        notices += self._report_misspellings(when, ignored)
         return notices
 
     def _blind_notice(self, when: str, ignored: Mapping[str, str]) -> Notice:
@@ -368,26 +344,25 @@ class StreamNotices:
         sentence = f"{when}: the message has no reading of any {sensor}{passed_over}."
         return Notice("blind", sentence)
 
-    def _report_slips(self, when: str, ignored: Mapping[str, str]) -> list[Notice]:
-        """Return a notice about ignored names that look like misspelt sensors or keys.
+    def _report_misspellings(self, when: str, ignored: Mapping[str, str]) -> list[Notice]:
+        """Return a notice about ignored names that look like misspelt sensors or keys, if any.
 
-        Each name is reported once in a watch, and at most `_MOST_SLIPS` names altogether. The list
-        is empty if there is nothing to report.
+        Each name is reported once in a watch, and at most `_MOST_MISSPELLINGS` names altogether.
         """
-        new_slips = []
+        new_misspellings = []
         for name, meaning in ignored.items():
-            if meaning and name not in self._reported_slips:
-                new_slips.append(name)
-        new_slips = new_slips[: _MOST_SLIPS - len(self._reported_slips)]
-        if not new_slips:
+            if meaning and name not in self._reported_misspellings:
+                new_misspellings.append(name)
+        new_misspellings = new_misspellings[: _MOST_MISSPELLINGS - len(self._reported_misspellings)]
+        if not new_misspellings:
             return []
-        self._reported_slips += new_slips
-        described = listing(f"`{name}` ({ignored[name]})" for name in new_slips)
+        self._reported_misspellings += new_misspellings
+        described = listing(f"`{name}` ({ignored[name]})" for name in new_misspellings)
         sentence = f"{when}: passed over as no {self._words.sensor}: {described}."
         return [Notice("passed_over", sentence)]
 
     def pop_pending(self) -> list[Notice]:
-        """Return the notices that wait for the next reading, and forget them."""
+        """Return the notices that wait for the next reading, and clear them."""
         notices = self._pending
         self._pending = []
         return notices

@@ -35,8 +35,6 @@ def source_of(scenario: Scenario, *, is_real: bool = False) -> AssetSource:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario of the mission, checked.
     is_real : bool
         Whether the assets are real, so that only the twins' model is needed.
     """
@@ -102,13 +100,7 @@ def _faults_of_recordings(group: Group) -> list[str]:
 
 
 def _check_scenario(group: Group, scenario: Scenario) -> None:
-    """Check that a group can fly one of its scenarios.
-
-    Raises
-    ------
-    FleetError
-        If the scenario cannot be flown in a fleet; the message says why.
-    """
+    """Raise an error if a group cannot fly one of its scenarios."""
     if scenario.observation.role == "modes":
         raise FleetError(
             'a fleet stores values without covariances, but with `role = "modes"` each step has a '
@@ -136,13 +128,7 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
 
 
 def _check_recordings(group: Group) -> None:
-    """Check that a group of real assets has recordings, and that no two have the same name.
-
-    Raises
-    ------
-    FleetError
-        If there is no recording, or if two recordings have the same name.
-    """
+    """Raise an error if a group of real assets has no recordings, or two of one name."""
     names = {member.name for member in group.members}
     if not names:
         raise FleetError(
@@ -157,13 +143,7 @@ def _check_recordings(group: Group) -> None:
 
 
 def _check_true_parameters(group: Group, scenario: Scenario) -> None:
-    """Check that every asset's true factor on Young's modulus is in the reduced model's range.
-
-    Raises
-    ------
-    FleetError
-        If the factor of any asset is outside of this range.
-    """
+    """Raise an error if a true factor on Young's modulus lies outside the model's range."""
     from fe.wing.design import wing_structure
 
     usual_value = scenario.asset.true_parameters.get(_WING_PARAMETER, 1.0)

@@ -1,4 +1,4 @@
-"""The figures of groups of fleets: what flights earned, errors and counts, side by side."""
+"""Results of the groups of fleets side by side: returns of the flights, errors and counts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -40,8 +40,8 @@ def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
 def earned_figures(group: "xr.DataTree") -> dict[str, Figure]:
     """Return what the flights of a group earned, by title; empty for stores without rewards.
 
-    Figures are means over the flights with their standard errors. Flights that failed are left out.
-    Of a flight that ended early, the flown steps are counted.
+    The values are means over the flights with their standard errors. Failed flights are left out.
+    If a flight ended early, its flown steps are counted.
     """
     if "earned" not in group.children:
         return {}
@@ -118,21 +118,19 @@ def group_figures(group: "xr.DataTree") -> dict[str, Figure]:
 
 
 class NamedGroup(NamedTuple):
-    """A group of a fleet, as it is compared with others.
+    """A group of a fleet, to be compared with others.
 
     Attributes
     ----------
     name : str
-        The name of the group; of several folders, with the folder, or the folder alone if it has
-        one group.
+        The name of the group; if there are several folders, with the folder, or the folder alone if
+        it has one group.
     folder : Path
         The folder of the fleet.
     record : dict
         The record of the group in `config.json`.
-    group : DataTree
-        The stored results.
     policy : str
-        The policy that decides: the name of the scenario's, or "given" for one that the user gave.
+        The name of the scenario's policy that decides, or "given" for one from the user.
     """
 
     name: str
@@ -180,7 +178,7 @@ def figures_of_fleets(folders: Sequence[Path]) -> Figures:
 
 
 def compare_fleets(folders: Sequence[Path]) -> Figures:
-    """Return the figures of each group, beside what was promised and what the first group earned.
+    """Return the results of each group, beside what was promised and what the first group earned.
 
     Groups are compared seed by seed, because flights of one seed meet the same damage and noise
     (common random numbers): the difference of their returns varies less than either of them.
@@ -237,9 +235,9 @@ def returns_of_group(group: "xr.DataTree") -> Float:
 
 
 def _difference_of_returns(group: "xr.DataTree", other_group: "xr.DataTree") -> Estimated:
-    """Return by how much flights earn more than those of another group under the same seeds.
+    """Return how much more flights earn than those of another group under the same seeds.
 
-    It is NaN if no seed is that of one flight in each group.
+    It is NaN if no seed has one flight in each group.
     """
     returns_by_seed = []
     for tree in (group, other_group):
@@ -266,9 +264,9 @@ def unit_of_states(group: "xr.DataTree") -> str:
 
 
 def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Figure], int]:
-    """Return the numbers of twins by title, and the number of twins that have outcomes.
+    """Return the numbers of twins that flew, failed, ended early or gave notices, by title.
 
-    Counted are twins that flew, failed, ended early, or gave notices.
+    The number of twins that have outcomes is returned, too.
     """
     status_counts = np.zeros(max(FLOWN, FAILED, ENDED) + 1, dtype=np.int64)
     alarmed = 0

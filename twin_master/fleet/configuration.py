@@ -43,14 +43,12 @@ def locked_fleet_folder(
     replace_old: bool = False,
     check: Callable[[], None] = _nothing_to_check,
 ) -> Iterator[JsonObject]:
-    """Return a context in which this process alone uses the folder of a fleet.
+    """Provide the folder of a fleet, which only this process uses, and its configuration.
 
     The folder is made, or a folder that holds the same fleet is used again.
 
     Parameters
     ----------
-    folder : Path
-        The path of the folder.
     kind : str
         `KIND` or `WATCHED_KIND`.
     record : mapping
@@ -99,10 +97,8 @@ def fleet_config(folder: Path, *kinds: str) -> JsonObject:
 
     Parameters
     ----------
-    folder : Path
-        The path of the folder.
     *kinds : str
-        The kinds of fleets that are accepted; by default one that is flown.
+        The accepted kinds of fleets; by default one that is flown.
 
     Raises
     ------
@@ -119,5 +115,5 @@ def fleet_config(folder: Path, *kinds: str) -> JsonObject:
 
 
 def group_folder(folder: Path, group: Group, scenario_number: int) -> Path:
-    """Return the folder with the prepared knowledge of a group's twins for one of its scenarios."""
+    """Return the folder with the prepared knowledge of a group's twins for a scenario."""
     return folder / GROUPS / group.name / str(scenario_number)

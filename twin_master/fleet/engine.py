@@ -1,7 +1,4 @@
-"""Distribution of the work on a fleet: to this process, to local workers, or to a Dask cluster.
-
-Shards that were flown come back in any order, the results of tasks in the order of the tasks.
-"""
+"""Distributes the work on a fleet: to this process, to local workers, or to a Dask cluster."""
 
 import logging
 import sys
@@ -43,14 +40,14 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Engine:
-    """The processes in which the shards of a fleet are flown, and in which lessons are computed.
+    """The processes that fly the shards of a fleet and compute lessons.
 
     Attributes
     ----------
     workers : int
-        The number of worker processes of this machine; with 0 this process does all.
+        The number of worker processes of this machine; with 0 this process does all the work.
     cluster : str or None
-        The address of a Dask scheduler, which takes the place of workers of this machine.
+        The address of a Dask scheduler, whose workers replace those of this machine.
     """
 
     workers: int = 0
@@ -65,16 +62,16 @@ class Engine:
 class Piece(NamedTuple):
     """The twins that are sent to a worker together: a shard, or one twin of it.
 
-    The twins of a shard are sent one by one if workers died while they flew the shard.
+    The twins of a shard are sent one by one if workers died while flying the shard.
 
     Attributes
     ----------
     group_number : int
-        The number of its group in the fleet.
+        The number of the group in the fleet.
     kit : bytes
-        The packed `Kit` of its twins.
+        The packed `Kit` of the twins.
     members : tuple of Member
-        Its twins.
+        The twins.
     """
 
     group_number: int
@@ -89,10 +86,8 @@ def fly_pieces(
 
     Parameters
     ----------
-    engine : Engine
-        The processes that fly.
     pieces : iterator of Piece
-        The pieces; the next one is taken from the iterator when a worker is free for it.
+        The next one is taken from the iterator when a worker is free for it.
     progress : Progress
         Shows the address of the dashboard of workers.
 
@@ -115,8 +110,8 @@ def _fly_by_workers(
 ) -> Iterator[tuple[Piece, ShardResult]]:
     """Fly pieces by workers.
 
-    If more than `ALLOWED_DEATHS` workers died while they flew a piece, its twins are flown one by
-    one. A single twin for which this happens again is returned as failed.
+    If more than `ALLOWED_DEATHS` workers died while flying a piece, its twins are flown one by one.
+    A single twin with as many deaths is returned as failed.
     """
     from distributed import CancelledError, as_completed
     from distributed.comm import CommClosedError
@@ -159,12 +154,12 @@ def _fly_by_workers(
 
 
 class TaskPool:
-    """Computes a function of many tasks, by the processes of an engine.
+    """Computes a function of many tasks with the processes of an engine.
 
     Parameters
     ----------
     client : Client or None
-        The client of the workers; None if this process computes.
+        None if this process computes.
     """
 
     def __init__(self, client: "Client | None") -> None:
@@ -178,9 +173,9 @@ class TaskPool:
         Parameters
         ----------
         function : callable
-            The function of one task, at the top of a module.
+            A function of one task, at the top level of a module.
         tasks : iterable
-            The tasks; the next one is taken from the iterator when a worker is free for it.
+            The next one is taken from the iterable when a worker is free for it.
 
         Raises
         ------
@@ -222,7 +217,7 @@ class TaskPool:
 
 @contextmanager
 def open_task_pool(engine: Engine, progress: Progress) -> Iterator[TaskPool]:
-    """Return a context with a pool of the processes of an engine.
+    """Provide a pool of the processes of an engine.
 
     Raises
     ------
@@ -247,13 +242,7 @@ def program_version() -> str:
 
 
 def _call_on_worker(function: Callable[[_Task], _Result], task: _Task, version: str) -> _Result:
-    """Return the result of a task in a worker process, if it runs the given program version.
-
-    Raises
-    ------
-    FleetError
-        If the worker runs another version.
-    """
+    """Return the result of a task; raise an error if the worker runs another program version."""
     if version != program_version():
         raise FleetError(
             "a worker of the cluster runs another version of this program, of Python or of a "
@@ -270,7 +259,7 @@ def _fly_piece(piece: Piece) -> ShardResult:
 
 @contextmanager
 def _connected_client(engine: Engine) -> "Iterator[Client]":
-    """Return a context with a client of the cluster, or of local workers that the context ends."""
+    """Provide a client of the cluster, or of local workers that end with the context."""
     import dask
 
     # Importing `distributed` adds its defaults to the configuration. That must happen before the
@@ -299,13 +288,7 @@ def _connected_client(engine: Engine) -> "Iterator[Client]":
 
 @contextmanager
 def _cluster_client(address: str) -> "Iterator[Client]":
-    """Return a context with a client of the scheduler at an address.
-
-    Raises
-    ------
-    FleetError
-        If the scheduler does not answer, or if it has no workers.
-    """
+    """Provide a client of the scheduler at an address; raise an error if it has no workers."""
     from distributed import Client
 
     try:
@@ -326,7 +309,7 @@ def _cluster_client(address: str) -> "Iterator[Client]":
 
 @contextmanager
 def _local_client(workers: int) -> "Iterator[Client]":
-    """Return a context with a client of worker processes of this machine."""
+    """Provide a client of worker processes of this machine."""
     from distributed import Client, LocalCluster
 
     with (
@@ -345,10 +328,10 @@ def _local_client(workers: int) -> "Iterator[Client]":
 
 @contextmanager
 def _hidden_main_module() -> Iterator[None]:
-    """Return a context in which new processes do not run the caller's script again.
+    """Provide a context in which new processes do not run the caller's script again.
 
     `multiprocessing` imports the main module of its parent in each new process, both at the start
-    and when it replaces a worker that died. An empty module in its place prevents this.
+    and when it replaces a dead worker. An empty module in its place prevents this.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")

@@ -294,13 +294,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
 
 
 def _check_shared_inspections(group: Group, head: FleetSection) -> None:
-    """Check that the assets of a group that share inspections fly in one shard.
-
-    Raises
-    ------
-    FleetError
-        If they do not.
-    """
+    """Raise an error unless the assets of a group that share inspections fly in one shard."""
     shares_inspections = group.scenarios[0].planner.inspections_per_step is not None
     flies_in_one_shard = len(group.members) <= head.shard and len(group.scenarios) == 1
     if shares_inspections and not flies_in_one_shard:
@@ -333,7 +327,7 @@ def ensemble(
     overrides : Overrides or mapping, optional
         Values that replace those of the scenario.
     shard : int
-        The number of twins that are flown in one piece.
+        The number of twins that fly in one shard.
     """
     resolved_scenario = resolve_scenario(load_scenario(scenario), overrides)
     mission = resolved_scenario.mission
@@ -366,19 +360,7 @@ def seed_range(text: str) -> range:
 def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     """Return the group that a section of a fleet file describes.
 
-    Parameters
-    ----------
-    section : GroupSection
-        The group in the file.
-    folder : Path
-        The folder of the file.
-    seed : int
-        The seed of the fleet.
-
-    Raises
-    ------
-    TwinMasterError
-        If the group cannot be flown.
+    `folder` is that of the file, and `seed` that of the fleet.
     """
     # The scenario is a file beside the fleet file, or the name of a shipped scenario.
     local_file = folder / section.scenario
@@ -398,12 +380,9 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
 
 
 def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
-    """Return the FMUs or calibrations of the assets of a group; empty if it has no pattern.
+    """Return the FMUs or calibrations of a group's assets; empty without a pattern.
 
-    Raises
-    ------
-    FleetError
-        If no file matches the pattern.
+    An error is raised if no file matches the pattern.
     """
     pattern = section.fmus or section.calibrations
     if not pattern:
@@ -421,25 +400,9 @@ def _scenarios(
     loaded_scenario: LoadedScenario,
     files: list[Path],
 ) -> tuple[Scenario, ...]:
-    """Return the scenarios of a group: one for each file, or a single one without files.
+    """Return the scenarios of a group: one for each FMU or calibration file, or a single one.
 
-    Parameters
-    ----------
-    section : GroupSection
-        The group as the fleet file describes it.
-    folder : Path
-        The folder of the fleet file.
-    seed : int
-        The seed of the fleet.
-    loaded_scenario : LoadedScenario
-        The scenario file of the group.
-    files : list of Path
-        The FMU or the calibration of each asset; empty if all assets have those of the scenario.
-
-    Raises
-    ------
-    TwinMasterError
-        If a scenario cannot be resolved; the message lists all files for which this is so.
+    An error lists all files with which the scenario cannot be resolved.
     """
     common_overrides = _common_overrides(section, folder, seed)
     if not files:
@@ -490,17 +453,9 @@ def _with_values_of_group(section: GroupSection, scenario: Scenario) -> Scenario
 def _members(section: GroupSection, seed: int, observations: str, files: list[Path]) -> Members:
     """Return the assets of a group.
 
-    Parameters
-    ----------
-    section : GroupSection
-        The group in the fleet file.
-    seed : int
-        The seed of the fleet.
-    observations : str
-        The pattern of the recordings of real assets, or the address of the broker that sends their
-        messages; empty if the assets are simulated.
-    files : list of Path
-        The FMU or calibration of each asset; empty if the section gives the number of assets.
+    `observations` is the pattern of recordings or the address of a broker for real assets, and
+    empty for simulated ones. `files` has the FMU or calibration of each asset; it is empty if the
+    section gives the number of assets.
     """
     if observations:
         if is_broker(observations):
@@ -519,13 +474,13 @@ def _members(section: GroupSection, seed: int, observations: str, files: list[Pa
 
 
 def _member_with_file(section: GroupSection, seed: int, row: int, file: Path) -> Member:
-    """Return an asset with an FMU or a calibration, and thus a scenario, of its own."""
+    """Return an asset with its own FMU or calibration, and so its own scenario."""
     member = seeded_member(section.name, seed, row, section.parameters, file.stem)
     return replace(member, scenario_number=row, file=file)
 
 
 def recording_files(pattern: str) -> list[Path]:
-    """Return the recordings of real assets that match a pattern, sorted, without hidden files."""
+    """Return the recordings of real assets that match a pattern, sorted; skip hidden files."""
     paths = sorted(Path(pattern).parent.glob(Path(pattern).name))
     return [path for path in paths if not path.name.startswith(".")]
 

@@ -33,11 +33,6 @@ if TYPE_CHECKING:
 def open_fleet(folder: Path | str) -> "xr.DataTree":
     """Return everything that a fleet has stored, as labelled arrays that are read at first use.
 
-    Parameters
-    ----------
-    folder : Path or str
-        The folder of the fleet.
-
     Returns
     -------
     xarray.DataTree
@@ -57,12 +52,10 @@ def open_fleet(folder: Path | str) -> "xr.DataTree":
 
 
 def open_groups(folder: Path, *, names: bool = False) -> "dict[str, xr.DataTree]":
-    """Return the groups of the store of a fleet by name.
+    """Return the groups of a fleet's store by name.
 
     Parameters
     ----------
-    folder : Path
-        The folder of the fleet.
     names : bool
         Whether to read the names of the twins.
 
@@ -83,10 +76,10 @@ def notice_counts(group: "xr.DataTree", kind: str, rows: slice = ALL_ROWS) -> In
 
 
 def believed_means(group: "xr.DataTree", rows: slice = ALL_ROWS) -> Float:
-    """Return the mean of F state factors of B twins in T steps, a (B, T, F) array in SI units.
+    """Return the mean (B, T, F) of F state factors of B twins in T steps, in SI units.
 
-    They are NaN in steps in which the probability that no state of the model explains the
-    observations is above `BELIEVED`.
+    It is NaN in steps in which the probability that no state of the model explains the observations
+    exceeds `BELIEVED`.
     """
     is_unexplained = stored_values(group, "notice/none_of_these", rows) > BELIEVED
     mean = stored_values(group, "filtered/mean", rows)
@@ -94,7 +87,7 @@ def believed_means(group: "xr.DataTree", rows: slice = ALL_ROWS) -> Float:
 
 
 def last_steps(group: "xr.DataTree", rows: slice = ALL_ROWS) -> Index:
-    """Return the number of the last flown step of each of B twins: (B,); 0 if none was flown."""
+    """Return the last flown step (B,) of each of B twins; 0 if none was flown."""
     # Steps that were not flown, at the end of a mission, have the control -1.
     flown_steps = (stored_values(group, "observed/control_index", rows) >= 0).sum(axis=1)
     last_step: Index = np.maximum(flown_steps - 1, 0)
@@ -109,8 +102,6 @@ def severity(scenario: Scenario, mean: ArrayLike) -> Float:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario with F factors of the state.
     mean : (..., F) array
         The mean states, in SI units.
 
@@ -137,11 +128,11 @@ def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) ->
     Parameters
     ----------
     knowledge : Knowledge
-        The knowledge that the twins share.
+        What the twins share: model, policy and draws.
     belief : (B, S) array
         Their beliefs after the last step.
     control : int
-        The index of the control in force, under which the states change until it is left.
+        The index of the control in force, under which the states evolve until it is left.
 
     Returns
     -------
@@ -198,8 +189,6 @@ def flown_twins(
 
     Parameters
     ----------
-    folder : Path
-        The folder of the fleet.
     record : mapping
         The group in `config.json`.
     group : DataTree

@@ -43,15 +43,13 @@ from twin_master.scenario.schema import Scenario
 def flights_of_recordings(
     knowledge: Knowledge, recordings: Sequence[Sequence[FeedItem]]
 ) -> Flights:
-    """Return the beliefs and controls of B twins given recordings of real assets.
+    """Return the beliefs and controls of B twins, given recordings of real assets.
 
     Each recording is processed as `uav-twin watch` would process it. A recording that cannot be
     processed gives its reason in `failure`.
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge that the twins share: model, policy and draws.
     recordings : sequence of sequence of FeedItem
         The messages of each of the B assets.
     """
@@ -75,10 +73,10 @@ def flights_of_recordings(
 
 
 def _history_of_recording(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
-    """Return a twin's history of beliefs and controls, given the messages of one real asset.
+    """Return a twin's beliefs and controls, given the messages of one real asset.
 
-    If a message comes late and changes the observation of a former step, all steps are filtered
-    again with the final observations.
+    If a late message changes the observation of an earlier step, all steps are filtered again with
+    the final observations.
     """
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
@@ -124,14 +122,14 @@ def result_of_unflown(member: Member, reason: str) -> ShardResult:
 
 
 class Kit:
-    """All that the twins of a scenario need, on any machine, ready to fly.
+    """Everything that the twins of a scenario need to fly, on any machine.
 
     Parameters
     ----------
     packed : bytes
-        Pickled: the portable scenario, the files of the prepared folder by their paths (what the
-        twins know, and the FMU), the model that is flown without an FMU, or None, and the sensor
-        model and estimator that a user has given.
+        Pickled: the portable scenario, the files of the prepared folder by their paths (knowledge
+        and FMU), the model that is flown without an FMU, or None, and the user's sensor model and
+        estimator.
     """
 
     def __init__(self, packed_kit: bytes) -> None:
@@ -144,7 +142,7 @@ class Kit:
         self.knowledge: Knowledge = load_knowledge(folder, self.scenario, parts=parts)
 
     def without_folder(self, sentence: str) -> str:
-        """Return a sentence with the temporary folder of the kit cut off from all paths."""
+        """Return a sentence with the temporary folder removed from all paths."""
         return sentence.replace(f"{self._folder}/", "")
 
     def open_asset(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:
@@ -155,7 +153,7 @@ class Kit:
         parameters : mapping of str to float
             True parameters that replace those of the scenario, in SI units.
         seed : int, optional
-            The seed with which the asset draws its own damage and noise, if it has such seeds.
+            The seed with which the asset draws its own damage and noise, if it does.
         """
         scenario = with_parameters(self.scenario, parameters)
         if self.wing is not None:
@@ -179,8 +177,6 @@ def fly_shard(packed_kit: bytes, members: Sequence[Member]) -> ShardResult:
 
     Parameters
     ----------
-    packed_kit : bytes
-        The packed `Kit` of the twins.
     members : sequence of Member
         The B twins.
     """
@@ -212,7 +208,7 @@ def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
     """Simulate the assets of some twins, and return the flights.
 
     Assets without memory are flown side by side in array operations, unless the twins learn or have
-    an estimator that a user has given; other assets are flown one after the other.
+    the user's own estimator; others are flown one after the other.
     """
     knowledge = kit.knowledge
     scenario = kit.scenario
@@ -253,13 +249,6 @@ class _AssetPool(ExitStack):
     """The simulated assets of some twins; at most one asset with memory is open at a time.
 
     After a failed flight the asset is closed, and a new one is opened for the next twin.
-
-    Parameters
-    ----------
-    kit : Kit
-        The scenario, knowledge and files of the twins.
-    members : sequence of Member
-        The twins.
     """
 
     def __init__(self, kit: Kit, members: Sequence[Member]) -> None:
@@ -293,19 +282,11 @@ class _AssetPool(ExitStack):
         return [asset] * len(self._keys) if isinstance(asset, StatelessAsset) else []
 
     def asset_at_start(self, twin: int, is_reusable: bool) -> Asset:
-        """Return the asset of a twin that flies alone, in its state at the start of the mission.
+        """Return the asset of a twin that flies alone, at the start of the mission.
 
-        Parameters
-        ----------
-        twin : int
-            The number of the twin in the shard.
-        is_reusable : bool
-            Whether the previous flight ended without an error, so that its asset can be reset.
-
-        Raises
-        ------
-        FleetError
-            If the twins share inspections, and so cannot fly one after the other.
+        `is_reusable` says whether the previous flight ended without an error, so that its asset can
+        be reset. An error is raised if the twins share inspections, and so cannot fly one after the
+        other.
         """
         if self._kit.scenario.planner.inspections_per_step is not None:
             raise FleetError(

@@ -20,10 +20,10 @@ class SearchRequest:
     first_step, last_step : int
         The first and the last step that the search uses.
     verdict_folder : Path
-        The folder that the search makes, with `verdict.json` and, if the verdict gives one,
-        `patch.json`. It must appear complete or not at all.
+        The folder for `verdict.json` and, if the verdict gives one, `patch.json`. It must appear
+        complete or not at all.
     log : Path
-        The file that takes the messages of the search.
+        The file for the messages of the search.
     seed : int
         The seed of all random numbers of the search.
     low_priority : bool
@@ -40,21 +40,21 @@ class SearchRequest:
 
 
 class RunningSearch(Protocol):
-    """A search that was started."""
+    """A search that is running or has ended."""
 
     def has_ended(self) -> bool:
         """Return whether the search has ended, with a verdict or without one."""
 
     def stop(self) -> None:
-        """End the search at once, if it still runs, and wait until it has ended."""
+        """Terminate the search if it still runs, and wait for its end."""
 
 
 class CauseSearch(Protocol):
     """Starts searches for the cause of an alarm.
 
-    A search must not disturb the watch: it runs in a process of its own, from which no error, no
-    key of the terminal and no change of the state of the process reaches the watch.
+    A search must not disturb the watch: it runs in a process of its own, and no error, terminal key
+    or process state of it reaches the watch.
     """
 
     def start(self, request: SearchRequest) -> RunningSearch:
-        """Start a search and return without waiting for its end."""
+        """Start a search without waiting for its end."""

@@ -1,9 +1,4 @@
-"""Decisions of a watch as points of a time series, for InfluxDB and what else reads line protocol.
-
-Each decision becomes a point of the measurement `uav_twin`, one of `uav_twin_state` for each state,
-one of `uav_twin_hypothesis` for each compared hypothesis, and one of `uav_twin_notice` for each
-notice. Line protocol has no number that is not one: a field without a value is left out.
-"""
+"""Decisions of a watch as points of a time series, for InfluxDB and readers of line protocol."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -57,7 +52,7 @@ def decision_points(decision: Decision, asset: str, timestamp: int) -> Iterator[
 
 
 def _with_value(fields: Mapping[str, object]) -> dict[str, object]:
-    """Return fields without those that have no value, numbers of NumPy as those of Python."""
+    """Return fields that have a value, with numbers of NumPy as those of Python."""
     with_value: dict[str, object] = {}
     for name, value in fields.items():
         if isinstance(value, float):
@@ -98,6 +93,6 @@ class DecisionLines:
         self._append("".join(f"{write_line(point)}\n" for point in points))
 
     def _append(self, text: str) -> None:
-        """Write a text at the end of the file."""
+        """Append a text to the file."""
         with explained_write_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(text)

@@ -67,12 +67,10 @@ After a power failure the recording is read again. The steps of a live watch are
 
 
 class GivenPatch(NamedTuple):
-    """A patch of the model that the user wants the twin to believe.
+    """A patch of the model that the user gives to the twin.
 
     Attributes
     ----------
-    file : Path
-        The file of the patch.
     from_step : int
         The first step that is filtered with the patched model.
     """
@@ -86,20 +84,16 @@ def _do_nothing() -> None:
 
 
 class Watch:
-    """A watch of an asset, whose folder is locked by this process.
+    """A watch of an asset, in a folder that this process has locked.
 
     Parameters
     ----------
-    folder : Path
-        The folder of the watch.
     config : dict
         The content of its `config.json`.
     scenario : Scenario
         The scenario, whose paths are in the folder.
-    progress : Progress
-        Shows stages and notes.
     sibling : Watch, optional
-        A watch of the same scenario, whose model and plan this one shares.
+        A watch of the same scenario, with which model and plan are shared.
 
     Attributes
     ----------
@@ -110,24 +104,24 @@ class Watch:
     journal_path : Path
         The path of the journal.
     models : list of BelievedModel
-        The first model, and the patched models that were adopted, in their order.
+        The first model, and the adopted patched models in order.
     teaching : Teaching
         The state of teaching after the last line of the journal.
     journal : JournalFile
         The journal, from `begin` on.
     intake : Intake
-        The messages that come, from `begin` on.
+        The intake of messages, from `begin` on.
     twin : Twin
         The twin, from `begin` on. It is replaced when a patched model is adopted.
     filtered : (states,) array or None
         The filtered probability of each state after the last step; None before the first step of
         this process.
     has_begun : bool
-        Whether journal, intake and twin are there.
+        Whether journal, intake and twin exist.
     last_step : MissionStep or None
         The last step of this process; None before the first one.
     is_quiet : bool
-        Whether the operator was told that no step comes any more.
+        Whether the operator was notified that no step comes any more.
     """
 
     journal: JournalFile
@@ -165,7 +159,7 @@ class Watch:
         self._keep_knowledge(sibling)
 
     def _prepare_model(self) -> BelievedModel:
-        """Calibrate the model of the watch, plan with it, and return it as the first model."""
+        """Calibrate and plan, and return the first model of the watch."""
         with self.progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
         remark = calibration_sentence(
@@ -177,10 +171,10 @@ class Watch:
         return BelievedModel(0, knowledge, Path(patch) if patch else None)
 
     def _keep_knowledge(self, sibling: "Watch | None") -> None:
-        """Write the knowledge of all models into the folder, where viewers find it.
+        """Write the knowledge of all models to the folder, for viewers.
 
-        If this watch and its sibling have adopted no patch, both have the same knowledge, and the
-        file of the sibling is linked instead.
+        If neither this watch nor its sibling has adopted a patch, the file of the sibling is
+        linked.
         """
         has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
         if sibling is not None and has_same_knowledge:
@@ -191,10 +185,7 @@ class Watch:
             save_knowledge(self.folder, model.knowledge, number)
 
     def update_from_journal(self) -> None:
-        """Read the state of teaching from the journal, and load the models adopted in it.
-
-        Models that are loaded already are kept.
-        """
+        """Read the state of teaching from the journal, and load adopted models that are missing."""
         check_header(self.journal_path, self._config_hash)
         notice = self.scenario.notice
         threshold = 1.0 if notice is None else notice.threshold  # without notices: of no effect
@@ -216,12 +207,10 @@ class Watch:
         patch: GivenPatch | None = None,
         unconfirmed: Decision | None = None,
     ) -> Counts:
-        """Watch until the feed ends, or until SIGINT or SIGTERM comes.
+        """Watch until the feed ends, or until SIGINT or SIGTERM.
 
         Parameters
         ----------
-        feed : Feed
-            The feed of the observations, to which the decisions are sent.
         decide : callable
             Called with each decision, once its step is in the journal.
         between_steps : callable, optional
@@ -231,12 +220,12 @@ class Watch:
         patch : GivenPatch, optional
             A patch to adopt before the first step.
         unconfirmed : dict, optional
-            The last decision, if a kill may have kept it from being sent; it is sent first.
+            The last decision, if a kill may have prevented its sending; it is sent first.
 
         Returns
         -------
         Counts
-            How many messages came, and what became of them.
+            How many messages were received, late or refused.
         """
 
         def send(decision: Decision) -> None:
@@ -257,14 +246,12 @@ class Watch:
 
     @contextmanager
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
-        """Open the journal, and restore the twin and the intake after its last line.
+        """Open the journal, and restore twin and intake after its last line.
 
-        This is a context manager. At its end the counts of the messages are written.
+        At the end of this context the counts of the messages are written.
 
         Parameters
         ----------
-        feed : Feed
-            The feed of the observations.
         patch : GivenPatch, optional
             A patch to adopt before the first step.
         """
@@ -291,9 +278,9 @@ class Watch:
             self._write_last_counts()
 
     def _write_last_counts(self) -> None:
-        """Write the counts of the messages that came after the last line into the journal.
+        """Write the counts of messages after the last line to the journal.
 
-        If the disk is full the counts are lost, but no observation is.
+        If the disk is full, the counts are lost, but no observation.
         """
         if self.intake.state()["counts"] == self._written_intake["counts"]:
             return
@@ -303,8 +290,8 @@ class Watch:
     def decisions(self) -> Iterator[JsonObject]:
         """Yield the decision of each step, once it is in the journal, until the feed ends.
 
-        If the messages after a step are refused, its decision is given again with a notice. If a
-        patched model is adopted between two steps, the loop goes on with the twin of this model.
+        If the messages after a step are refused, its decision is repeated with a notice. If a
+        patched model is adopted between two steps, the loop continues with the twin of this model.
         """
         while True:
             twin = self.twin

@@ -1,4 +1,4 @@
-"""Figures of watches for a monitoring system, served over HTTP in the text format of Prometheus."""
+"""Metrics of watches for a monitoring system, served over HTTP in Prometheus' text format."""
 
 import math
 import re
@@ -33,12 +33,10 @@ class Sample(NamedTuple):
         The name of the metric, without the prefix `uav_twin_`.
     meaning : str
         The meaning of the metric, with the unit.
-    value : float
-        The value.
     labels : dict of str to str
-        What distinguishes the value from other values of the metric.
+        Labels that distinguish the value from others of the metric.
     is_counter : bool
-        Whether the metric only rises while a process lives. Otherwise it is a gauge.
+        Whether the metric is a counter, which only rises while a process lives; else a gauge.
     """
 
     name: str
@@ -49,7 +47,7 @@ class Sample(NamedTuple):
 
 
 class WatchMetrics:
-    """The figures of a watch: its last decision, its notices, and the counts of its messages.
+    """The metrics of a watch: its last decision, its notices, and its message counts.
 
     Parameters
     ----------
@@ -68,7 +66,7 @@ class WatchMetrics:
         self._notice_counts = Counter({ALARM: 0})
 
     def note_decision(self, decision: Decision) -> None:
-        """Take a new decision, and count its notices."""
+        """Record a new decision, and count its notices."""
         self._decision = decision
         # A new counter, because another thread may be reading the present one
         new_kinds = Counter(notice["kind"] for notice in decision.get("notices", ()))
@@ -76,13 +74,13 @@ class WatchMetrics:
         self._notice_counts.setdefault(ALARM, 0)
 
     def samples(self) -> Iterator[Sample]:
-        """Yield all figures; none before the watch has begun to read messages."""
+        """Yield all metrics; none before the watch has begun to read messages."""
         if self.watch.has_begun:
             yield from self._decision_samples(self._decision)
             yield from self._message_samples()
 
     def _decision_samples(self, decision: Decision) -> Iterator[Sample]:
-        """Yield the figures of the last decision; none before the first one."""
+        """Yield the metrics of the last decision; none before the first one."""
         if "health" not in decision:
             return
         figures = {
@@ -254,7 +252,7 @@ class MetricsServer:
 
 @contextmanager
 def serve_metrics(address: str | int | None) -> Iterator[MetricsServer | None]:
-    """Serve the figures of watches within a context; None if no address is given.
+    """Serve the metrics of watches within a context; None if no address is given.
 
     Parameters
     ----------

@@ -26,27 +26,24 @@ MOST_WAITING = 200
 
 
 class Topic(Feed):
-    """The observations of one asset, which a session hands on, and its decisions.
+    """The observations of one asset, which a session passes on, and its decisions.
 
-    The size of the part of the journal whose decisions the broker has is on the disk, `published`.
-    After a kill the decisions after it are published again, so that each comes at least once.
+    The file `published` has the size of the part of the journal whose decisions the broker has
+    acknowledged. After a kill the later decisions are published again, so that each arrives at
+    least once.
 
     Parameters
     ----------
-    session : Session
-        The session at the broker.
     topic : str
         The topic of the observations.
-    scenario : Scenario
-        The scenario whose sensors the messages name.
     on_error : callable
-        Called with the error that keeps decisions from being published. They are then left until
-        the watch is taken up again.
+        Called with an error that prevents publishing. Decisions then wait until the watch is
+        resumed.
 
     Attributes
     ----------
     payloads : deque of bytes
-        The messages that the session has handed on.
+        The messages that the session has passed on.
     watch : Watch or None
         The watch of the asset; None before it is attached.
     """
@@ -75,7 +72,7 @@ class Topic(Feed):
         self._end_of_pause = 0.0  # on the monotonic clock [s]
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
-        """Yield the messages that the session has handed on, without end.
+        """Yield the messages that the session has passed on, without end.
 
         None is yielded while there is none. The position is not used: a broker cannot go back.
         """
@@ -103,7 +100,7 @@ class Topic(Feed):
     def attach(self, watch: Watch) -> None:
         """Attach a watch, whose decisions are published from now on.
 
-        Decisions in its journal that the broker has not acknowledged will be published again.
+        Decisions in its journal that the broker has not acknowledged are published again.
         """
         self.watch = watch
         self._path = watch.folder / PUBLISHED_NAME
@@ -119,10 +116,7 @@ class Topic(Feed):
 
     @contextmanager
     def _contained_errors(self) -> Iterator[None]:
-        """Let an error end the publication of the decisions of this asset, and nothing else.
-
-        The error is handed to `on_error`.
-        """
+        """Let an error stop the publishing of this asset's decisions; pass it to `on_error`."""
         try:
             yield
         except Exception as error:  # noqa: BLE001 - whatever it is
@@ -131,9 +125,9 @@ class Topic(Feed):
             self._on_error(error)
 
     def send_decision(self, decision: Decision) -> None:
-        """Publish all decisions in the journal that were not sent yet; the last is the given one.
+        """Publish all unsent decisions in the journal, of which the given one is the last.
 
-        The payload of the step is acknowledged, unless readings or messages of it still wait.
+        The payload of the step is acknowledged, unless readings or messages in it still wait.
         """
         has_unread = bool(self._unread_items)
         if self.watch is not None and not self.watch.intake.has_queued_readings and not has_unread:
@@ -142,7 +136,7 @@ class Topic(Feed):
         self.publish()
 
     def publish(self) -> None:
-        """Send the decisions in the journal that were not sent yet, up to the limit of the session.
+        """Send the unsent decisions in the journal, up to the limit of the session.
 
         A decision that was already sent over a former connection is marked with `told_again`.
         Nothing is sent during the pause after a refusal.
@@ -165,18 +159,18 @@ class Topic(Feed):
             self._session.publishers.pop(self, None)
 
     def note_answer(self, message_id: int, refusal: str | None) -> None:
-        """Note the answer of the broker to a decision.
+        """Record the broker's answer to a decision.
 
-        If the broker has taken the decision, the size of the acknowledged part of the journal is
-        written to the disk. If it refuses it, all decisions without an answer are sent again after
-        a pause; the operator is notified of the first refusal only.
+        If the broker has accepted it, the size of the acknowledged part of the journal is written
+        to the disk. If it refuses it, all decisions without an answer are sent again after a pause;
+        the operator is notified of the first refusal only.
 
         Parameters
         ----------
         message_id : int
             The number of the message with the decision.
         refusal : str or None
-            Why the broker refuses the decision; None if it has taken it.
+            Why the broker refuses the decision; None if it has accepted it.
         """
         if refusal is not None and message_id in self._line_of_message:
             is_first_refusal = self._end_of_pause == 0.0
@@ -200,7 +194,7 @@ class Topic(Feed):
         self._session.publishers[self] = None
 
     def end_pause(self) -> None:
-        """Send decisions again at once, even if the broker has refused one a moment ago."""
+        """Send decisions again at once, even if the broker has just refused one."""
         self._end_of_pause = 0.0
 
 
@@ -225,14 +219,12 @@ def _read_size(path: Path) -> int:
 
 
 class MqttFeed(Topic):
-    """The topic of one asset, with its own session at the broker; see `Session` for the errors.
+    """The topic of one asset, with its own session at the broker; see `Session` for errors.
 
     Parameters
     ----------
-    broker : Broker
-        The broker and the topic.
     watch : Watch
-        The watch of the asset; one that was begun before goes on with what the broker has kept.
+        The watch of the asset; a resumed one continues with what the broker has kept.
     note : callable
         Called with a sentence when the connection is lost or made.
     scenario : Scenario, optional
@@ -267,7 +259,7 @@ class MqttFeed(Topic):
 
     @property
     def waiting_messages(self) -> int:
-        """The number of messages that the broker has sent and that are not read yet."""
+        """The number of messages that have come from the broker and are not read yet."""
         return len(self._session.unread)
 
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
@@ -284,5 +276,5 @@ class MqttFeed(Topic):
 
 
 def _raise_error(error: Exception) -> None:
-    """Raise an error that keeps decisions from being published, so that the watch ends."""
+    """Raise an error that prevents publishing, so that the watch ends."""
     raise error

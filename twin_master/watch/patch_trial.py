@@ -1,7 +1,7 @@
-"""A patch of the model that a watch believes: the patched model, and its trial against the old.
+"""A patched model that a watch believes, and the comparison of its evidence with the old model.
 
-The outcome of a trial follows from the journal up to one of its lines. So it can be computed
-beside the watch, which goes on meanwhile.
+The outcome depends on the journal up to one of its lines. So it can be computed beside the watch,
+which continues meanwhile.
 """
 
 import json
@@ -38,8 +38,6 @@ class ComparedSteps:
     ----------
     first : int
         The first of these steps.
-    count : int
-        The number of these steps.
     """
 
     first: int
@@ -57,7 +55,7 @@ class PatchOutcome:
     Attributes
     ----------
     patch : bytes
-        The content of the patch file, together with the patch that was believed before.
+        The content of the patch file, combined with the patch that was believed before.
     model : BelievedModel
         The patched model.
     gained_evidence : float
@@ -81,13 +79,9 @@ def patched_model(
     Parameters
     ----------
     scenario : Scenario
-        The scenario of the watch, whose belief is a design.
-    patch : Path
-        The file of the patch.
+        The scenario, whose belief is a design.
     from_step : int
         The first step that is filtered with the patched model.
-    progress : Progress, optional
-        Shows the stages of building the model.
 
     Raises
     ------
@@ -113,28 +107,20 @@ def outcome_of_patch(
     compared: ComparedSteps = NO_STEPS,
     progress: Progress | None = None,
 ) -> PatchOutcome:
-    """Return the changes that a patch would make in the steps of a watch.
+    """Return what a patch would change in the steps of a watch.
 
     The steps from `from_step` on are filtered twice, without and with the patch.
 
     Parameters
     ----------
-    journal : Path
-        The journal of the watch.
     end : int
-        The number of bytes of the journal that are read.
-    scenario : Scenario
-        The scenario of the watch.
+        The number of bytes of the journal to read.
     models : sequence of BelievedModel
         The models that were believed so far.
     patch : bytes
-        The content of the patch file, together with the patch that is believed already.
+        The content of the patch file, combined with the patch that is believed already.
     from_step : int
         The first step that is filtered with the patched model.
-    compared : ComparedSteps
-        The steps whose evidence is compared.
-    progress : Progress, optional
-        Shows the stages of building the model.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a watch writes into its journal as JSON: verdicts and models."""
+"""Verdicts and models as a watch writes them to its journal, in JSON."""
 
 from typing import NotRequired, TypedDict
 
@@ -17,7 +17,7 @@ class VerdictRecord(TypedDict):
     from_step, to_step : int
         The first and the last step that were searched.
     tried : bool
-        Whether the patch of the verdict is tried beside the model.
+        Whether the patch of the verdict is tested beside the model.
     kind : str
         The kind of the verdict, such as "named".
     folder : str

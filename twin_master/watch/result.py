@@ -28,10 +28,8 @@ def store_watch(
 
     Parameters
     ----------
-    watch : Watch
-        The watch, which has ended.
     counts : Counts
-        How many messages came, and what became of them.
+        How many messages were received, late or refused.
     last : int
         The number of last steps that are stored.
     report : bool
@@ -66,17 +64,7 @@ def store_watch(
 
 
 def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
-    """Return the last steps of a watch, smoothed, as the result of a mission.
-
-    Parameters
-    ----------
-    watch : Watch
-        The watch.
-    step_count : int
-        The number of its steps.
-    last : int
-        The number of last steps that are returned.
-    """
+    """Return the last steps of a watch, smoothed, as the result of a mission."""
     first = max(0, step_count - last)
     # The replay begins at a snapshot at or before the first step: earlier steps are removed
     history, _ = replay(watch.journal_path, watch.models, None, first_step=first)
@@ -93,11 +81,8 @@ def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
 
     Parameters
     ----------
-    watch : Watch
-        The watch.
     first_step : int
-        The first step whose notices are returned. The first alarm of the watch is returned in any
-        case.
+        The first alarm of the watch is returned even if it lies before this step.
     """
     records: list[tuple[int, JsonObject]] = []
     first_alarm = watch.teaching.first_alarm
@@ -114,7 +99,7 @@ def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
 
 
 def _lines_since(watch: Watch, first_step: int) -> Sequence[JournalLine]:
-    """Return the lines of the journal from a step on, in their order."""
+    """Return the lines of the journal from a step on, in order."""
     backwards = (line for line, _, _ in records_backwards(watch.journal_path))
     lines = list(takewhile(lambda line: _step_of(line) >= first_step, backwards))
     return lines[::-1]

@@ -1,7 +1,7 @@
 """The state of teaching in a watch: when to search for a cause, and which patch is on trial.
 
-This state is a pure function of the journal. So a watch that was killed and taken up again
-searches, tries and adopts the same.
+This state depends on the journal only. So a watch that was killed and resumed searches, tests and
+adopts in the same way.
 """
 
 import math
@@ -43,7 +43,7 @@ _KEYS = {
 
 
 def check_teachable(scenario: Scenario) -> None:
-    """Refuse a scenario if no search could find the cause of its alarms.
+    """Raise an error if no search could find the cause of a scenario's alarms.
 
     Raises
     ------
@@ -72,21 +72,21 @@ def _no_wing_error(reason: str) -> MissionInputError:
 
 @dataclass
 class Teaching:
-    """The state of teaching after some lines of the journal of a watch.
+    """The state of teaching after some lines of a watch's journal.
 
     Parameters
     ----------
     threshold : float
-        The evidence from which on an alarm holds.
+        The evidence above which an alarm holds.
 
     Attributes
     ----------
     step : int
         The last step; -1 before the first one.
     steps_to_search : (int, int) or None
-        The first and the last step in which the cause of an alarm is to be looked for.
+        The first and the last step of the data for a search for the cause of an alarm.
     verdict_on_trial : VerdictRecord or None
-        The verdict whose patch is tried beside the model.
+        The verdict whose patch is tested beside the model.
     pending_notices : list of dict
         The notices that are given with the next step.
     adopted_models : list of ModelRecord
@@ -94,7 +94,7 @@ class Teaching:
     first_alarm : (int, dict) or None
         The step of the first alarm, and its notice.
     is_alarm_of_many : bool
-        Whether the gauges together explain the alarm that is searched, and no single gauge does.
+        Whether several gauges explain the alarm clearly better than any single one.
     """
 
     threshold: float
@@ -115,7 +115,7 @@ class Teaching:
         return self._current_alarm is not None
 
     def as_record(self) -> JsonObject:
-        """Return the state by the keys of a journal."""
+        """Return the state with the keys of a journal."""
         return {key: getattr(self, attribute) for attribute, key in _KEYS.items()}
 
     def _restore(self, record: Mapping[str, object]) -> None:
@@ -129,8 +129,8 @@ class Teaching:
 
         Some lines contain the state before them, under `standing`. So the state is restored from
         the last of these lines, and then updated with this line and those after it. The lines in
-        the last `CHECKED_BYTES` bytes are read in any case, to check that each begins at the byte
-        at which it was written.
+        the last `CHECKED_BYTES` bytes are always read, to check that each begins at the byte at
+        which it was written.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class Teaching:
     def _take_step(self, line: JournalLine) -> None:
         """Update the state with a step.
 
-        The notices that were pending were given with this step; only further alarms count as new.
+        Pending notices were given with this step; only further alarms count as new.
         """
         self.step = int(line["step"])
         pending_sentences = {notice["sentence"] for notice in self.pending_notices}
@@ -196,10 +196,7 @@ class Teaching:
         self._request_search_if_due(line.get("suspicion", {}))
 
     def _note_alarms(self, notices: Sequence[JsonObject]) -> None:
-        """Note the alarms among notices.
-
-        Each alarm puts the search for its cause off by `SETTLE_STEPS` steps.
-        """
+        """Record the alarms among notices; each delays the search by `SETTLE_STEPS` steps."""
         for notice in notices:
             if notice["kind"] == "alarm":
                 self._current_alarm = (self.step, int(notice.get("since") or 0))
@@ -210,13 +207,9 @@ class Teaching:
         """Request a search for the cause of the alarm, if one is due.
 
         It is due if the alarm came at least `SETTLE_STEPS` steps ago, its evidence still exceeds
-        the threshold, and neither another search nor the trial of a patch goes on.
-
-        Parameters
-        ----------
-        suspicion : mapping of str to float
-            The log evidence [nats] after the last step for two hypotheses: no state of the model
-            explains the readings; a single gauge is off.
+        the threshold, and neither another search nor the trial of a patch is running. `suspicion`
+        has the log evidence [nats] of two hypotheses: no state of the model explains the readings;
+        a single gauge is off.
         """
         is_busy = self.steps_to_search is not None or self.verdict_on_trial is not None
         if self._current_alarm is None or is_busy or self.step < self._next_search_step:

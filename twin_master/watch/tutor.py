@@ -1,8 +1,4 @@
-"""The tutor of a watch: between two steps it searches for a cause, tries a patch and adopts it.
-
-The search runs in a process of its own (`CauseSearch`). Its verdict is a line of the journal
-after the step during which it came.
-"""
+"""The tutor of a watch: between two steps it searches for a cause, and tests and adopts patches."""
 
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,18 +16,15 @@ POLL_SECONDS = 0.05
 
 
 class Tutor:
-    """Searches for causes, tries patches and adopts them between two steps of a watch.
+    """Searches for causes, tests patches and adopts them between two steps of a watch.
 
     Parameters
     ----------
-    watch : Watch
-        The watch that is taught.
     cause_search : CauseSearch
         Starts the searches.
     wait : bool
-        Whether the next step waits for the verdict and for the patched model, as the steps of a
-        recording do. A live watch goes on beside the search and beside a thread that builds the
-        model.
+        Whether the next step waits for the verdict and for the patched model, as in a recording. A
+        live watch continues beside the search and beside a thread that builds the model.
 
     Attributes
     ----------
@@ -102,10 +95,10 @@ class Tutor:
         return True
 
     def _judge(self, verdict: VerdictRecord) -> None:
-        """Adopt the patch of a verdict at the end of its trial, or write down why not.
+        """Adopt the patch of a verdict at the end of its trial, or record why not.
 
         The outcome of the trial is computed in a thread, which the first call starts. If the watch
-        does not wait for it, nothing else is done until a later call finds it computed.
+        does not wait for it, a later call finds it.
         """
         if self.outcome is None:
             self.outcome = self._begin_trial(verdict)
@@ -134,7 +127,7 @@ class Tutor:
         return outcome
 
     def _reject(self, verdict: VerdictRecord, sentence: str) -> None:
-        """Write into the journal that the patch of a verdict is not adopted, and why."""
+        """Record in the journal that the patch of a verdict is not adopted, and why."""
         rejected: VerdictRecord = {
             **verdict,
             "tried": False,

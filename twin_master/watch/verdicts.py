@@ -1,4 +1,4 @@
-"""Verdicts of searches for the cause of an alarm: which patch is tried, and which is adopted."""
+"""Verdicts of searches for the cause of an alarm: which patch is tested, and which adopted."""
 
 from pathlib import Path
 
@@ -150,9 +150,9 @@ def command_to_believe(folder: str, first_step: int) -> str:
 def is_adopted(verdict: VerdictRecord, outcome: PatchOutcome) -> bool:
     """Return whether a patch is adopted after its trial.
 
-    It is if it gained at least `LEAST_GAIN` of log evidence, unless many gauges raised the alarm.
-    In that case the search names the effect of its catalogue that comes closest, and any effect
-    that moves all gauges gains evidence over a model that explains none of them.
+    It is adopted if it gained at least `LEAST_GAIN` of log evidence, unless many gauges raised the
+    alarm. In that case the search names the closest effect of its catalogue, and any effect that
+    moves all gauges gains evidence over a model that explains none of them.
     """
     has_gained = outcome.gained_evidence >= LEAST_GAIN
     return has_gained and not verdict.get("of_many", False)

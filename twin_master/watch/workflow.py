@@ -1,4 +1,4 @@
-"""A watch from its observations to its report, begun or resumed, and its run up to a step."""
+"""A watch from its observations to its report, new or resumed, and its run up to a step."""
 
 from __future__ import annotations
 
@@ -57,24 +57,20 @@ def begin_watch(
     sibling: Watch | None = None,
     fleet_is_locked: bool = False,
 ) -> Iterator[Watch]:
-    """Create the folder of a new watch, and give the watch while its folder is locked.
+    """Create the folder of a new watch, and provide the watch while its folder is locked.
 
     Parameters
     ----------
-    resolved_scenario : Scenario
-        The scenario, resolved.
     file : mapping of str to str
-        The name and the hash of the file of the scenario.
+        Name and hash of the scenario file.
     folder : Path
         The folder to make.
-    progress : Progress
-        Shows stages and notes.
     replace_run : bool
-        Whether to take the place of an existing folder.
+        Whether to replace an existing folder.
     sibling : Watch, optional
-        A watch of the same scenario, whose model and plan this one shares.
+        A watch of the same scenario, with which model and plan are shared.
     fleet_is_locked : bool
-        Whether the folder belongs to a fleet whose folder this process has locked; see
+        Whether the folder belongs to a fleet that this process has locked; see
         `run_folder.create_run_folder`.
 
     Raises
@@ -101,11 +97,11 @@ def begin_watch(
 
 
 def _client_files_to_discard(folder: Path) -> dict[str, bytes]:
-    """Return files for a new folder that let the watch end the session of a former one at a broker.
+    """Return files by which a new watch ends the session of the replaced one at a broker.
 
-    They are the files of client names in the folder that is replaced, each with a second line that
-    asks for the end of the session. The client name is kept, because a broker ends a session only
-    if a client of the same name asks for it.
+    They are the files of client names, each with a second line that asks for the end of the
+    session. The client name is kept, because a broker ends a session only for a client of the same
+    name.
     """
     files = {}
     for path in folder.glob(f"*{CLIENT_SUFFIX}"):
@@ -123,20 +119,16 @@ def resume_watch(
     *,
     fleet_is_locked: bool = False,
 ) -> Iterator[Watch]:
-    """Give the watch in an existing folder while the folder is locked.
+    """Provide the watch in an existing folder while the folder is locked.
 
     Parameters
     ----------
-    folder : Path
-        The folder of the watch.
     loaded_scenario : LoadedScenario or None
-        The scenario that the user expects in the folder; None takes any.
-    progress : Progress
-        Shows stages and notes.
+        The scenario that the folder must have; None accepts any.
     sibling : Watch, optional
-        A watch of the same scenario, whose model and plan this one shares.
+        A watch of the same scenario, with which model and plan are shared.
     fleet_is_locked : bool
-        Whether the folder belongs to a fleet whose folder this process has locked; see
+        Whether the folder belongs to a fleet that this process has locked; see
         `run_folder.create_run_folder`.
 
     Raises
@@ -166,7 +158,7 @@ def resume_watch(
 def copy_of_run_until(
     folder: Path, first: int | None, last: int | None, progress: Progress
 ) -> Iterator[Path]:
-    """Give a run folder with results up to a step.
+    """Provide a run folder with results up to a step.
 
     The folder of a run is given as it is. A watch may still go on and may have no results yet: a
     temporary copy of its folder is given instead, with the journal up to the last step and the
@@ -175,11 +167,9 @@ def copy_of_run_until(
     Parameters
     ----------
     folder : Path
-        The folder of a run, which is given as it is, or of a watch, which is only read.
+        The folder of a run or a watch, which is only read.
     first, last : int or None
-        The first and the last step that are wanted; None for the ends of the journal.
-    progress : Progress
-        Shows the stages of storing the copy.
+        The first and the last step; None for the ends of the journal.
 
     Raises
     ------
@@ -253,7 +243,7 @@ def is_stored(folder: Path) -> bool:
 
 
 def _watch_config(folder: Path) -> JsonObject | None:
-    """Return the configuration of a watch; None if the folder holds something else."""
+    """Return the configuration of a watch; None if the folder has something else."""
     config = run_folder.find_config(folder)
     return config if config is not None and config.get("watched") else None
 
@@ -406,7 +396,7 @@ def _also_for_monitoring(
     line_protocol: Path | str | None,
     watched: Watch,
 ) -> DecisionSink:
-    """Return a function that also serves each decision as metrics, and appends it to a file."""
+    """Return a sink that also serves each decision as metrics, and appends it to a file."""
     name = watched.scenario.mission.name
     sinks = [decide]
     if server is not None:
@@ -459,14 +449,14 @@ def _scenario_for_reading(
 
 
 def _check_teaching(scenario: Scenario, cause_search: CauseSearch | None) -> None:
-    """Refuse `teach` if no search is given, or if none can find causes in this scenario."""
+    """Raise an error if no search is given, or if none can find causes in this scenario."""
     check_teachable(scenario)
     if cause_search is None:
         raise MissionInputError("`teach` needs a `cause_search`, as `uav_twin.watch` has it.")
 
 
 def _check_recording_is_kept(feed: Feed | Broker, folder: Path) -> None:
-    """Refuse to replace a folder that contains the observations to be read."""
+    """Raise an error if the folder to be replaced contains the observations to be read."""
     if isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
         raise MissionInputError(
             f"--replace would remove the observations in {feed.path} before they are read: choose "
@@ -483,7 +473,7 @@ def _open_watch(
     resume: bool,
     replace: bool,
 ) -> AbstractContextManager[Watch]:
-    """Return a context manager that gives the new or resumed watch while its folder is locked."""
+    """Return a context manager that provides the new or resumed watch in its locked folder."""
     if resume and (replace or overrides != Overrides()):
         raise MissionInputError(
             "a watch is resumed with the inputs in its folder: leave out options that would change "
@@ -511,7 +501,7 @@ def _run(
 ) -> Counts:
     """Run a watch until its feed ends, and return the counts of its messages.
 
-    If a search for causes is given, a tutor searches, tries and adopts between the steps.
+    If a search for causes is given, a tutor searches, tests and adopts between the steps.
     """
     # If the earlier process was killed, its last decision may not have been sent
     unconfirmed = None if is_stored(watched.folder) else watched.last_decision()
@@ -532,7 +522,7 @@ def _run(
 
 
 def _advice_after_error(watched: Watch) -> str:
-    """Return a sentence that says how to go on after an error has ended a watch."""
+    """Return a sentence that says how to continue after an error has ended a watch."""
     has_steps = watched.teaching.step >= 0
     if has_steps:
         return (

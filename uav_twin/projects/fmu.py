@@ -48,7 +48,7 @@ _NOISE = 0.05
 
 @dataclass(frozen=True)
 class FmuDraft:
-    """What is guessed of an FMU.
+    """What is guessed about an FMU.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class FmuDraft:
     levels : dict of str to list of float
         The levels of each damage.
     parameter : str
-        The parameter that is not known exactly.
+        A parameter that is taken as uncertain.
     value : float
         Its start value.
     """
@@ -72,7 +72,7 @@ class FmuDraft:
 
 
 def draft_fmu(description: FmuDescription) -> FmuDraft:
-    """Return roles and values of the variables of an FMU, guessed from names, units and ranges.
+    """Guess roles and values of an FMU's variables from names, units and ranges.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def draft_fmu(description: FmuDescription) -> FmuDraft:
 
 
 def _probe(fmu_file: Path, binding_file: Path, draft: FmuDraft) -> FloatArray:
-    """Return what the sensors show under each control at each level of all damages: (U, L, G)."""
+    """Return the readings (U, L, G) under each control at each level of all damages."""
     readings = []
     for inputs in draft.controls.values():
         readings_of_levels = []
@@ -137,7 +137,7 @@ def _probe(fmu_file: Path, binding_file: Path, draft: FmuDraft) -> FloatArray:
 
 
 def _binding_text(draft: FmuDraft, fmu_name: str) -> str:
-    """Return the file of a binding, with one observation of all sensors."""
+    """Return the text of the binding file, with one observation of all sensors."""
     variables: list[str] = []
     units: list[str] = []
     for entry in draft.binding.observation.values():
@@ -155,7 +155,7 @@ def _binding_text(draft: FmuDraft, fmu_name: str) -> str:
 
 
 def _mission_text(name: str, fmu_name: str, draft: FmuDraft, readings: FloatArray) -> str:
-    """Return the mission of an FMU, given what its sensors show, see `_probe`."""
+    """Return the text of an FMU's mission, given its readings, see `_probe`."""
     controls = []
     for control, inputs in draft.controls.items():
         pairs = ", ".join(f"{key} = {value:g}" for key, value in inputs.items())
@@ -192,7 +192,7 @@ def _mission_text(name: str, fmu_name: str, draft: FmuDraft, readings: FloatArra
 
 
 def _state(damage: str, levels: list[float]) -> dict[str, object]:
-    """Return the levels of a damage."""
+    """Return the table of a damage with its levels."""
     return {
         "name": damage,
         "title": damage.replace("_", " "),
@@ -203,9 +203,9 @@ def _state(damage: str, levels: list[float]) -> dict[str, object]:
 
 
 def _sensors(draft: FmuDraft, readings: FloatArray) -> dict[str, object]:
-    """Return titles, noise and limit of the sensors, and the weight of the control beside it.
+    """Return titles, noise and limit of the sensors, and the weight of the control's reward.
 
-    The sensor that rises most with the damage, relative to its value, has the limit.
+    The limit is that of the sensor that rises most with the damage, relative to its value.
     """
     hard_readings = readings[-1]
     healthy = hard_readings[0]
@@ -245,7 +245,7 @@ def _inline(values: Mapping[str, float]) -> str:
 
 
 def fmu_project(name: str, fmu_file: Path | None) -> Project:
-    """Return the project of an FMU; of the shipped gear pump if None."""
+    """Return the project of an FMU, by default of the shipped gear pump."""
     with TemporaryDirectory(prefix="uav_twin_") as temporary_folder:
         folder = Path(temporary_folder)
         if fmu_file is None:

@@ -55,22 +55,20 @@ _USUAL_STRAIN = 100e-6
 
 @dataclass(frozen=True)
 class PartDraft:
-    """What is guessed of a part from its mesh alone.
+    """What is guessed about a part from its mesh alone.
 
     Attributes
     ----------
     unit : str
         The unit of length of the mesh.
     axis : int
-        The axis along which the part is longest.
+        The axis of the largest extent.
     across : int
-        The axis along which it is shortest, and along which it is pulled.
+        The axis of the smallest extent, along which the part is pulled.
     root, tip : (2, 3) array
-        Corners of the boxes of nodes that are held, and that are pulled, in `unit`.
+        Corners of the boxes of nodes that are held (root) and pulled (tip), in `unit`.
     regions : list of (2, 3) array
         Corners of the box of cells of each region of `_REGIONS`, in `unit`.
-    rosettes : list of Rosette
-        Where the gauges are.
     """
 
     unit: str
@@ -83,7 +81,7 @@ class PartDraft:
 
 
 def draft_part(mesh: StructureMesh) -> PartDraft:
-    """Return support, regions and gauges of a part, by its extent alone."""
+    """Choose support, regions and gauges of a part by its extent alone."""
     points = mesh.points / mesh.unit
     low = points.min(axis=0)
     high = points.max(axis=0)
@@ -123,13 +121,13 @@ def draft_part(mesh: StructureMesh) -> PartDraft:
 
 
 def _unit_of(mesh_file: Path) -> str:
-    """Return the unit of length of a mesh: "mm" if its coordinates are large, else "m"."""
+    """Return the length unit of a mesh: "mm" if its coordinates are large, else "m"."""
     mesh = read_mesh(mesh_file, 1.0, "units of the file")
     return "mm" if np.ptp(mesh.points, axis=0).max() > _LARGE_IN_METRES else "m"
 
 
 def structure_text(name: str, mesh_name: str, draft: PartDraft, force: float) -> str:
-    """Return the file of a structure that is drafted from a mesh, with a force [N] at its tip."""
+    """Return the text of a structure file for a mesh, with a force [N] at the tip."""
     direction = np.zeros(3)
     direction[draft.across] = -force
     regions = []
@@ -160,22 +158,18 @@ def structure_text(name: str, mesh_name: str, draft: PartDraft, force: float) ->
 
 
 def _vectors(values: FloatArray) -> str:
-    """Return one or several vectors as TOML, with six digits of the largest component."""
+    """Return vectors as TOML, with six digits of the largest component."""
     digits = 6 - int(np.ceil(np.log10(np.abs(values).max())))
     return str((np.round(values, digits) + 0.0).tolist())
 
 
 def mission_text(name: str, structure_file: Path, *, watched: bool = False) -> str:
-    """Return a mission of a structure whose file is complete.
+    """Return the text of a mission for a complete structure file.
 
-    The noise and the limit follow from the strains under the heavy load.
+    Noise and limit follow from the strains under the heavy load.
 
     Parameters
     ----------
-    name : str
-        The name of the mission.
-    structure_file : Path
-        The structure.
     watched : bool
         Whether a real asset is watched instead of a simulated flight.
     """
@@ -215,7 +209,7 @@ def mission_text(name: str, structure_file: Path, *, watched: bool = False) -> s
 
 
 def _state(region: str) -> dict[str, object]:
-    """Return the levels of the stiffness loss of a region."""
+    """Return the table of a region with its levels of stiffness loss."""
     return {
         "name": region,
         "title": f"stiffness loss {region}",
@@ -226,10 +220,9 @@ def _state(region: str) -> dict[str, object]:
 
 
 def _sensors(structure: AffineStructure) -> dict[str, object]:
-    """Return titles, noise and limit of the gauges, by the strains under the heavy load.
+    """Return titles, noise and limit of the gauges, from the strains under the heavy load.
 
-    The limit is such that the light control is the better one from a loss of 60 % of the first
-    region on.
+    The limit makes the light control the better one from a loss of 60 % of the first region on.
     """
     design = structure.design
     noise = rounded_to(0.05e6 * HEAVY * _largest_strain(structure))
@@ -250,20 +243,20 @@ def _sensors(structure: AffineStructure) -> dict[str, object]:
 
 
 def _largest_strain(structure: AffineStructure) -> float:
-    """Return the largest strain of a gauge under each load alone, at nominal values."""
+    """Return the largest gauge strain under any load alone, at nominal values."""
     responses = static_responses(structure).values()
     return max(float(np.abs(response.strain).max()) for response in responses)
 
 
 class _DraftedPart(NamedTuple):
-    """The files of a part that is drafted from a mesh, without its mission."""
+    """The mesh and the structure file of a drafted part."""
 
     mesh_file: Path
     structure: str
 
 
 def drafted_part(name: str, mesh_file: Path | None) -> _DraftedPart:
-    """Return the part of a mesh, or of that of the shipped bracket, with a force of usual size."""
+    """Draft the part of a mesh, by default the shipped bracket, with a force of usual size."""
     if mesh_file is None:
         mesh_file = structure_files()["bracket"].with_suffix(".inp")
     unit = _unit_of(mesh_file)
@@ -278,7 +271,7 @@ def drafted_part(name: str, mesh_file: Path | None) -> _DraftedPart:
 
 
 def mesh_project(name: str, mesh_file: Path | None) -> Project:
-    """Return the project of a part from a mesh; from that of the shipped bracket if None."""
+    """Return the project of a part from a mesh, by default that of the shipped bracket."""
     part = drafted_part(name, mesh_file)
     mesh_name = part.mesh_file.name
     with TemporaryDirectory(prefix="uav_twin_") as folder:

@@ -80,21 +80,19 @@ def _templates() -> Environment:
 
 
 def filled_in(template: str, /, *, schema: str | None = None, **values: object) -> str:
-    """Return a template with values filled in.
+    """Return the text of a template with values filled in.
 
     Parameters
     ----------
     template : str
         The name of a file in `templates`, without `.jinja`.
     schema : str, optional
-        The format of the file, whose JSON Schema its first line names to editors.
-    **values : object
-        The values that the template uses.
+        The file format whose JSON Schema the first line names for editors.
     """
     text = _templates().get_template(f"{template}.jinja").render(**values)
     return text if schema is None else schema_line(schema) + text
 
 
 def rounded_to(value: float, digits: int = 2) -> float:
-    """Return a number with a few significant digits, for a file that people read."""
+    """Return a number with a few significant digits, for a file that is read by people."""
     return float(f"{value:.{digits}g}")

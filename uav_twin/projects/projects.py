@@ -17,5 +17,5 @@ _PROJECTS = {
 
 
 def make_project(kind: str, name: str, file: Path | None) -> Project:
-    """Return a project of a kind, with a file of the user in it if one is given."""
+    """Return a project of a kind, with the user's file in it if one is given."""
     return _PROJECTS[kind](name, file)

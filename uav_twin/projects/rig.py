@@ -66,14 +66,12 @@ _MEANINGS = {
 
 
 def rig_project(name: str, ring_down: Path | None) -> Project:
-    """Return the project of a rig: of a ring-down as CSV, or of a simulated mass with friction.
+    """Return the project of a rig, from a ring-down or from a simulated mass with friction.
 
     Parameters
     ----------
-    name : str
-        The name of the rig.
     ring_down : Path or None
-        A table whose first column is the time and whose second one is a displacement.
+        A CSV file whose first column is time and whose second one is a displacement.
 
     Raises
     ------
@@ -138,7 +136,7 @@ def rig_project(name: str, ring_down: Path | None) -> Project:
 
 
 def _with_comments(campaign: str) -> str:
-    """Return the text of a campaign with its schema, and each key explained at its first place."""
+    """Return the text of a campaign with a schema line, and a comment at each key's first place."""
     lines = [
         schema_line("campaign").rstrip("\n"),
         "# What was measured, and how. Further records stand beside this file, each a [[trial]].",
@@ -175,7 +173,7 @@ def _write_simulated_campaign(model_file: Path, folder: Path) -> None:
 
 
 def _frequency_of(ring_down: Path) -> float:
-    """Return the frequency [Hz] of the largest peak in the spectrum of the second column."""
+    """Return the frequency [Hz] of the largest spectral peak of the second column."""
     sheet = read_sheets(ring_down)[0]
     time, displacement = (np.array(sheet.columns[column], dtype=np.float64) for column in (0, 1))
     spectrum = np.abs(np.fft.rfft(displacement - displacement.mean()))

@@ -29,10 +29,10 @@ _PAUSE = 8 * 3600.0
 
 
 def stream_project(name: str, structure_file: Path | None) -> Project:
-    """Return the project of a part that is watched: of a structure file, or of the bracket.
+    """Return the project of a part that is watched, by default of the shipped bracket.
 
-    The readings are simulated. From step `_STUCK_FROM` on the gauge with the largest strain is
-    stuck, and after step `_PAUSE_AFTER` no reading comes for hours.
+    The readings are simulated: from step `_STUCK_FROM` on the gauge with the largest strain is
+    stuck, and after step `_PAUSE_AFTER` there is a pause of hours.
     """
     with TemporaryDirectory(prefix="uav_twin_") as temporary_folder:
         folder = Path(temporary_folder)
@@ -93,7 +93,7 @@ def stream_project(name: str, structure_file: Path | None) -> Project:
 
 
 def _simulated_stream(scenario_file: Path, folder: Path) -> str:
-    """Fly a mission, and return its readings as the table of a logger."""
+    """Simulate a mission, and return its readings as the table of a logger."""
     fly(scenario_file, folder, {"in_process": True}, report=False)
     run = open_run(folder)
     readings = 1e6 * np.asarray(run["observed/strain"].values)

@@ -42,7 +42,7 @@ def reason_transitions_are_fixed(scenario: Scenario) -> str:
 
 
 class _Cause(NamedTuple):
-    """The control and the state factor for which a probability to worsen holds.
+    """The control, and the factor of the state, for which a probability of worsening holds.
 
     The factor is empty if the control has one probability for all factors.
     """
@@ -80,7 +80,7 @@ def _predecessors(scenario: Scenario) -> PredecessorLists:
 
 @dataclass(frozen=True)
 class TransitionFamily:
-    """The transition probabilities of a scenario as a function of K probabilities to worsen.
+    """The transition probabilities of a scenario as a function of K probabilities of worsening.
 
     A probability to worsen is the probability that a factor of the state moves to its next level in
     a step. Each entry of the lists of predecessors is a linear function of one of them. K is 0 if
@@ -187,7 +187,7 @@ def _predecessors_at(scenario: Scenario, probability: float) -> PredecessorLists
 
 
 def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: PredecessorLists) -> Index:
-    """Return the number of the cause on whose probability each entry of the lists depends.
+    """Return the index of the cause on whose probability each entry of the lists depends.
 
     The result is a (non-zeros,) array. Rows of the lists are ordered by factor, then by control,
     then by level.
@@ -226,12 +226,10 @@ def scaled(log_likelihood: Float) -> tuple[Float, Float]:
 def transition_evidence(
     family: TransitionFamily, points: Float, log_likelihood: Float, control: Index
 ) -> Float:
-    """Return the log evidence of B twins for P values of the probabilities to worsen.
+    """Return the log evidence of B twins for P values of the probabilities of worsening.
 
     Parameters
     ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
     points : (P, K) array
         The probabilities, between 0 and 1.
     log_likelihood : (B, T, S) array
@@ -252,14 +250,12 @@ def transition_evidence(
 
 
 def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
-    """Return the grid of K axes of probabilities to worsen, with the transitions at its points.
+    """Return the grid of K axes of probabilities of worsening, with the transitions at its points.
 
     Parameters
     ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
     axes : tuple of (N,) array
-        The values of each probability.
+        The values of each of the K probabilities.
     """
     first = [0]
     strides = []
@@ -288,15 +284,13 @@ def sub_grids(family: TransitionFamily, axes: Axes) -> SubGrids:
 
 
 def grid_evidence(family: TransitionFamily, axes: Axes, likelihood: Float, control: Index) -> Float:
-    """Return the log evidence of B twins on a tensor grid of the probabilities to worsen.
+    """Return the log evidence of B twins on a tensor grid of the probabilities of worsening.
 
     It is that of `transition_evidence` at the points of the grid, to rounding, but for a constant
     of each twin: the `log_scale` of its likelihood.
 
     Parameters
     ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
     axes : tuple of (N,) array
         The values of each probability, between 0 and 1.
     likelihood : (B, T, S) array

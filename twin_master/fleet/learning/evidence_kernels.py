@@ -80,7 +80,7 @@ def _apply_block_backward(
     source: Float,
     target: Float,
 ) -> None:
-    """Fill `target` (S, L) with `source` (S, L) carried back through one block: its transpose."""
+    """Fill `target` (S, L) with `source` (S, L) multiplied by the transpose of a block."""
     levels, first_row, start, predecessor, _, _ = lists
     level_count = levels[block]
     inner_count = np.uint64(len(source) // level_count)
@@ -101,7 +101,7 @@ def _apply_block_backward(
 
 
 class SubGrids(NamedTuple):
-    """The points of a tensor grid of K axes, and of its projections on every set of axes.
+    """The points of a tensor grid of K axes, and of its projections on all sets of axes.
 
     A set of axes is a number whose bit k says whether it has axis k; there are 2^K sets. The points
     of a projection are lanes, the last axis varies fastest, and the last point is repeated until
@@ -114,7 +114,7 @@ class SubGrids(NamedTuple):
     first : (2^K + 1,) array
         The first lane of each set among the lanes of all sets.
     stride : (2^K, K) array
-        By how many lanes of a set its next value of an axis is away; 0 if the set lacks the axis.
+        The distance, in lanes of a set, between two values of an axis; 0 if the set lacks the axis.
     index_on_axis : (lanes of all sets, K) array
         The index on each axis of each lane; 0 on axes that its set lacks.
     entries : (non-zeros, lanes of all sets) array
@@ -153,8 +153,8 @@ def _spread_lanes(
 def _cheapest_meeting(grids: SubGrids, control: Index, backward_lanes: Index) -> int:
     """Return the step at which a forward and a backward pass meet with the least work.
 
-    Each pass has a lane for each point of the axes on which its own transitions depend. A fleet
-    whose twins change from one control to another once has two passes with one axis each, where a
+    Each pass has a lane for each point of the axes on which its own transitions depend. If the
+    twins of a fleet change once from one control to another, two passes have one axis each, where a
     forward pass alone would have two axes after the change. `backward_lanes` (T,) is work space.
     """
     steps = len(control)
@@ -227,7 +227,7 @@ def _forward_to(
     current: Float,
     other: Float,
 ) -> tuple[int, Float, Float]:
-    """Return the forward sums of a twin up to a step, as `_backward_to` those after it."""
+    """Return the forward sums of a twin up to a step; arguments as for `_backward_to`."""
     state_count = likelihood.shape[1]
     axes = 0
     lanes = grids.first[1]
@@ -321,18 +321,9 @@ def _multiply_by_likelihood(
 ) -> None:
     """Multiply beliefs (S, L) in place by the likelihood of a step over its largest value.
 
-    Parameters
-    ----------
-    log_density : (S, L) or (S, 1) array
-        The log likelihood in each lane, or the same in all lanes.
-    belief : (S, L) array
-        The beliefs; updated in place.
-    belief_sum : (L,) array
-        To be filled: the sums of the beliefs afterwards.
-    log_evidence : (L,) array
-        The log of the largest likelihood is added in place.
-    work : _LikelihoodWork
-        Work space.
+    `log_density` is (S, L), or (S, 1) if it is the same in all lanes. `belief_sum` (L,) is filled
+    with the sums of the beliefs afterwards, and the log of the largest likelihood is added to
+    `log_evidence` (L,).
     """
     largest, mantissa, power_bits = work
     power = power_bits.view(np.float64)

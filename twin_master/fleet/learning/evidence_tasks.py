@@ -40,14 +40,14 @@ _LARGEST_PROBABILITY = 0.9
 def with_all_transitions_possible(probability: Float) -> Float:
     """Return probabilities of worsening that are neither near 0 nor near 1.
 
-    So any course of the damage is possible, and observations that are impossible with these
+    Then any course of the damage is possible, so observations that are impossible with these
     probabilities contradict the sensor model.
     """
     return probability.clip(_LEAST_PROBABILITY, _LARGEST_PROBABILITY)
 
 
 class EvidenceKit(NamedTuple):
-    """All that the evidence of twins of one scenario needs beside their observations.
+    """Everything that the evidence of a scenario's twins needs besides their observations.
 
     Attributes
     ----------
@@ -55,15 +55,9 @@ class EvidenceKit(NamedTuple):
         The folder of the fleet, an absolute path.
     fleet_hash : str
         The hash of the fleet's `config.json`.
-    group : str
-        The name of the group.
     reading : str
-        Differs from call to call, so that no process takes what it has read before for what is in a
+        A key that differs from call to call, so that no process reuses what it has read from a
         store that has grown since.
-    family : TransitionFamily
-        The transitions.
-    sensor_model : GaussianSensorModel
-        The model of the sensors.
     """
 
     folder: str
@@ -124,7 +118,7 @@ class GridSum(NamedTuple):
 
 @lru_cache(maxsize=2)
 def _unpacked_kit(packed_kit: bytes) -> EvidenceKit:
-    """Return a kit; the last ones are kept, because successive tasks share them."""
+    """Return a kit; the last ones are cached, because successive tasks share them."""
     kit: EvidenceKit = pickle.loads(packed_kit)
     return kit
 
@@ -135,7 +129,7 @@ def _stored_observations(
 ) -> StoredObservations | None:
     """Return the observations of a group; None if this machine does not have that fleet.
 
-    They are kept for tasks of the same reading.
+    They are cached for tasks of the same reading.
     """
     try:
         config = fleet_config(Path(folder))
@@ -149,7 +143,7 @@ def _stored_observations(
 
 
 def _observed_twins(task: _Task) -> Sequence[ObservedTwins] | Iterator[ObservedTwins] | None:
-    """Return the observations of the twins of a task, block by block; None if they are missing."""
+    """Return the observations of a task's twins, block by block; None if they are missing."""
     if task.observed is not None:
         return task.observed
     kit = _unpacked_kit(task.kit)
@@ -158,10 +152,9 @@ def _observed_twins(task: _Task) -> Sequence[ObservedTwins] | Iterator[ObservedT
 
 
 def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
-    """Return the log likelihood of the twins of a task on a grid.
+    """Return the log likelihood of a task's twins on a grid, see `GroupEvidence.grid_sum`.
 
-    It is None if this process cannot read their observations. `axes` and `prior` are those of
-    `GroupEvidence.grid_sum`.
+    None if this process cannot read their observations.
     """
     blocks = _observed_twins(task)
     if blocks is None:
@@ -185,7 +178,7 @@ def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
 
 
 def _evidence_of_draws(task: _Task, probability: Float) -> Float | None:
-    """Return the log evidence (B, E) of the twins of a task, or None as `_grid_sum`."""
+    """Return the log evidence (B, E) of a task's twins, or None as `_grid_sum`."""
     blocks = _observed_twins(task)
     if blocks is None:
         return None
@@ -199,18 +192,12 @@ def _evidence_of_draws(task: _Task, probability: Float) -> Float | None:
 
 
 class GroupEvidence:
-    """The evidence of the twins of a group, summed up by the processes of a pool.
+    """The evidence of a group's twins, summed by the processes of a pool.
 
     Parameters
     ----------
-    pool : TaskPool
-        The processes.
-    group : str
-        The name of the group.
     flights : sequence of FlightsOfScenario
         The flights of the twins, by scenario.
-    progress : Progress
-        Shows how far a pass over all twins has come.
     """
 
     def __init__(
@@ -241,15 +228,15 @@ class GroupEvidence:
         return GroupEvidence(self._pool, self._group, flights, self._progress)
 
     def grid_sum(self, axes: Axes, prior: Float | None) -> GridSum:
-        """Return the log likelihood of the probabilities to worsen on a grid.
+        """Return the log likelihood of the probabilities of worsening on a grid.
 
         Parameters
         ----------
         axes : tuple of (N,) array
             The values of each probability.
         prior : (E,) array or None
-            The probability of each draw of the sensor model, which holds in all steps; None takes
-            the weight that the draw has in the calibration.
+            The probability of each draw of the sensor model, which holds in all steps; None for the
+            weight of the draw in the calibration.
         """
         log_likelihood = np.zeros([len(axis) for axis in axes])
         explained = 0
@@ -264,7 +251,7 @@ class GroupEvidence:
         Parameters
         ----------
         probability : (K,) array
-            The probabilities to worsen.
+            The probabilities of worsening.
         """
         yield from self._answers(partial(_evidence_of_draws, probability=probability))
 
@@ -277,10 +264,10 @@ class GroupEvidence:
                     yield _Task(kit, rows_of_task)
 
     def _answers(self, function: Callable[[_Task], _Answer | None]) -> Iterator[_Answer]:
-        """Yield the results of all tasks, in their order.
+        """Yield the results of all tasks, in order.
 
-        A worker that cannot read the fleet's folder answers None. Its task is then computed again
-        with the observations, which this process reads, and so are all later tasks.
+        A worker that cannot read the fleet's folder returns None. Its task, and all later ones, are
+        then sent with the observations, which this process reads.
         """
         unanswered: deque[_Task] = deque()
 
@@ -303,13 +290,7 @@ class GroupEvidence:
 
 
 def _with_observations(task: _Task) -> _Task:
-    """Return a task with the observations of its twins, which are read here.
-
-    Raises
-    ------
-    FleetError
-        If the fleet was replaced in the meantime.
-    """
+    """Return a task with the observations of its twins."""
     blocks = _observed_twins(task)
     if blocks is None:
         raise FleetError(

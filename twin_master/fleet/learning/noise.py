@@ -55,7 +55,7 @@ class ParameterNodes:
     values : (E,) array
         The equally spaced values.
     prior : (E,) array
-        Their probabilities by the calibration, a normal distribution.
+        Their probabilities in the calibration, a normal distribution.
     predicted : (E, S, U, G) array
         The noise-free readings of the sensors for each value, state and control, in SI units.
     """
@@ -66,13 +66,13 @@ class ParameterNodes:
 
     @property
     def every_second(self) -> "ParameterNodes":
-        """Every second value: enough for the growth of damage, which changes little with them."""
+        """Every second value: enough for the growth of damage, which hardly depends on them."""
         prior = self.prior[::2] / self.prior[::2].sum()
         return ParameterNodes(self.values[::2], prior, self.predicted[::2])
 
 
 def parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> ParameterNodes | None:
-    """Return values of the calibrated parameter, with the readings that a model predicts for each.
+    """Return values of the calibrated parameter, with the readings that a model predicts.
 
     Return None if the calibration has no uncertainty, or if the source of the readings cannot
     compute them at chosen values of the parameter.
@@ -109,14 +109,10 @@ def parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> ParameterNodes 
 def with_noise_factor(
     model: GaussianSensorModel, factor: float, value_per_draw: Float | None = None
 ) -> GaussianSensorModel:
-    """Return a copy of a sensor model with its noise multiplied by a factor.
+    """Return a copy of a sensor model with a factor on the standard deviation of its noise.
 
     Parameters
     ----------
-    model : GaussianSensorModel
-        The model.
-    factor : float
-        The factor on the standard deviation of the noise.
     value_per_draw : (E, S, U, G) array, optional
         The noise-free readings at other values of the parameter; by default those of the model.
     """
@@ -136,12 +132,12 @@ def noise_factor(
     family: TransitionFamily,
     nodes: ParameterNodes | None,
 ) -> Distribution:
-    """Return the posterior of the factor on the assumed noise, given a uniform prior of its log.
+    """Return the posterior of the factor on the assumed noise, with a uniform prior of its log.
 
     The calibrated parameter of an asset is the same in all steps. A likelihood that averages over
-    it in each step separately would attribute a part of the noise to the parameter. So the evidence
-    of all steps is computed at each value first and averaged over the values then: over the nodes
-    or, if there are none, over the draws of the calibration.
+    it in each step separately would attribute part of the noise to the parameter. So the evidence
+    of all steps is computed at each value first and then averaged over the values: over the nodes
+    or, without nodes, over the draws of the calibration.
     """
     first_twins = [
         twins._replace(rows=twins.rows[:NOISE_TWINS]) for twins in twins_by_scenario[:NOISE_TWINS]

@@ -41,10 +41,8 @@ def parameter_evidence(
 
     Parameters
     ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
     probability : (K,) array
-        The probabilities to worsen.
+        The probabilities of worsening.
     model : GaussianSensorModel
         The model of the G sensors; its E draws are the values of the parameter.
     observations : (B, T, G) array
@@ -88,8 +86,6 @@ class TwinLikelihood(NamedTuple):
 
         Parameters
         ----------
-        family : TransitionFamily
-            The transitions as a function of K probabilities.
         axes : tuple of (N,) array
             The values of each probability.
 
@@ -112,18 +108,16 @@ def likelihood_at_nodes(
     observations: Float,
     control: Index,
 ) -> TwinLikelihood:
-    """Return the likelihood of twins at those values of their parameter that are probable.
+    """Return the likelihood of twins at the probable values of their parameter.
 
     The evidence of a twin is the sum of those at all values, each times its prior. Values are left
     out whose posterior is below `LEAST_POSTERIOR`, and twins whose observations are impossible.
 
     Parameters
     ----------
-    family : TransitionFamily
-        The transitions as a function of K probabilities.
     probability : (K,) array
-        The probabilities to worsen for which the posterior of the values is computed; any course of
-        the state must be possible.
+        The probabilities of worsening for the posterior of the values; any course of the state must
+        be possible.
     prior : (E,) array
         The probability of each value of the parameter.
     model : GaussianSensorModel
@@ -169,16 +163,10 @@ def _twins_at_nodes(
     observations: Float,
     control: Index,
 ) -> Iterator[tuple[Float, Float]]:
-    """Yield what the observations say at each of E nodes, for as many twins as memory allows.
+    """Yield the densities and the evidence at E nodes, for as many twins as memory allows.
 
-    The arguments are those of `parameter_evidence`.
-
-    Yields
-    ------
-    log_density : (B, T, S, E) array
-        log p(o_t | D_t, u_t, e) of B twins.
-    log_evidence : (B, E) array
-        The log evidence of all steps.
+    They are log p(o_t | D_t, u_t, e), a (B, T, S, E) array, and the log evidence of all steps (B,
+    E). The arguments are those of `parameter_evidence`.
     """
     twin_count, step_count = control.shape
     entries = np.repeat(family.entries(probability[None]).T, model.draw_count, axis=1)

@@ -1,4 +1,4 @@
-"""Posteriors of the probabilities that groups share, and of the mean and spread of populations."""
+"""Posteriors of probabilities that groups share, and of mean and deviation of populations."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -98,10 +98,8 @@ def likelihood_grid(
     ----------
     log_likelihood : callable
         Returns the log likelihood at all points of a grid of log odds.
-    count : int
-        The number K of probabilities, from 1 to 4.
     first_axes : tuple of (N,) array, optional
-        The log odds with which the search for the grid begins; by default those of the whole range.
+        The log odds at which the search for the grid starts; by default the whole range.
     """
 
     def log_posterior(axes: Axes) -> Float:
@@ -189,8 +187,6 @@ class _GroupOnAxes:
     ----------
     axes : tuple of (P,) array
         The log odds of its K probabilities.
-    likelihood : (P, P) or (P, 1) array
-        The likelihood at the points of the axes, times their intervals.
     prior_of_first : (H, P) array
         The density of the first probability for each pair of hyperparameters.
     prior_of_second : (H, P) or (1, 1) array
@@ -208,12 +204,9 @@ class _GroupOnAxes:
         return self.prior_of_first @ self.likelihood @ self.prior_of_second.T
 
     def posterior(self, hyper_weight: Float) -> tuple[Distribution, ...]:
-        """Return the posterior of the probabilities, given weights of the hyperparameters.
+        """Return the posterior of the probabilities, averaged over weighted hyperparameters.
 
-        Parameters
-        ----------
-        hyper_weight : (H, H) or (H, 1) array
-            The posterior of the hyperparameters given all groups.
+        The weights, (H, H) or (H, 1), are the posterior of the hyperparameters given all groups.
         """
         # With the hyperparameters h, and the group's probabilities p and data d:
         # p(p | all data) = p(d | p) * sum over h of p(p | h) p(h | all data) / p(d | h).
@@ -229,16 +222,9 @@ class _GroupOnAxes:
 def _group_on_axes(
     grid: LikelihoodGrid, mean_axis: Float, concentration_axis: Float
 ) -> _GroupOnAxes:
-    """Return a group's likelihood on fine axes, with its priors for all pairs of hyperparameters.
+    """Return a group's likelihood on fine axes, with its priors for all hyperparameters.
 
-    Parameters
-    ----------
-    grid : LikelihoodGrid
-        The log likelihood of the group.
-    mean_axis : (M,) array
-        The log odds of the mean over groups.
-    concentration_axis : (C,) array
-        The decimal logarithms of the concentration; there are H = M C pairs.
+    The M means are log odds, the C concentrations decimal logarithms; there are H = M C pairs.
     """
     axes = tuple(np.linspace(axis[0], axis[-1], SHARED_POINTS) for axis in grid.axes)
     mean, concentration = np.meshgrid(logistic(mean_axis), 10.0**concentration_axis, indexing="ij")
@@ -254,17 +240,10 @@ def _group_on_axes(
 
 
 def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
-    """Return the densities Beta(a, b) as densities of log odds, an (H, P) array.
+    """Return H densities Beta(a, b) as densities of log odds (P,), an (H, P) array.
 
-    The density of log odds is that of p times p (1 - p), so that its exponents are a and b in place
-    of a - 1 and b - 1.
-
-    Parameters
-    ----------
-    log_odds : (P,) array
-        The log odds.
-    a, b : (H,) array
-        The parameters of the distributions.
+    The density of log odds is that of p times p (1 - p), so its exponents are a and b instead of a
+    - 1 and b - 1.
     """
     from scipy.special import betaln
 
@@ -276,17 +255,8 @@ def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
 def _interpolated_likelihood(grid: LikelihoodGrid, axes: Axes) -> Float:
     """Interpolate the log likelihood of a group to finer axes, and return normalised weights.
 
-    Parameters
-    ----------
-    grid : LikelihoodGrid
-        The likelihood of one or two probabilities on a grid.
-    axes : tuple of (P,) array
-        The finer axes, log odds, with P = `SHARED_POINTS` points each.
-
-    Returns
-    -------
-    (P, P) or, for one probability, (P, 1) array
-        The weight of each point.
+    There are P = `SHARED_POINTS` points on each axis; the result is (P, P), or (P, 1) for one
+    probability.
     """
     from scipy.interpolate import RegularGridInterpolator
 
@@ -387,24 +357,10 @@ def population_posterior(
 
 
 def _member_likelihood(nodes: Float, log_evidence: Float, values: Float) -> Float:
-    """Return the normalised likelihood of each member at finer values of its parameter.
+    """Return the normalised likelihood (at most B, V) of each member at finer parameter values.
 
-    Members whose observations have the probability 0 at a node are left out, because their log
-    evidence cannot be interpolated.
-
-    Parameters
-    ----------
-    nodes : (E,) array
-        The nodes of the evidence.
-    log_evidence : (B, E) array
-        The log evidence of each member at the nodes.
-    values : (V,) array
-        The finer values, between the nodes.
-
-    Returns
-    -------
-    (at most B, V) array
-        The likelihood; its sum over the values is 1.
+    The log evidence (B, E) at the nodes is interpolated. Members whose observations are impossible
+    at a node are left out.
     """
     from scipy.interpolate import CubicSpline
 

@@ -20,7 +20,7 @@ class RowFile:
     Parameters
     ----------
     folder : Path
-        The folder of the file; it vanishes also if the process is killed.
+        The folder of the file, which also vanishes if the process is killed.
     width : int
         The number E of values of a row.
     rows_together : int
@@ -33,13 +33,7 @@ class RowFile:
         self._rows_together = rows_together
 
     def __enter__(self) -> Self:
-        """Open the file.
-
-        Raises
-        ------
-        FileNotWrittenError
-            If the folder cannot be written.
-        """
+        """Open the file; raise `FileNotWrittenError` if the folder cannot be written."""
         with explained_write_errors(self._folder):
             self._file = TemporaryFile(dir=self._folder)
         return self
@@ -54,7 +48,7 @@ class RowFile:
         self._file.close()
 
     def append(self, rows: Float) -> None:
-        """Append rows, a (B, E) array.
+        """Append rows (B, E).
 
         Raises
         ------

@@ -203,7 +203,7 @@ def _fallback_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> st
 
 
 def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
-    """Return a sentence on the most severely damaged asset; empty if no state is estimated."""
+    """Return a sentence on the most severe damage; empty if no state is estimated."""
     candidates = [overview.most_damaged for overview in overviews]
     with_state = [candidate for candidate in candidates if candidate is not None]
     if not with_state:
@@ -248,16 +248,9 @@ def _add_watched_fleet(
 
 
 def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None:
-    """Add a table of the errors that ended flights or watches, the most frequent errors first.
+    """Add a table of the errors that ended flights or watches, most frequent first.
 
-    Parameters
-    ----------
-    page : Page
-        The page to which content is added.
-    failures : mapping of str to str
-        The error of each asset, by GROUP/NAME.
-    caption : str
-        A sentence that names the file with the complete list of failures.
+    `failures` has the error of each asset, and the caption names the file with all of them.
     """
     rows = []
     for reason, count in Counter(failures.values()).most_common(_FAILURE_ROWS):
@@ -278,20 +271,9 @@ def _add_lessons(page: Page, folder: Path) -> None:
 
 
 def _add_map(page: Page, scenario: Scenario, mean: Float, failed: int, sample: str = "") -> None:
-    """Add the map of the states of a group's assets; assets that failed in flight are grey.
+    """Add the map of the states (B, F) of a group's assets, in SI units.
 
-    Parameters
-    ----------
-    page : Page
-        The page to which content is added.
-    scenario : Scenario
-        The scenario with F factors of the state.
-    mean : (B, F) array
-        The mean states after the last steps, in SI units.
-    failed : int
-        The number of assets that failed in flight.
-    sample : str
-        A sentence that says which of the assets are drawn, if not all are.
+    Assets that failed in flight are grey; `sample` says which assets are drawn if not all are.
     """
     if not len(mean):
         page.add_paragraph("Nothing is known of its assets yet.")

@@ -34,18 +34,16 @@ def serve_fleet(
     ready: Callable[[str], None],
     is_wanted: Callable[[], bool] = is_always_wanted,
 ) -> None:
-    """Serve the report of a fleet to browsers on this machine, and renew it when files change.
+    """Serve the report of a fleet to browsers on this machine; update it when files change.
 
     Parameters
     ----------
-    folder : Path
-        The folder of the fleet.
     port : int
         The port of the server; 0 takes a free one.
     ready : callable
         Called with the address once the server answers.
     is_wanted : callable
-        Returns whether to go on serving; by default for ever.
+        Returns whether to continue serving; by default always.
     """
     page = _CurrentPage(folder)
     texts = {

@@ -1,12 +1,4 @@
-"""A file of a fleet's store: chunks of twins in the sharding codec of zarr 3, appended as they fly.
-
-The file begins with an index that has position and length of each chunk, and a checksum (Zarr
-Enhancement Proposal 2, with the index at the start). zarr itself can only replace such a file as a
-whole. Here a new chunk is appended behind the others and the index is overwritten, so that a file
-that still grows is valid and each chunk is written once. `finish` puts the chunks into their order:
-the complete file is equal to the one that zarr would have written, whatever the order in which the
-twins flew and however often the flight was killed.
-"""
+"""A file of a fleet's store: chunks in the sharding codec of zarr 3, appended while twins fly."""
 
 import os
 from pathlib import Path
@@ -37,8 +29,6 @@ class ChunkFile:
     ----------
     path : Path
         The path of the file, which need not exist.
-    chunk_count : int
-        The number N.
     """
 
     def __init__(self, path: Path, chunk_count: int) -> None:
@@ -61,15 +51,12 @@ class ChunkFile:
             return file.read(length)
 
     def write(self, number: int, content: bytes | None) -> None:
-        """Append the content of a chunk, which takes the place of its former content.
+        """Append the content of a chunk, which replaces its former content.
 
         Parameters
         ----------
-        number : int
-            The number of the chunk, from 0 to N - 1.
         content : bytes or None
-            The encoded content; None if all values are those of twins that have not flown, which
-            the file leaves out.
+            The encoded content; None if no twin of the chunk has flown, which the file leaves out.
 
         Raises
         ------
@@ -98,7 +85,7 @@ class ChunkFile:
             os.close(descriptor)
 
     def finish(self) -> None:
-        """Put the chunks into their order, without gaps; remove the file if it has none.
+        """Reorder the chunks without gaps; remove the file if it has none.
 
         A file that is finished already, or that does not exist, stays as it is.
 

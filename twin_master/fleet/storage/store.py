@@ -61,14 +61,10 @@ def flown_rows(status: AnyArray) -> Index:
 def stored_variables(
     knowledge: Knowledge, flights: Flights, members: Sequence[Member]
 ) -> dict[str, AnyArray]:
-    """Return the variables that are stored of B flown twins, with B rows each.
+    """Return the stored variables of B flown twins, with B rows each.
 
     Parameters
     ----------
-    knowledge : Knowledge
-        The knowledge that the twins share: model, policy and draws.
-    flights : Flights
-        Their flights.
     members : sequence of Member
         The B assets with their seeds and true parameters.
     """
@@ -152,7 +148,7 @@ def _notice_variables(flights: Flights) -> dict[str, list[list[int]]]:
 
 
 class Fallbacks(NamedTuple):
-    """Fallbacks of B twins: changes from the initial control to a gentler one because of damage.
+    """Fallbacks of B twins: changes from the initial to a gentler control because of damage.
 
     A fallback is called for once the true state reaches a level at which the policy leaves the
     initial control, that of the first step.
@@ -215,8 +211,6 @@ def in_credible_set(
 
     Parameters
     ----------
-    model : GraphicalModel
-        The model of S joint states of F factors.
     probability : (T, S) array
         The beliefs.
     true_state : (T, F) array
@@ -269,8 +263,6 @@ def open_group(folder: Path, group: str, *, names: bool = True) -> "xr.DataTree"
 
     Parameters
     ----------
-    folder : Path
-        The folder of the fleet.
     group : str
         The name of the group.
     names : bool

@@ -1,8 +1,4 @@
-"""Where the store of a fleet is: in its folder, or at an address that fsspec knows.
-
-Addresses are such as `s3://bucket/winter.zarr`. fsspec finds the package that knows the service,
-and takes keys and tokens from where this package looks for them.
-"""
+"""The location of a fleet's store: in its folder, or at an address that fsspec supports."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +20,7 @@ STORE_NAME = "fleet.zarr"
 
 @dataclass(frozen=True)
 class StoreAddress:
-    """The place of a store.
+    """The location of a store.
 
     Attributes
     ----------
@@ -38,7 +34,7 @@ class StoreAddress:
     remote: str = ""
 
     def for_zarr(self) -> "Path | RemoteStore":
-        """Return what zarr and xarray open."""
+        """Return the argument with which zarr and xarray open the store."""
         if not self.remote:
             return self.folder / STORE_NAME
         from zarr.storage import FsspecStore
@@ -136,12 +132,12 @@ class StoreAddress:
 
     @contextmanager
     def explained_errors(self) -> Iterator[None]:
-        """Return a context in which an error of the service becomes one sentence.
+        """Turn an error of the service into one sentence, within a context.
 
         Raises
         ------
         FleetError
-            In place of the error, if the store has an address elsewhere.
+            Instead of the error, if the store has a remote address.
         """
         try:
             yield

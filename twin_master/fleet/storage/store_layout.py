@@ -196,11 +196,9 @@ def in_present_layout(
     Parameters
     ----------
     dataset : Dataset
-        The group, whose variables have their former names.
-    scenario : Scenario
-        The scenario of the group.
+        The group, with former names of variables.
     twins : sequence of str or None
-        The names of the twins; None if they are not wanted.
+        The names of the twins; None to leave them out.
     """
     import xarray as xr
 

@@ -117,17 +117,7 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
 def _create_coordinates(
     zarr_group: "zarr.Group", path: str, coordinates: Mapping[str, Variable]
 ) -> None:
-    """Write the coordinates of one of the groups inside a group of the fleet.
-
-    Parameters
-    ----------
-    zarr_group : zarr.Group
-        The group of the fleet.
-    path : str
-        The path of the group inside it; empty for the group itself.
-    coordinates : mapping of str to Variable
-        The coordinates by their names.
-    """
+    """Write the coordinates of an inner group, or of the fleet's group for an empty path."""
     inner_group = zarr_group.require_group(path) if path else zarr_group
     for name, coordinate in coordinates.items():
         values = coordinate.values
@@ -225,17 +215,7 @@ def chunk_key(number: int, axis_count: int) -> str:
 
 
 class GroupWriter:
-    """Writes flown twins into the arrays of a group of assets.
-
-    Parameters
-    ----------
-    address : StoreAddress
-        The place of the store, which exists.
-    fleet : Fleet
-        The plan of the fleet.
-    group : Group
-        The group.
-    """
+    """Writes flown twins to the arrays of a group of assets."""
 
     def __init__(self, address: StoreAddress, fleet: Fleet, group: Group) -> None:
         import zarr
@@ -292,10 +272,10 @@ class GroupWriter:
         file.write(number_in_file, codec.encode(chunk))
 
     def finish_file(self, number: int) -> None:
-        """Finish the files of all variables with a number, all of whose twins have flown.
+        """Finish the files of all variables with a number, after all their twins have flown.
 
-        They are put into their order and, if the store is elsewhere, sent there. Files that were
-        finished before stay as they are.
+        They are put in order and, if the store is elsewhere, sent there. Files that were finished
+        before stay as they are.
 
         Raises
         ------
