@@ -1,7 +1,4 @@
-"""The flight of a fleet, whose results go into its store shard by shard.
-
-A flight that was interrupted is continued with the first shard that is not in the store.
-"""
+"""The flight of a fleet, whose results are stored shard by shard."""
 
 from __future__ import annotations
 
@@ -69,23 +66,21 @@ _PACKED_KITS = 2
 
 @dataclass(frozen=True)
 class FleetOutcome:
-    """Numbers of flown twins and shards, and the reasons of flights that ended early.
+    """The outcome of a fleet's flight: numbers of twins and shards, and why flights ended early.
 
     Attributes
     ----------
-    folder : Path
-        The folder of the fleet.
     twins : int
         The number of twins.
     failures : dict of str to str
         The error that ended the flight of each twin that failed, by GROUP/NAME.
     ended : dict of str to str
         The reason of each asset that ended its simulation early, by GROUP/NAME; its flown steps are
-        in the store.
+        stored.
     seconds : float
         The wall-clock time of this call [s].
     shards_flown, shards_kept : int
-        The number of shards that this call flew, and of those that an earlier call had flown.
+        The numbers of shards that this call and earlier calls have flown.
     """
 
     folder: Path
@@ -136,21 +131,19 @@ def fly_fleet(
     Parameters
     ----------
     fleet : Fleet or path
-        The fleet, or its file.
+        The plan of the fleet, or its file.
     folder : Path or str
         The folder of the store; a fleet that was begun there with the same plan and program is
         continued.
     engine : Engine, optional
         The processes that fly; by default this one.
     policy, sensor_model, estimator : optional
-        The parts of all twins in the place of those of the scenarios, see `fly`. Other processes
-        than this one must be able to import the modules of objects.
+        Parts of all twins that replace those of the scenarios, see `fly`. Worker processes must be
+        able to import the modules of objects.
     store : str
         The address of the store, such as "s3://bucket/winter.zarr"; by default it is in the folder.
     replace_old : bool
         Whether another fleet in the folder is removed.
-    progress : Progress, optional
-        Shows how far the flight has come.
 
     Returns
     -------
@@ -161,9 +154,8 @@ def fly_fleet(
     ------
     FleetError
         If an asset cannot fly: the message lists all such assets, and no twin has flown. If the
-        store cannot be at its address. If the
-        cluster cannot be used: shards that were flown stay in the store. If the extra `fleet` is
-        not installed.
+        store cannot be at its address. If the cluster cannot be used: shards that were flown stay
+        in the store. If the extra `fleet` is not installed.
     RunFolderError
         If the folder holds something else.
     NotResumableError
@@ -218,7 +210,7 @@ def fly_fleet(
 
 
 def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
-    """Tell the user for which groups `fleet learn` cannot learn transitions, and why."""
+    """Notify the user of groups whose transitions `fleet learn` cannot learn, and why."""
     for group in fleet.groups:
         reason = reason_transitions_are_fixed(group.scenarios[0])
         if reason:
@@ -228,7 +220,7 @@ def _note_fixed_transitions(fleet: Fleet, progress: Progress) -> None:
 
 
 def _note_slow_flights(fleet: Fleet, progress: Progress) -> None:
-    """Tell the user which groups fly one twin after the other, and why."""
+    """Notify the user of groups that fly one twin after the other, and why."""
     for group in fleet.groups:
         if group.observations or len(group.members) < 2:
             continue
@@ -270,7 +262,7 @@ def endings_of(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
 def prepare_kit(
     scenario: Scenario, folder: Path, *, is_real: bool = False, parts: TwinParts = NO_PARTS
 ) -> bytes:
-    """Prepare the twins' knowledge of a scenario in a folder, and pack all that a flight needs.
+    """Prepare the twins' knowledge of a scenario in a folder, and pack everything a flight needs.
 
     Knowledge that the folder holds already is not computed again.
 
@@ -279,11 +271,11 @@ def prepare_kit(
     scenario : Scenario
         The scenario of the mission, checked.
     folder : Path
-        The folder of the prepared knowledge; files are written to it.
+        The folder of the prepared knowledge. Knowledge in it is not computed again.
     is_real : bool
         Whether the assets are real, so that no asset is simulated.
     parts : TwinParts
-        The parts of the twins that a user gives instead of those of the scenario.
+        The user's parts, which replace those of the scenario.
 
     Returns
     -------
@@ -325,7 +317,7 @@ def prepare_kit(
 
 
 def _note_likelihood_of_single_observations(sensor_model: GaussianSensorModel) -> None:
-    """Tell the user how a sensor model that is asked for one twin at a time becomes faster."""
+    """Notify the user how a sensor model that evaluates one twin at a time becomes faster."""
     if sensor_model.takes_observations_one_by_one:
         _note_once(
             f"The sensor model {type(sensor_model).__qualname__} has only `log_likelihood`, which "
@@ -337,19 +329,17 @@ def _note_likelihood_of_single_observations(sensor_model: GaussianSensorModel) -
 
 @cache
 def _note_once(message: str) -> None:
-    """Show a line once in a process, also if several scenarios give it."""
+    """Print a line once in a process, even if several scenarios produce it."""
     note(message)
 
 
 class Shard(NamedTuple):
-    """Twins of one group in successive rows that one process flies together.
+    """Twins of one group in successive rows, which one process flies together.
 
     Attributes
     ----------
-    group_number : int
-        The number of their group in the fleet.
     rows : range
-        Their rows; the twins share a scenario.
+        The twins, which share a scenario.
     """
 
     group_number: int
@@ -359,7 +349,7 @@ class Shard(NamedTuple):
 def _shards(fleet: Fleet) -> Iterator[Shard]:
     """Yield the shards of a fleet, group by group, each with its twins in order.
 
-    If the members have different scenarios, each is a shard of its own.
+    Members with different scenarios are in different shards.
     """
     for number, group in enumerate(fleet.groups):
         size = fleet.head.shard if len(group.scenarios) == 1 else 1
@@ -369,17 +359,10 @@ def _shards(fleet: Fleet) -> Iterator[Shard]:
 
 
 class _StoredRows:
-    """Which rows of the groups of a fleet are in its store.
+    """The rows of a fleet's groups that are in its store.
 
-    The rows of single twins are noted, because the twins of a shard are stored one by one if
-    workers died over it.
-
-    Parameters
-    ----------
-    fleet : Fleet
-        The plan of the fleet.
-    journal : Path
-        The journal, which names the rows that were stored before.
+    Single rows are recorded, because the twins of a shard are stored one by one if workers died
+    while flying it. The journal names the rows that were stored before.
     """
 
     def __init__(self, fleet: Fleet, journal: Path) -> None:
@@ -388,11 +371,11 @@ class _StoredRows:
             self.note(record["group"], range(*record["rows"]))
 
     def note(self, group_number: int, rows: range) -> None:
-        """Note that rows of a group are in the store."""
+        """Record that rows of a group are in the store."""
         self._is_stored[group_number][rows.start : rows.stop] = True
 
     def has_all(self, group_number: int, rows: range) -> bool:
-        """Return whether all of some rows of a group are in the store."""
+        """Return whether the store has all of some rows of a group."""
         return bool(self._is_stored[group_number][rows.start : rows.stop].all())
 
 
@@ -401,10 +384,6 @@ class _FleetFlight:
 
     Parameters
     ----------
-    fleet : Fleet
-        The plan of the fleet.
-    folder : Path
-        The folder of the fleet.
     journal : JournalFile
         The journal, in which a shard is recorded after it is in the store.
 
@@ -413,7 +392,7 @@ class _FleetFlight:
     remaining_shards : list of Shard
         The shards that were not in the store at the beginning.
     shards_kept : int
-        The number of those that an earlier call had flown.
+        The number of shards that an earlier call had flown.
     """
 
     def __init__(self, fleet: Fleet, folder: Path, journal: JournalFile) -> None:
@@ -491,15 +470,7 @@ class _FleetFlight:
         self._finish_files(group_number, rows)
 
     def _finish_files(self, group_number: int, rows: range | None = None) -> None:
-        """Finish the files of a group whose twins are all in the store.
-
-        Parameters
-        ----------
-        group_number : int
-            The number of the group.
-        rows : range, optional
-            Only the files that have some of these rows; all files if left out.
-        """
+        """Finish the files of a group whose twins are all stored, or only those with some rows."""
         writer = self._writers[group_number]
         for number, rows_of_file in enumerate(writer.file_rows):
             is_touched = rows is None or (
@@ -511,12 +482,12 @@ class _FleetFlight:
 
 
 def _with_group_name(group: Group, sentences: Mapping[str, str]) -> dict[str, str]:
-    """Return sentences by GROUP/NAME of a twin, given sentences by the name of the twin alone."""
+    """Return sentences by GROUP/NAME, given sentences by the name of the twin."""
     return {f"{group.name}/{name}": sentence for name, sentence in sentences.items()}
 
 
 def _with_recording(group: Group, member: Member) -> Member:
-    """Return a member with the recorded messages of its asset, so that workers read no files."""
+    """Return a member with its recorded messages, so that workers read no files."""
     if not group.observations or member.file is None:
         return member
     messages = file_feed(member.file, group.scenarios[0]).messages(None)

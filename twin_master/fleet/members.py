@@ -1,8 +1,4 @@
-"""The assets of a group with their twins, computed from their rows or listed by their files.
-
-A million assets that differ only in seed and true parameters follow from a few numbers. They are
-computed when they are needed, and the configuration of the fleet records these numbers alone.
-"""
+"""The assets of a group with their twins: computed from their rows, or listed by file."""
 
 import zlib
 from abc import ABC, abstractmethod
@@ -22,7 +18,7 @@ from twin_master.seeds import generator
 
 
 class Spread(Section):
-    """A parameter of the true assets that is normally distributed over the group."""
+    """The normal distribution of a true parameter over the assets of a group."""
 
     mean: Number
     """Mean of the parameter [unit of the binding]."""
@@ -32,22 +28,20 @@ class Spread(Section):
 
 @dataclass(frozen=True)
 class Member:
-    """One asset of a group with its twin.
+    """An asset of a group with its twin.
 
     Attributes
     ----------
     row : int
-        Its number in the group, and its row in the store.
-    name : str
-        The name of the asset.
+        Its index in the group, and its row in the store.
     seed : int
         The seed of its mission; ``uav-twin run --seed`` flies the same mission.
     parameters : dict of str to float
-        Its true parameters in SI units, by name; only those that differ between the assets.
+        The true parameters in SI units that differ between the assets.
     scenario_number : int
-        The number of its scenario in the group.
+        The index of its scenario in the group.
     file : Path or None
-        The file of this asset alone: its FMU, its calibration, or the recording of a real asset.
+        The asset's own file: its FMU, its calibration, or its recording.
     recording : tuple of FeedItem or None
         The observations of a real asset, as they are sent to a worker.
     """
@@ -62,7 +56,7 @@ class Member:
 
 
 class Members(Sequence[Member], ABC):
-    """The assets of a group, by their rows; a slice of them is a tuple."""
+    """The assets of a group by row; a slice gives a tuple."""
 
     @abstractmethod
     def member(self, row: int) -> Member:
@@ -74,7 +68,7 @@ class Members(Sequence[Member], ABC):
 
     @abstractmethod
     def record(self) -> object:
-        """Return what `config.json` has of the assets; `RecordedMembers` reads it."""
+        """Return the record of the assets in `config.json`; `RecordedMembers` reads it."""
 
     @overload
     def __getitem__(self, rows: int) -> Member: ...
@@ -92,13 +86,7 @@ class Members(Sequence[Member], ABC):
 
 @dataclass(frozen=True)
 class ListedMembers(Members):
-    """Assets that have a file each, one by one.
-
-    Attributes
-    ----------
-    members : tuple of Member
-        The assets.
-    """
+    """Assets with a file each."""
 
     members: tuple[Member, ...]
 
@@ -115,19 +103,13 @@ class ListedMembers(Members):
         return self.members[row].name
 
     def record(self) -> list[list[object]]:
-        """Return name, seed and number of the scenario of each asset."""
+        """Return name, seed and scenario number of each asset."""
         return [[member.name, member.seed, member.scenario_number] for member in self.members]
 
 
 @dataclass(frozen=True)
 class SeededMembers(Members):
-    """Equal assets that fly under seeds of a range.
-
-    Attributes
-    ----------
-    seeds : range
-        The seeds.
-    """
+    """Equal assets that fly under a range of seeds."""
 
     seeds: range
 
@@ -144,16 +126,16 @@ class SeededMembers(Members):
         return f"seed-{self.seeds[row]}"
 
     def record(self) -> JsonObject:
-        """Return the range of the seeds: first one, end and distance."""
+        """Return the range of the seeds: first, end and step."""
         return {"seeds": [self.seeds.start, self.seeds.stop, self.seeds.step]}
 
 
 @dataclass(frozen=True)
 class CountedMembers(Members):
-    """A number of assets with seeds and true parameters that follow from their rows.
+    """A number of assets whose seeds and true parameters are computed from their rows.
 
-    Seed and parameters depend on the seed of the fleet, the name of the group and the row of the
-    asset alone, so that the mission of a twin does not change if other assets or groups are added.
+    They depend only on the seed of the fleet, the name of the group and the row, so that the
+    mission of a twin does not change if other assets or groups are added.
 
     Attributes
     ----------
@@ -192,20 +174,14 @@ class CountedMembers(Members):
 def seeded_member(
     group: str, fleet_seed: int, row: int, spreads: Mapping[str, Spread], name: str
 ) -> Member:
-    """Return an asset of a group with a seed and normally distributed true parameters.
+    """Return an asset with a seed of its own and normally distributed true parameters.
 
     Parameters
     ----------
-    group : str
-        The name of the group.
-    fleet_seed : int
-        The seed of the fleet.
     row : int
-        The number of the asset in the group.
+        The index of the asset in the group.
     spreads : dict of str to Spread
         The distributions of the true parameters.
-    name : str
-        The name of the asset.
     """
     key = (zlib.crc32(group.encode()), row)
     sequence = np.random.SeedSequence(fleet_seed, spawn_key=key)
@@ -221,14 +197,9 @@ def seeded_member(
 
 
 class RecordedMembers:
-    """The assets of a flown group, from its record in `config.json`.
+    """The assets of a flown group, as `config.json` records them.
 
-    Fleets of earlier versions have a list of all assets there.
-
-    Parameters
-    ----------
-    record : mapping
-        The record of the group.
+    Earlier versions recorded a list of all assets.
     """
 
     def __init__(self, record: JsonRecord) -> None:
@@ -252,7 +223,7 @@ class RecordedMembers:
         return f"{self._group}-{row}" if self._seeds is None else f"seed-{self._seeds[row]}"
 
     def scenario_numbers(self, rows: Index) -> Index:
-        """Return the number of the scenario of each of the rows, a (B,) array."""
+        """Return the scenario number (B,) of each row."""
         if not isinstance(self._content, list):
             return np.zeros(len(rows), dtype=np.int64)
         return np.array([self._content[row][2] for row in rows.tolist()], dtype=np.int64)

@@ -35,7 +35,8 @@ class Estimated:
     value, error : float
         The estimate, and its standard error.
     unit : str
-        The unit of both; empty for a plain number, or where factors of a state differ in it.
+        The unit of both; empty for a plain number, or if the factors of a state have different
+        ones.
     """
 
     value: float
@@ -44,7 +45,7 @@ class Estimated:
 
 
 class Moments:
-    """Number, mean and sum of squared deviations of values that come block by block.
+    """Count, mean and sum of squared deviations of values that come block by block.
 
     The sums of two blocks are joined by the formulas of Chan, Golub and LeVeque (1983), which lose
     no digits if the mean is large compared with the standard deviation.
@@ -70,7 +71,7 @@ class Moments:
 
     @property
     def mean(self) -> Estimated:
-        """The mean with its standard error; NaN without values, the error also for a single one."""
+        """The mean with its standard error; NaN without values, as is the error of a single one."""
         if not self._count:
             return Estimated(float("nan"), float("nan"))
         if self._count == 1:
@@ -120,8 +121,8 @@ class Outcomes:
     Attributes
     ----------
     prompt_fallbacks : Estimated
-        Of the missions whose true damage called for a fallback to a gentler control, the fraction
-        in which it came within `WITHIN` steps; NaN if there is no such mission. A mission that
+        Of the missions in which the true damage called for a fallback to a gentler control, the
+        fraction in which it came within `WITHIN` steps; NaN without such a mission. A mission that
         ended within `WITHIN` steps of the call, without a fallback, is not counted.
     early_fallbacks : Estimated
         The fraction of missions with a fallback before the damage that calls for it; NaN if no
@@ -152,7 +153,7 @@ class Outcomes:
         Parameters
         ----------
         stored_arrays : mapping of str to array
-            The variables of a group of the store by path.
+            The variables of a group of the store, by path.
         """
         return cls.from_blocks(iter([stored_arrays.__getitem__]))
 
@@ -160,7 +161,7 @@ class Outcomes:
     def from_blocks(cls, blocks: Iterator[StoredRows]) -> "Outcomes":
         """Return the outcomes of all twins that have flown, block by block.
 
-        Of a twin whose asset ended its simulation early, the flown steps are counted.
+        If an asset ended its simulation early, its flown steps are counted.
 
         Parameters
         ----------

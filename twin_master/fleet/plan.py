@@ -54,7 +54,7 @@ PRESENT_NAMES = {"group.inspections_a_turn": "inspections_per_step"}
 
 
 class GroupSection(Section):
-    """Assets that share a scenario, as a fleet file names them."""
+    """Assets that share a scenario, as a fleet file describes them."""
 
     name: Name
     """Name of the group."""
@@ -140,19 +140,17 @@ class Group:
 
     Attributes
     ----------
-    name : str
-        The name of the group.
     scenarios : tuple of Scenario
         The resolved scenarios: one for all assets, or one for each.
     parameter_spreads : dict of str to Spread
-        The parameters that differ from asset to asset.
+        The distributions of the parameters that differ from asset to asset.
     members : Members
         The assets; empty if they become known by their messages to a broker.
     observations : str
-        Where the observations of real assets come from, a pattern of files or an address; empty if
-        assets are flown.
+        The source of real assets' observations, a pattern of files or an address; empty for
+        simulated assets.
     scenario_file : dict of str to str
-        The name and the hash of the file of the scenario.
+        Name and hash of the scenario file.
     """
 
     name: str
@@ -191,13 +189,11 @@ class Fleet:
     ----------
     head : FleetSection
         Name, title, seed and size of shards.
-    groups : tuple of Group
-        The groups.
     parts : TwinParts
-        The parts of all twins that a user gives in the place of those of the scenarios.
+        The user's parts of all twins, which replace those of the scenarios.
     store : str
-        The address of the store, such as "s3://bucket/winter.zarr"; empty if it is in the folder of
-        the fleet.
+        The address of the store, such as "s3://bucket/winter.zarr"; empty for the folder of the
+        fleet.
     """
 
     head: FleetSection
@@ -223,7 +219,7 @@ class Fleet:
         return record
 
     def with_parts(self, parts: TwinParts) -> "Fleet":
-        """Return the fleet with the parts that a user gives.
+        """Return the fleet with the user's parts.
 
         Raises
         ------
@@ -242,7 +238,7 @@ class Fleet:
         return replace(self, groups=tuple(groups), parts=other_parts)
 
     def with_store(self, address: str) -> "Fleet":
-        """Return the fleet with its store at an address; in its folder if the address is empty."""
+        """Return the fleet with a store at an address, or in its folder if that is empty."""
         return replace(self, store=address)
 
     def _policy_hash(self, group: Group) -> str:
@@ -428,7 +424,7 @@ def _scenarios(
 
 
 def _common_overrides(section: GroupSection, folder: Path, seed: int) -> Overrides:
-    """Return the overrides of the scenario that hold for all assets of a group."""
+    """Return the overrides of the scenario for all assets of a group."""
     overrides = Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name)
     files: dict[str, Any] = {}
     for key in ("fmu", "binding", "calibration", "learnt"):
@@ -439,7 +435,7 @@ def _common_overrides(section: GroupSection, folder: Path, seed: int) -> Overrid
 
 
 def _with_values_of_group(section: GroupSection, scenario: Scenario) -> Scenario:
-    """Return a scenario in which the values that the group's section sets replace its own."""
+    """Return a scenario with the values that the group's section sets."""
     table = scenario.to_dict()
     if section.steps is not None:
         table["mission"]["steps"] = section.steps

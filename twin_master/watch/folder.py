@@ -376,8 +376,7 @@ class Watch:
     def last_decision(self) -> JsonObject | None:
         """Return the last decision in the journal; None if there is none.
 
-        The decision is marked with `told_again`, because it may have been sent before: after a kill
-        that is not known.
+        The decision is marked with `told_again`, because it may have been sent before a kill.
         """
         recent = RecentParts(self.folder)
         for line, _, _ in records_backwards(self.journal_path, recent=recent):
@@ -388,8 +387,7 @@ class Watch:
     def report_silence(self, send: Callable[[JsonObject], None]) -> None:
         """Send the last decision again, with a notice that no step has come for too long.
 
-        Nothing is sent before `watch.quiet_after_seconds` have passed, or if this silence was
-        reported already.
+        Nothing is sent before `watch.quiet_after_seconds` have passed, or a second time.
         """
         longest_silence = self.scenario.watch.quiet_after_seconds
         if longest_silence is None or self.is_quiet or self.seconds_since_step < longest_silence:
@@ -408,9 +406,9 @@ class Watch:
         send(decision)
 
     def _last_decision_with(self, notice: Notice) -> JsonObject:
-        """Return the last decision, its notices replaced by one notice.
+        """Return the last decision with one notice instead of its own.
 
-        If there is no decision yet, a record with the step -1 and without a control is returned.
+        Without a decision, a record with the step -1 and without a control is returned.
         """
         decision = self.last_decision() or {"step": -1}
         return {**decision, "notices": [notice.as_record()]}
@@ -418,10 +416,10 @@ class Watch:
     def trial_of(
         self, patch: Path, from_step: int, compared: ComparedSteps = NO_STEPS
     ) -> Callable[..., PatchOutcome]:
-        """Return a function that computes the outcome of a patch.
+        """Return a function that computes what a patch would change.
 
-        It reads the journal up to its present end, so that it may be called in a thread while the
-        watch goes on. Its only argument, `progress`, is optional.
+        It reads the journal up to its present end, so it may be called in a thread while the watch
+        continues. Its only argument, `progress`, is optional.
 
         Parameters
         ----------
@@ -446,13 +444,7 @@ class Watch:
         )
 
     def _adopt_given(self, patch: GivenPatch) -> None:
-        """Adopt a patch that the user gives.
-
-        Raises
-        ------
-        MissionInputError
-            If no step was watched yet, or if `from_step` is neither one of them nor the next one.
-        """
+        """Adopt a patch that the user gives, from a step that was watched, or from the next one."""
         steps = self.twin.steps
         if not steps or not 0 <= patch.from_step <= steps:
             raise MissionInputError(
@@ -462,14 +454,9 @@ class Watch:
         self.adopt(outcome, None, self._copy_verdict_of(patch.file))
 
     def _copy_verdict_of(self, patch: Path) -> str:
-        """Copy the verdict in the folder of a given patch, with its drawing, for viewers.
+        """Copy the verdict beside a given patch for viewers, with its drawing of the missing force.
 
-        The drawing shows the missing force that the verdict has found.
-
-        Returns
-        -------
-        str
-            The folder of the copy, relative to that of the watch; empty if there is no drawing.
+        Return the folder of the copy, relative to that of the watch; empty without a drawing.
         """
         verdict = patch.with_name(VERDICT)
         drawing = patch.parent / PICTURE
@@ -484,14 +471,12 @@ class Watch:
     def adopt(
         self, outcome: PatchOutcome, notice: JsonObject | None, verdict_folder: str = ""
     ) -> None:
-        """Adopt a patched model: filter the steps again with it, and go on with its twin.
+        """Adopt a patched model: filter the steps again with it, and continue with its twin.
 
         Parameters
         ----------
-        outcome : PatchOutcome
-            The patched model, and what it changes.
         notice : dict or None
-            The notice to the operator, as it stands in a journal.
+            The notice to the operator, in the form of the journal.
         verdict_folder : str
             The folder of the verdict, relative to that of the watch, if the user gave the patch.
         """
@@ -531,7 +516,7 @@ class Watch:
         self._show_adoption(record)
 
     def _show_adoption(self, model: ModelRecord) -> None:
-        """Tell the operator how well the patched model fits, and how well the former one did."""
+        """Notify the operator how well the patched model fits, compared with the former one."""
         comparisons = []
         for name, value in model["before"].items():
             if value is not None:

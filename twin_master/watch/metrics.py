@@ -134,7 +134,7 @@ class WatchMetrics:
                 yield Sample(f"state_{moment}", meaning, value, labels)
 
     def _rms_residual(self) -> float | None:
-        """Return the residual of the last step; None if it has no reading."""
+        """Return the root mean square residual of the last step; None without a reading."""
         step = self.watch.last_step
         if step is None:
             return None
@@ -173,7 +173,7 @@ class WatchMetrics:
 
 
 class MetricsServer:
-    """Serves the figures of watches, of each from the moment when it is attached.
+    """Serves the metrics of watches, each from the time at which it is attached.
 
     Parameters
     ----------
@@ -204,14 +204,14 @@ class MetricsServer:
         self.address = f"http://{host}:{self._server.server_port}/metrics"
 
     def attach(self, asset: str, watch: Watch) -> WatchMetrics:
-        """Serve the figures of a watch from now on, and return them.
+        """Serve the metrics of a watch from now on, and return them.
 
         Parameters
         ----------
         asset : str
-            The name of the asset, which is in all of its figures.
+            The name of the asset, a label of all its metrics.
         watch : Watch
-            The watch; one that takes the place of another of the asset begins to count anew.
+            A watch that replaces another one of the asset starts its counters again.
         """
         metrics = self._metrics_of_asset.get(asset)
         if metrics is None or metrics.watch is not watch:
@@ -220,10 +220,9 @@ class MetricsServer:
         return metrics
 
     def collect(self) -> Iterable[CounterMetricFamily | GaugeMetricFamily]:
-        """Return the metrics of all assets, as the registry of Prometheus asks for them.
+        """Return the metrics of all assets for the registry of Prometheus.
 
-        The values of a metric stand together, whatever asset they are of. A metric without values
-        is left out.
+        The values of a metric stand together, for all assets. A metric without values is omitted.
         """
         families: dict[str, CounterMetricFamily | GaugeMetricFamily] = {}
         # A copy, because the thread of the watches may attach another one meanwhile
@@ -239,12 +238,12 @@ class MetricsServer:
         return families.values()
 
     def text(self) -> str:
-        """Return the figures in the text format of Prometheus; empty before a watch is attached."""
+        """Return the metrics in the text format of Prometheus; empty before a watch is attached."""
         text: str = generate_latest(self._collectors).decode()
         return text
 
     def close(self) -> None:
-        """End the page."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

@@ -82,9 +82,9 @@ def _predecessors(scenario: Scenario) -> PredecessorLists:
 class TransitionFamily:
     """The transition probabilities of a scenario as a function of K probabilities of worsening.
 
-    A probability to worsen is the probability that a factor of the state moves to its next level in
-    a step. Each entry of the lists of predecessors is a linear function of one of them. K is 0 if
-    the transitions are not learnt.
+    A probability of worsening is the probability that a factor of the state moves to its next level
+    in a step. Each entry of the lists of predecessors is a linear function of one of them. K is 0
+    if the transitions are not learnt.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class TransitionFamily:
     parameter_index : (non-zeros,) array
         The index of the probability on which each entry of the lists depends.
     entries_at_zero, entries_at_one : (non-zeros,) array
-        The entries of the lists if their probability to worsen is 0, and if it is 1.
+        The entries of the lists if their probability of worsening is 0, and if it is 1.
     prior : (S,) array
         The belief p(D_0) over the S joint states before the first step.
     reason_fixed : str
@@ -151,9 +151,9 @@ class TransitionFamily:
 
     @property
     def axes_of_control(self) -> Index:
-        """For each control, (U,), the probabilities on which its transition depends.
+        """For each control (U,), the set of probabilities on which its transition depends.
 
-        They are a number whose bit k says whether probability k is among them.
+        A set is a number whose bit k says whether probability k belongs to it.
         """
         levels, first_row, start, _, _, _ = self.lists
         is_changed = self.entries_at_zero != self.entries_at_one

@@ -1,4 +1,4 @@
-"""Densities on tensor grids, which are moved and narrowed until sums over them suffice."""
+"""Densities on tensor grids, which are moved and narrowed until sums over them are accurate."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -61,10 +61,10 @@ class Distribution:
 
     @cached_property
     def _interpolated(self) -> tuple[Float, Float]:
-        """Values of x and their probabilities, as two arrays, from a spline of the log density.
+        """Values of x and their probabilities, from a spline of the log density.
 
-        Sums over the grid itself would be wrong where its points are as far apart as the
-        distribution is wide, or where a bound cuts the distribution off.
+        Sums over the grid itself would be wrong if its points are as far apart as the distribution
+        is wide, or if a bound cuts the distribution off.
         """
         from scipy.interpolate import CubicSpline
 
@@ -98,7 +98,7 @@ class Distribution:
 
     @property
     def summary(self) -> dict[str, float]:
-        """Mean, standard deviation and central 95 % interval, as records keep them."""
+        """Mean, standard deviation and central 95 % interval, as a record."""
         low, high = self.interval()
         return {
             "mean": self.mean,
@@ -108,7 +108,7 @@ class Distribution:
         }
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the ends of the central interval that has the given probability."""
+        """Return the ends of the central interval with the given probability."""
         x, probability_of_x = self._interpolated
         # Half of the probability of a value lies below it.
         cumulative = np.cumsum(probability_of_x) - 0.5 * probability_of_x
@@ -132,7 +132,7 @@ def resolve_density(
     widest_axes : tuple of (N,) array
         The widest axes.
     first_axes : tuple of (N,) array, optional
-        Narrower axes that presumably hold the density, with which the search begins.
+        Narrower axes that presumably contain the density, with which the search begins.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def _is_cut_off(axes: Axes, values: Float, bounds: Sequence[tuple[float, float]]
 
 
 def _twice_as_wide(axes: Axes, bounds: Sequence[tuple[float, float]]) -> Axes:
-    """Return axes of twice the length about the same centres, within their bounds."""
+    """Return axes of twice the length with the same centres, within their bounds."""
     wider_axes = []
     for axis, (lowest, highest) in zip(axes, bounds, strict=True):
         half_length = 0.5 * (axis[-1] - axis[0])
@@ -215,7 +215,7 @@ def _is_fine(axis: Float, marginal: Float) -> bool:
 
 
 def _would_shrink(axes: Axes, ranges: Sequence[tuple[float, float]]) -> bool:
-    """Return whether any of the ranges is notably shorter than its axis."""
+    """Return whether any range is notably shorter than its axis."""
     return not all(
         high - low > LEAST_SHRINKAGE * (axis[-1] - axis[0])
         for (low, high), axis in zip(ranges, axes, strict=True)
@@ -242,10 +242,8 @@ def marginal_distributions(
     ----------
     weight : (N, ..., N) array
         The probability of each point.
-    axes : tuple of (N,) array
-        The axes.
     transforms : sequence of callable
-        For each axis, the function that returns the quantity for its values.
+        For each axis, a function that returns the quantity for its values.
     """
     marginals = []
     for number, (axis, transform) in enumerate(zip(axes, transforms, strict=True)):

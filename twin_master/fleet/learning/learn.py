@@ -1,7 +1,4 @@
-"""Learning from the store of a fleet: growth of damage, noise of sensors, spread of a parameter.
-
-The results are a record for the report, and `learnt.toml`, which replaces values of a scenario.
-"""
+"""Learns from a fleet's store: growth of damage, noise of sensors, population of a parameter."""
 
 import pickle
 from collections.abc import Sequence
@@ -68,7 +65,7 @@ _TWINS_WORTH_WORKERS = 10_000
 _MEMBERS_TOGETHER = 1024
 """Number of members of a population whose log evidence is in memory at the same time."""
 _MOST_SHARED = 2
-"""Largest number of probabilities to worsen for which groups share a distribution."""
+"""Largest number of probabilities of worsening for which groups share a distribution."""
 
 
 def learn_from_fleet(
@@ -78,7 +75,7 @@ def learn_from_fleet(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> JsonObject:
-    """Learn from all twins of a fleet, and write what was learnt to a file.
+    """Learn from all twins of a fleet, and write the results to a file.
 
     This gives the probabilities with which damage grows, the noise of the sensors, and the
     distribution of the calibrated parameter over the assets. The record is also written to the
@@ -93,8 +90,6 @@ def learn_from_fleet(
         the key of this name.
     engine : Engine, optional
         The processes that compute; by default this one. Their number does not change the results.
-    progress : Progress, optional
-        Shows how far the work has come.
 
     Returns
     -------
@@ -131,10 +126,10 @@ def is_worth_workers(folder: Path) -> bool:
 def learn_fleet(
     folder: Path | str, *, engine: Engine | None = None, progress: Progress | None = None
 ) -> JsonObject:
-    """Return the record of all that is learnt from a fleet; see `learn_from_fleet`.
+    """Return the record of everything that is learnt from a fleet; see `learn_from_fleet`.
 
-    The prior of each probability is uniform; if there are several groups, it is a Beta
-    distribution that they share.
+    The prior of each probability is uniform; if there are several groups, it is a Beta distribution
+    that they share.
 
     Parameters
     ----------
@@ -142,8 +137,6 @@ def learn_fleet(
         The folder of the fleet. Its twins may still be flying.
     engine : Engine, optional
         The processes that compute; by default this one.
-    progress : Progress, optional
-        Shows how far the work has come.
 
     Raises
     ------
@@ -179,18 +172,18 @@ def learn_fleet(
 
 @dataclass(frozen=True)
 class _GroupLessons:
-    """What is learnt from the twins of one group alone.
+    """What is learnt from the twins of a single group.
 
     Attributes
     ----------
     family : TransitionFamily
-        The transitions as a function of the probabilities to worsen.
+        The transitions as a function of the probabilities of worsening.
     grid : LikelihoodGrid or None
         The likelihood of the probabilities; None if the transitions are not learnt.
     flown_controls : set of str
         The controls under which a transition from one step to the next was flown.
     record : dict
-        The record of the group without its probabilities to worsen.
+        The record of the group without its probabilities of worsening.
     """
 
     family: TransitionFamily
@@ -206,14 +199,10 @@ class _GroupLessons:
     def with_probabilities(
         self, posteriors: Sequence[Distribution], flown_controls: set[str]
     ) -> JsonObject:
-        """Return the record of the group with its probabilities to worsen.
+        """Return the record of the group, completed by its probabilities of worsening.
 
-        Parameters
-        ----------
-        posteriors : sequence of Distribution
-            The posterior of each probability.
-        flown_controls : set of str
-            The controls for which observations contribute to the posterior.
+        `posteriors` has one for each probability; `flown_controls` are the controls for which
+        observations contribute.
         """
         probabilities = {}
         for name, assumed, posterior in zip(
@@ -231,7 +220,7 @@ class _GroupLessons:
 def _lessons_of_groups(
     folder: Path, config: JsonObject, pool: TaskPool, progress: Progress
 ) -> dict[str, _GroupLessons]:
-    """Learn from each group by itself; groups without a flown twin are left out."""
+    """Learn from each group separately; skip groups without a flown twin."""
     lessons = {}
     for record in config["fleet"]["groups"]:
         group = open_group(folder, record["name"], names=False)
@@ -250,10 +239,10 @@ def _lessons_of_groups(
 
 
 def _records(lessons: dict[str, _GroupLessons]) -> JsonObject:
-    """Return the records of all groups, and of the distribution of probabilities common to them.
+    """Return the records of all groups, and of the distribution that their probabilities share.
 
-    The groups share a distribution if several of them have learnt probabilities, if these have the
-    same names in all groups, and if there are `_MOST_SHARED` of them at most.
+    They share one if several groups have learnt probabilities, with the same names in all groups,
+    and at most `_MOST_SHARED` of them.
     """
     grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
     distinct_names = {lesson.family.names for lesson in lessons.values()}
@@ -274,7 +263,7 @@ def _records_with_shared_distribution(
     """Return the records of groups whose probabilities share a distribution.
 
     A control that was flown in any group counts as flown in all, because the shared distribution
-    carries what was learnt of it to the other groups.
+    transfers what was learnt to the other groups.
     """
     posterior = shared_posterior(grids)
     flown_controls: set[str] = set()
@@ -299,12 +288,10 @@ class _FlownGroup:
         The hash of its `config.json`.
     record : dict
         The record of the group in `config.json`.
-    group : DataTree
-        The stored results of the group.
     twins_by_scenario : sequence of TwinsOfScenario
         The twins that have flown, by scenario.
     reading : str
-        Differs from call to call; see `EvidenceKit`.
+        A key that differs from call to call; see `EvidenceKit`.
     """
 
     folder: Path
@@ -315,7 +302,7 @@ class _FlownGroup:
     reading: str
 
     def learn(self, pool: TaskPool, progress: Progress) -> _GroupLessons:
-        """Learn from the twins: the noise, the probabilities to worsen, and the population.
+        """Learn the noise, the probabilities of worsening, and the population from the twins.
 
         The noise is learnt first, because the likelihoods for the other two need it.
         """
@@ -370,20 +357,10 @@ class _FlownGroup:
         pool: TaskPool,
         progress: Progress,
     ) -> GroupEvidence:
-        """Return an object that computes the evidence of the twins by the processes of a pool.
+        """Return the evidence of the twins, computed by the processes of a pool.
 
-        Parameters
-        ----------
-        family : TransitionFamily
-            The transitions.
-        noise_factor : float
-            The factor on the assumed noise.
-        nodes : ParameterNodes or None
-            The values of the calibrated parameter; with None the draws of each twin's calibration.
-        pool : TaskPool
-            The processes.
-        progress : Progress
-            Shows how far a pass over all twins has come.
+        `noise_factor` multiplies the assumed noise. The calibrated parameter takes the values of
+        the nodes, or without nodes the draws of each twin's calibration.
         """
         readings_at_nodes = None if nodes is None else nodes.predicted
         flights = []
@@ -409,10 +386,10 @@ class _FlownGroup:
         family: TransitionFamily,
         nodes: ParameterNodes | None,
     ) -> tuple["_Growth", PopulationPosterior | None]:
-        """Learn the probabilities to worsen, and the population of the parameter if it has nodes.
+        """Learn the probabilities of worsening, and with nodes the population of the parameter.
 
-        Each of the two is learnt given the other, in rounds: first from some of the twins, at last
-        from all. A round begins with the grid and with the population of the last one.
+        Each is learnt given the other, in rounds: first from some of the twins, finally from all. A
+        round begins with the grid and the population of the last one.
         """
         first_axes = None
         population = None
@@ -437,19 +414,10 @@ class _FlownGroup:
         probability: Float,
         nodes: ParameterNodes,
     ) -> PopulationPosterior:
-        """Return the population of the calibrated parameter.
+        """Return the population of the calibrated parameter, given probabilities of worsening (K,).
 
-        The log evidence of the twins is read several times. It is kept in a temporary file, because
-        that of many twins would not fit in memory.
-
-        Parameters
-        ----------
-        evidence : GroupEvidence
-            The evidence of the twins at the values of the parameter.
-        probability : (K,) array
-            The probabilities to worsen.
-        nodes : ParameterNodes
-            The values of the parameter.
+        The log evidence of the twins is read several times, from a temporary file, because that of
+        many twins would not fit in memory.
         """
         with RowFile(
             self.folder, len(nodes.values), rows_together=_MEMBERS_TOGETHER
@@ -460,7 +428,7 @@ class _FlownGroup:
 
 
 def _transition_family(scenario: Scenario) -> TransitionFamily:
-    """Return the transitions of a scenario, as a function of the probabilities that are learnt."""
+    """Return the transitions of a scenario as a function of the learnt probabilities."""
     reason = reason_transitions_are_fixed(scenario)
     if reason:
         return TransitionFamily.fixed(scenario, reason)
@@ -468,14 +436,9 @@ def _transition_family(scenario: Scenario) -> TransitionFamily:
 
 
 def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> tuple[int, set[str]]:
-    """Count what is not learnt of the flown twins of a group, block by block.
+    """Return the number of flown twins with an alarm, and the controls with a further step.
 
-    Returns
-    -------
-    int
-        The number of twins that raised an alarm.
-    set of str
-        The controls under which a twin has flown a step before its last one.
+    These are the controls under which a twin has flown a step before its last one.
     """
     alarmed = 0
     followed_controls: set[str] = set()
@@ -490,7 +453,7 @@ def _counts(group: "xr.DataTree", control_names: Sequence[str]) -> tuple[int, se
 
 
 def _rounds(twin_count: int, *, has_population: bool) -> list[int]:
-    """Return the rounds of learning: each reads one block of twins in so many.
+    """Return the rounds of learning: in each round one block of twins in so many is read.
 
     Growth and population need several rounds to agree, because each is learnt given the other.
     """
@@ -502,12 +465,12 @@ def _rounds(twin_count: int, *, has_population: bool) -> list[int]:
 
 
 class _Growth(NamedTuple):
-    """The likelihood of the probabilities to worsen given the observations of twins.
+    """The likelihood of the probabilities of worsening, given the observations of twins.
 
     Attributes
     ----------
     grid : LikelihoodGrid or None
-        The likelihood; None if the transitions are not learnt.
+        None if the transitions are not learnt.
     explained_count : int
         The number of twins whose observations are possible under the model; the others are left
         out.
@@ -529,21 +492,11 @@ def _growth(
     prior: Float | None,
     first_axes: Axes | None,
 ) -> _Growth:
-    """Return, on a grid, the likelihood of the probabilities with which a state worsens.
+    """Return, on a grid, the likelihood of the probabilities of worsening.
 
-    All twins are read again for each grid of the search, because the likelihoods of the states of
-    many twins do not fit in memory.
-
-    Parameters
-    ----------
-    family : TransitionFamily
-        The transitions as a function of the probabilities.
-    evidence : GroupEvidence
-        The evidence of the twins.
-    prior : (E,) array or None
-        The prior of the calibrated parameter at its nodes; None if it has none.
-    first_axes : tuple of (N,) array or None
-        The log odds with which the search begins.
+    `prior` (E,) is that of the calibrated parameter at its nodes, or None. The search for the grid
+    begins with `first_axes`. All twins are read again for each grid, because the likelihoods of the
+    states of many twins do not fit in memory.
     """
     if not family.names:
         return _Growth(None, evidence.grid_sum((), prior).explained)
@@ -561,5 +514,5 @@ def _growth(
 
 
 def _probabilities(axes: Axes) -> Axes:
-    """Return the probabilities for the axes of a grid of log odds."""
+    """Return the probabilities for axes of log odds."""
     return tuple(logistic(axis) for axis in axes)

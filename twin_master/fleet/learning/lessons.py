@@ -1,4 +1,4 @@
-"""What was learnt from a fleet, as the file `learnt.toml` for scenarios and as rows of a table."""
+"""The results of learning from a fleet, as the file `learnt.toml` and as rows of a table."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,23 +26,16 @@ Record = JsonRecord
 def write_learnt(path: Path, folder: Path, record: Record) -> Path:
     """Write `learnt.toml`, whose tables replace those of a scenario.
 
-    Its first tables are for a new asset: the mean probabilities to worsen that the groups share,
+    Its first tables are for a new asset: the mean probabilities of worsening that the groups share,
     and the noise and the distribution of the parameter of the group with the most twins. If there
     are several groups, each has its own tables as well. All numbers are in SI units.
 
     Parameters
     ----------
-    path : Path
-        The file to write.
     folder : Path
-        The folder of the fleet, whose configuration has the assumed noise of the sensors.
+        The folder of the fleet, whose configuration has the assumed noise.
     record : mapping
-        What was learnt; see `learn_from_fleet`.
-
-    Returns
-    -------
-    Path
-        The path of the file.
+        As `learn_from_fleet` returns it.
     """
     groups = record["groups"]
     scenarios = {}
@@ -64,19 +57,12 @@ def write_learnt(path: Path, folder: Path, record: Record) -> Path:
 
 
 def _scenario_tables(group: Record, means: Record, scenario: Record) -> JsonObject:
-    """Return the tables with which the lessons of a group replace assumptions of a scenario.
+    """Return the tables by which a group's results replace assumptions of its scenario.
 
-    Parameters
-    ----------
-    group : mapping
-        What was learnt of the group.
-    means : mapping
-        Records with the mean of each probability, of the group or shared by all groups.
-    scenario : mapping
-        The scenario of the group, with the assumed noise.
+    `means` has the mean of each probability, of the group or shared by all groups.
     """
     tables: JsonObject = {}
-    # Probabilities to worsen by control, or by control and factor. For a control that was never
+    # Probabilities of worsening by control, or by control and factor. For a control that was never
     # flown nothing was learnt: its probability is the assumed one.
     probability: JsonObject = {}
     for name, learnt in group["probability"].items():
@@ -120,11 +106,9 @@ class LessonRow(NamedTuple):
     Attributes
     ----------
     group : str
-        The name and the size of the group in the first of its rows; empty in the others.
-    quantity : str
-        The quantity that was learnt.
+        Name and size of the group in its first row; empty in the others.
     assumed, mean, interval : str
-        Its assumed value, its mean and its 95 % interval.
+        The assumed value, the learnt mean and its 95 % interval.
     """
 
     group: str
@@ -153,7 +137,7 @@ def lesson_rows(record: Record) -> list[LessonRow]:
 
 
 def _group_rows(group: Record) -> Iterator[LessonRow]:
-    """Yield the rows of a group: probabilities to worsen, noise, and moments of the population."""
+    """Yield the rows of a group: probabilities of worsening, noise, and population moments."""
     for control, probability in group["probability"].items():
         yield _probability_row(control, probability)
     if "transitions_kept_because" in group:

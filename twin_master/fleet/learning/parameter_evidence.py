@@ -82,7 +82,7 @@ class TwinLikelihood(NamedTuple):
     first_row: Index
 
     def evidence_on_grid(self, family: TransitionFamily, axes: Axes) -> Float:
-        """Return the log evidence of each twin on a grid of the probabilities to worsen.
+        """Return the log evidence of each twin on a grid of the probabilities of worsening.
 
         Parameters
         ----------

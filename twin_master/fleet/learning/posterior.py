@@ -21,7 +21,7 @@ from twin_master.fleet.learning.grid_density import (
 GRID_POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
 """Points of each axis of the grid of probabilities, by the number of axes."""
 LOWEST, HIGHEST = 1e-4, 0.9
-"""Bounds of a probability to worsen, which keep its log odds finite."""
+"""Bounds of a probability of worsening, which keep its log odds finite."""
 SHARED_POINTS = 121
 """Points of each axis of a group, and of the mean of the distribution that groups share."""
 CONCENTRATION_POINTS = 13

@@ -27,24 +27,18 @@ class AssetStates:
 
     Attributes
     ----------
-    group : str
-        The name of the group.
     scenario : Scenario
         Its scenario, with F factors of the state.
-    names : list of str
-        The names of the assets.
     step : (B,) array
         The last step of each.
     mean, deviation : (B, F) array
-        Mean and standard deviation of the state, in SI units; NaN if no state of the model
-        explains the observations.
-    control : list of str
-        The control in force.
+        Mean and standard deviation of the state, in SI units; NaN if no state of the model explains
+        the observations.
     alarms : (B,) array
         The number of alarms.
     leaving_probability : (B,) array
         The probability that the control changes within the scenario's `prediction_steps`; NaN if
-        it is not known.
+        unknown.
     """
 
     group: str
@@ -93,7 +87,7 @@ class AssetStates:
 
     @property
     def attention_order(self) -> Index:
-        """The indices of the assets in the order in which they need attention, a (B,) array.
+        """The indices (B,) of the assets in the order in which they need attention.
 
         The order is by the number of alarms, then by the probability of a change of control, then
         by severity of damage. Assets without an estimated state count as the most damaged.
@@ -104,9 +98,9 @@ class AssetStates:
 
     @property
     def needs_attention(self) -> NDArray[np.bool_]:
-        """Whether each asset raised an alarm, may soon change its control, or has no estimate (B,).
+        """Whether each asset (B,) raised an alarm, may soon change its control, or has no estimate.
 
-        An asset whose probability of a change is not known counts as one that may.
+        An unknown probability of a change counts as a possible change.
         """
         may_change = (self.leaving_percentage > 0.0) | np.isnan(self.leaving_probability)
         return np.asarray((self.alarms > 0) | may_change | np.isnan(self.mean).any(axis=1))
@@ -138,8 +132,6 @@ def states_of_flown_assets(
         The record of the group in `config.json`.
     group : DataTree
         The stored results of the group, with a row for each twin.
-    rows : slice
-        The rows.
     leaving_probability : (B,) array, optional
         The probability that each twin in the rows changes its control; NaN if left out.
     """
@@ -167,7 +159,7 @@ def states_of_flown_assets(
 
 
 def states_of_watched_assets(group_record: JsonRecord, decided_assets: JsonRecord) -> AssetStates:
-    """Return state, control and alarms of the assets of a watched group after their last steps.
+    """Return state, control and alarms of a watched group's assets after their last steps.
 
     Parameters
     ----------
@@ -207,8 +199,7 @@ def states_of_watched_assets(group_record: JsonRecord, decided_assets: JsonRecor
 def _scenario_of_group(group_record: JsonRecord) -> Scenario:
     """Return a scenario whose states and controls hold for all assets of a group.
 
-    All scenarios of a group come from one scenario file, and differ only in what it lets differ
-    from asset to asset, so that the first one is taken.
+    All scenarios of a group come from one file, so the first one is taken.
     """
     return Scenario.model_validate(group_record["scenarios"][0])
 
@@ -216,18 +207,9 @@ def _scenario_of_group(group_record: JsonRecord) -> Scenario:
 def _moments_of_states(
     scenario: Scenario, moments_by_asset: list[JsonObject], moment: str
 ) -> Float:
-    """Return a moment of each state factor of each asset, a (B, F) array.
+    """Return a moment (B, F) of each state factor of each asset; NaN if it is missing.
 
-    It is NaN where the record has None.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        The scenario, which names the factors.
-    moments_by_asset : list of dict
-        For each asset, the moments of each state factor by the factor's name.
-    moment : str
-        The key of the moment: "mean" or "standard_deviation".
+    The moment is "mean" or "standard_deviation".
     """
     rows = []
     for moments in moments_by_asset:

@@ -1,8 +1,4 @@
-"""What the page of a fleet shows of a flown group, gathered block by block.
-
-Of a large group, the figures show every so many-th asset; counts, the table of assets that need
-attention, and the asset with the most damage are those of all.
-"""
+"""What the page of a fleet shows of a flown group, collected block by block."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,19 +29,19 @@ DRAWN_ASSETS = 10_000
 
 @dataclass
 class DrawnAssets:
-    """The assets that figures show.
+    """The assets that are drawn in figures.
 
     Attributes
     ----------
     distance : int
-        Every so many-th asset is shown, from the first one on.
+        Every so many-th asset is drawn, from the first one on.
     last_mean : list of (B, F) array
         The mean states after the last steps, block by block, in SI units; NaN if no state of the
         model explains the observations.
     mean, state : list of (B, T, F) array
         The believed mean states and the true states in all steps.
     failed_count : int
-        The number of them that failed in flight.
+        The number of drawn assets that failed in flight.
     """
 
     distance: int
@@ -55,17 +51,7 @@ class DrawnAssets:
     failed_count: int = 0
 
     def add(self, group: "xr.DataTree", rows: slice, states: AssetStates) -> None:
-        """Add those of the flown assets of a block that are shown.
-
-        Parameters
-        ----------
-        group : DataTree
-            The stored results of the group.
-        rows : slice
-            The rows of the block.
-        states : AssetStates
-            The states of its flown assets.
-        """
+        """Add the flown assets of a block that are to be drawn."""
         status = stored_values(group, "status", rows)
         is_drawn = (np.arange(rows.start, rows.stop) % self.distance) == 0
         flown = flown_rows(status)
@@ -98,7 +84,7 @@ class GroupOverview:
     most_damaged : AssetStates or None
         The most severely damaged asset; None if no asset has an estimated state.
     drawn : DrawnAssets
-        The assets that figures show.
+        The assets in figures.
     leaving_unknown_because : str
         Why it is not known which assets will soon change their control; empty if it is.
     """
@@ -152,12 +138,8 @@ def overview_of_group(
 
     Parameters
     ----------
-    folder : Path
-        The folder of the fleet.
     record : mapping
         The record of the group in `config.json`.
-    group : DataTree
-        The stored results of the group.
     most_assets : int
         The largest number of assets that need attention.
     """

@@ -1,4 +1,4 @@
-"""Figures of groups of assets: maps of their health, their health over time, their returns."""
+"""Figures of groups of assets: maps of their health, its course over time, their returns."""
 
 from collections.abc import Mapping
 
@@ -25,11 +25,9 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario with F factors of the state.
     mean : (B, F) array
-        The last mean states, in SI units; NaN if no state of the model explains the
-        observations of an asset.
+        The last mean states, in SI units; NaN if no state of the model explains the observations of
+        an asset.
     failed : int
         The number of assets that failed in flight.
     """
@@ -69,15 +67,13 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
 
 @style.publication_style()
 def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
-    """Draw the states of B assets over T steps, a panel for each factor of the state.
+    """Draw the states of B assets over T steps, with a panel for each factor of the state.
 
     Bands hold the central 50 % and 90 % of the assets' estimates; lines are the medians of the
     estimates and, if it is known, of the true values.
 
     Parameters
     ----------
-    scenario : Scenario
-        The scenario with F factors of the state.
     mean : (B, T, F) array
         The mean states, in SI units; NaN in steps that were not flown.
     state : (B, T, F) array
@@ -116,7 +112,7 @@ _LEAST_WIDTH = 1e-3
 
 @style.publication_style()
 def returns_figure(returns: Mapping[str, Float]) -> Figure:
-    """Draw the discounted returns of the flights of groups, a row for each group.
+    """Draw the discounted returns of the flights of groups, with a row for each group.
 
     Bands hold 90 % and 50 % of the flights, the mean has its 95 % interval. Groups without a return
     are left out.

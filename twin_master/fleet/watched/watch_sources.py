@@ -1,4 +1,4 @@
-"""Where the observations of watched assets come from: files, or topics of a broker."""
+"""Sources of watched assets' observations: files, or topics of a broker."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -40,16 +40,12 @@ class BrokerMessage(Protocol):
 
 
 class Watcher(Protocol):
-    """The part of the watch of a fleet that sources use; `FleetWatch` implements it.
+    """The part of a fleet's watch that sources use; `FleetWatch` implements it.
 
     Attributes
     ----------
-    folder : Path
-        The folder of the fleet.
-    assets : dict of str to WatchedAsset
-        The assets under watch.
     is_end_requested : bool
-        Whether the operator has asked for the end of the watch.
+        Whether the operator has requested the end of the watch.
     final_actions : ExitStack
         The actions at the end of the watch, before the folders are released.
     """
@@ -60,7 +56,7 @@ class Watcher(Protocol):
     final_actions: ExitStack
 
     def note(self, sentence: str) -> None:
-        """Tell the operator a sentence."""
+        """Notify the operator by a sentence."""
 
     def advance(
         self,
@@ -72,7 +68,7 @@ class Watcher(Protocol):
         """Process the new observations of an asset; return the number of steps."""
 
     def has_all_steps(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset has reached the number of steps that was asked for."""
+        """Return whether an asset has reached the requested number of steps."""
 
     def lose(self, key: str, error: Exception) -> None:
         """Stop watching an asset because of an error."""
@@ -90,14 +86,10 @@ class Source(Protocol):
 
 
 class FileSource:
-    """A file for each asset of a group, which is named after its file.
+    """A file for each asset of a group; the asset is named after its file.
 
     Parameters
     ----------
-    watcher : Watcher
-        The watch of the fleet.
-    group : Group
-        The group.
     follow : bool
         Whether to wait for new lines in the files and for new files.
 
@@ -120,7 +112,7 @@ class FileSource:
 
     @property
     def has_ended(self) -> bool:
-        """Whether all files are read to their end, or to the number of steps that was asked for."""
+        """Whether all files are read to their end, or to the requested number of steps."""
         if self._follow:
             return False
         for name in self._files:
@@ -130,7 +122,7 @@ class FileSource:
         return True
 
     def _is_read(self, asset: WatchedAsset) -> bool:
-        """Return whether the file of an asset is read to its end or has all steps asked for."""
+        """Return whether the file of an asset is read to its end or to the requested steps."""
         return asset.watch.intake.has_ended or self._watcher.has_all_steps(asset)
 
     def look(self, *, for_new_assets: bool) -> int:
@@ -139,7 +131,7 @@ class FileSource:
         Parameters
         ----------
         for_new_assets : bool
-            Whether to search first for files of assets that were not known before.
+            Whether to search first for files of new assets.
         """
         if for_new_assets:
             for path in recording_files(self._group.observations):
@@ -162,7 +154,7 @@ class FileSource:
 
 
 def _has_whole_header(path: Path) -> bool:
-    """Return whether the first line of a file ends with a line break; false if it is unreadable."""
+    """Return whether the first line of a file is complete; False if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.readline(_LONGEST_HEADER).endswith(b"\n")
@@ -171,12 +163,10 @@ def _has_whole_header(path: Path) -> bool:
 
 
 class TopicSource:
-    """A topic of a broker for each asset of a group; the last level of the topic names the asset.
+    """A topic of a broker for each asset of a group; its last level names the asset.
 
     Parameters
     ----------
-    watcher : Watcher
-        The watch of the fleet.
     group : Group
         The group, whose observations are the address of a broker.
     authority : Path or None
@@ -229,7 +219,7 @@ class TopicSource:
     def _take_in(self, message: BrokerMessage) -> int:
         """Queue a message at its topic and process the topic; return the number of new steps.
 
-        It is ignored if its asset has all steps asked for, or if there are too many assets.
+        It is ignored if its asset has all requested steps, or if there are too many assets.
         """
         name = message.topic.rpartition("/")[2]
         asset = self._watcher.assets.get(f"{self._group.name}/{name}")
@@ -240,7 +230,7 @@ class TopicSource:
         return self._advance(name)
 
     def _find_topic(self, name: str) -> Topic | None:
-        """Return the topic of an asset, and create it if it is new; None if there are too many."""
+        """Return the topic of an asset, created if it is new; None if there are too many."""
         if name not in self._topics and len(self._topics) < LARGEST_FLEET:
             lose = partial(self._watcher.lose, f"{self._group.name}/{name}")
             self._topics[name] = Topic(
@@ -253,7 +243,7 @@ class TopicSource:
         return self._watcher.advance(self._group, name, lambda: self._topics[name])
 
     def _heartbeat(self) -> dict[str, object]:
-        """Return the status of the watch, which the session publishes at regular intervals."""
+        """Return the state of the watch, which the session publishes at regular intervals."""
         # A topic has no watch until one is attached to it.
         watches = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         quiet_watches = [watch for watch in watches if watch.is_quiet]

@@ -1,4 +1,4 @@
-"""One asset of a fleet under watch, and the file with the last decisions of all assets."""
+"""One watched asset of a fleet, and the file with the last decisions of all assets."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,11 +21,6 @@ _KEPT_OF_DECISION = ("step", "control", "next_control", "probability", "health")
 
 def read_standing(folder: Path) -> JsonObject:
     """Read the last decisions and alarms of the assets of a watched fleet.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder of the fleet.
 
     Returns
     -------
@@ -73,28 +68,23 @@ def watched_fleet_counts(standing: JsonRecord) -> dict[str, int]:
 
 
 class WatchedAsset:
-    """An asset under watch.
+    """A watched asset.
 
     Parameters
     ----------
     name : str
-        The names of its group and of itself, GROUP/NAME; its folder has the same name.
-    watch : Watch
-        The watch, which has begun.
-    feed : Feed
-        The feed of its observations.
+        The names of group and asset, GROUP/NAME, which also is the path of its folder.
     previous_record : mapping or None
-        The record of the asset when it was watched last; None if it is new.
+        The record of the asset from the last time; None if it is new.
     keeps_file_open : bool
-        Whether the file of its observations, if there is one, stays open between two looks.
+        Whether the file of its observations, if any, stays open between two polls.
 
     Attributes
     ----------
     decision : dict or None
         The last decision.
     alarms : set of str
-        The sentences of the alarms that the operator was given since this process began or
-        resumed the watch.
+        The sentences of the alarms since this process began or resumed the watch.
     first_new_step : int
         The first step whose decision no earlier process has recorded.
     close : callable

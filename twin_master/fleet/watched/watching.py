@@ -61,8 +61,6 @@ class _Loss:
 
     Attributes
     ----------
-    sentence : str
-        The message of the error.
     wait : float
         The time from the error until the watch is resumed [s].
     again : float
@@ -83,22 +81,20 @@ class FleetWatch:
 
     Parameters
     ----------
-    fleet : Fleet
-        The fleet, whose groups have `observations`.
     folder : Path
-        The folder of the fleet, with the folder of a watch for each asset; a fleet that was
-        watched there before is continued.
+        The folder of the fleet, with the folder of a watch for each asset; a fleet that was watched
+        there before is resumed.
     tell : callable
         Called with the asset and each of its decisions, once the decision is in the journal.
     note : callable
-        Called with sentences for the operator: on errors that interrupt the watch of an asset, and
-        on brokers.
+        Called with sentences for the operator: about brokers, and errors that interrupt the watch
+        of an asset.
     follow : bool
         Whether to wait for new lines in the files and for new files.
     steps : int, optional
         The number of steps after which no more observations of an asset are processed.
     authority : Path, optional
-        The certificate of the authority that has signed the broker's certificate.
+        The certificate of the authority that has signed the broker's.
 
     Raises
     ------
@@ -110,8 +106,7 @@ class FleetWatch:
     Attributes
     ----------
     assets : dict of str to WatchedAsset
-        The assets under watch, by GROUP/NAME; an asset whose watch an error has interrupted is not
-        among them.
+        The watched assets by GROUP/NAME, without those that an error has interrupted.
     standing : dict
         The records of all assets as last written to the file; see `read_standing`.
     is_end_requested : bool
@@ -153,7 +148,7 @@ class FleetWatch:
         self._most_followed_files = allow_many_files() - FURTHER_FILES
 
     def note(self, sentence: str) -> None:
-        """Tell the operator a sentence."""
+        """Notify the operator by a sentence."""
         self._note(sentence)
 
     @property
@@ -163,7 +158,7 @@ class FleetWatch:
 
     @property
     def complaints(self) -> dict[str, str]:
-        """Why messages of watched assets could not be used, by asset; see `Intake.complaint`."""
+        """Why messages of watched assets were of no use, by asset; see `Intake.complaint`."""
         complaints = {}
         for key, asset in sorted(self.assets.items()):
             complaint = asset.watch.intake.complaint()
@@ -172,7 +167,7 @@ class FleetWatch:
         return complaints
 
     def run(self, after_look: Callable[[], None] = _do_nothing) -> None:
-        """Watch until all files are read to their end, or until the watch is asked to end.
+        """Watch until all files are read to their end, or until the end is requested.
 
         Parameters
         ----------
@@ -219,26 +214,17 @@ class FleetWatch:
         open_feed: Callable[[], Feed],
         most_steps: int | None = None,
     ) -> int:
-        """Process the new observations of an asset.
+        """Process the new observations of an asset, and return the number of steps.
 
         If the asset is not watched, its watch is begun or resumed first, unless an error has
         interrupted it and the waiting time is not over.
 
         Parameters
         ----------
-        group : Group
-            The group of the asset.
-        name : str
-            The name of the asset.
         open_feed : callable
             Returns the feed of its observations.
         most_steps : int, optional
             The largest number of steps to process; by default all that have come.
-
-        Returns
-        -------
-        int
-            The number of processed steps.
         """
         key = f"{group.name}/{name}"
         is_waiting = key in self._lost and time.monotonic() < self._lost[key].again
@@ -268,12 +254,9 @@ class FleetWatch:
         return steps
 
     def _take_up(self, group: Group, name: str, feed: Feed) -> None:
-        """Begin or resume the watch of an asset, and hand on a decision that was not handed on.
+        """Begin or resume the watch of an asset, and pass on a decision that was not passed on.
 
-        Raises
-        ------
-        FleetError
-            If the name cannot be that of a folder, or if there are too many assets.
+        An error is raised if the name cannot be that of a folder, or if there are too many assets.
         """
         if not _ASSET_NAME.fullmatch(name):
             raise FleetError(
@@ -297,7 +280,7 @@ class FleetWatch:
             self._hand_on(asset, last_decision)
 
     def _open_asset(self, group: Group, name: str, feed: Feed) -> WatchedAsset:
-        """Begin or resume the watch of an asset in its locked folder, and return the asset."""
+        """Begin or resume the watch of an asset in its locked folder."""
         key = f"{group.name}/{name}"
         folder = self.folder / group.name / name
         sibling = self._sibling.get(group.name)
@@ -333,9 +316,9 @@ class FleetWatch:
         return asset
 
     def _hand_on(self, asset: WatchedAsset, decision: JsonObject) -> None:
-        """Send a decision to the operator and to the feed of the asset, and record its alarms.
+        """Pass a decision to the operator and to the feed of the asset, and record its alarms.
 
-        A notice before the first step has no control, and is not kept as the last decision.
+        A notice before the first step has no control, and does not become the last decision.
         """
         if "control" in decision:
             asset.decision = decision
@@ -346,15 +329,15 @@ class FleetWatch:
                 asset.alarms.add(notice["sentence"])
 
     def ask(self) -> None:
-        """Ask the watch to end after the present step."""
+        """Request the end of the watch after the present step."""
         self.is_end_requested = True
 
     def has_all_steps(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset has reached the number of steps that was asked for."""
+        """Return whether an asset has reached the requested number of steps."""
         return self._wanted_steps is not None and asset.watch.twin.steps >= self._wanted_steps
 
     def lose(self, key: str, error: Exception) -> None:
-        """Stop watching an asset because of an error, and release its folder.
+        """Interrupt the watch of an asset because of an error, and release its folder.
 
         The watch is resumed after a time. If the same error comes again, this time doubles and the
         operator gets no second message.
@@ -393,13 +376,7 @@ class FleetWatch:
 
 
 def _check_observed(fleet: Fleet) -> None:
-    """Check that all groups of a fleet are of real assets.
-
-    Raises
-    ------
-    FleetError
-        If a group has no `observations`.
-    """
+    """Raise an error if a group of a fleet has no `observations`, and so no real assets."""
     unobserved = [group.name for group in fleet.groups if not group.observations]
     if unobserved:
         raise FleetError(
@@ -420,5 +397,5 @@ def _record(fleet: Fleet) -> JsonObject:
 
 
 def _pause_after(look_seconds: float) -> None:
-    """Sleep after a poll without new messages, in proportion to the time of the poll [s]."""
+    """Sleep after a poll without new messages, in proportion to the duration of the poll [s]."""
     time.sleep(min(max(IDLE_SECONDS, look_seconds / BUSY_SHARE), LONGEST_IDLE))
