@@ -1,4 +1,4 @@
-"""Calibration step 1: the planform of the real wing, and the design brought to it."""
+"""Calibration step 1: the planform of the real wing, and the design with this planform."""
 
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.result.record import FigureReading, ParameterPrior
+from calibration.result.record import ParameterPrior, QuantityReading
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
@@ -39,7 +39,7 @@ _SHORTEST_LENGTH_MM = 10.0  # a smaller number is probably a length in m
 
 @dataclass(frozen=True)
 class MeasuredLength:
-    """One length of the wing, designed and as built.
+    """A length of the wing as designed and as built.
 
     Attributes
     ----------
@@ -80,9 +80,9 @@ class MeasuredLength:
         )
 
     @property
-    def reading(self) -> FigureReading:
+    def reading(self) -> QuantityReading:
         """The reading: the measured length with its uncertainty."""
-        return FigureReading(
+        return QuantityReading(
             self.name, "planform", self.measured, READING_UNCERTAINTY / HALF_WIDTH_95
         )
 
@@ -112,7 +112,7 @@ class Lengths(NamedTuple):
 
     @property
     def sha256(self) -> str:
-        """Hash of the lengths and their uncertainty, equal on every platform."""
+        """Hash of the lengths and their uncertainty, the same on every platform."""
         return hash_record([[*astuple(length), TOLERANCE, READING_UNCERTAINTY] for length in self])
 
 
@@ -130,7 +130,7 @@ def published_lengths() -> Lengths:
 
 
 def read_lengths(path: Path) -> Lengths:
-    """Return the lengths of step 1 in the authors' calibration folder, or in one CSV file.
+    """Read the lengths of step 1 in the authors' calibration folder, or in one CSV file.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def read_lengths(path: Path) -> Lengths:
 
 
 def _lengths_in_millimetres(table: TextTable, column: str) -> Float:
-    """Return a column of lengths [mm]; refuse lengths in m."""
+    """Return a column of lengths [mm]; raise `ExperimentDataError` if they look like metres."""
     values = table.numbers(column, _NEEDED_BY, positive=True)
     too_short = np.flatnonzero(values < _SHORTEST_LENGTH_MM)
     if too_short.size:
@@ -179,16 +179,15 @@ def _lengths_in_millimetres(table: TextTable, column: str) -> Float:
 
 
 def tailored_geometry(lengths: Lengths) -> Geometry:
-    """Return the posterior means of the lengths [m], as the paper uses them.
+    """Return the posterior means of the lengths [m], rounded to 0.1 mm.
 
-    They are rounded to 0.1 mm, which is their standard deviation. The paper does not use that
-    further.
+    That is their standard deviation, of which the paper makes no further use.
     """
     return Geometry(*(round(length.posterior.mean, 4) for length in lengths))
 
 
 def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
-    """Return a wing's design with the planform that was measured on the built wing.
+    """Return a wing's design with the measured planform.
 
     Only the semi-span and the chords change. Some positions are fractions in the design, and so
     move with the planform: those of ribs, point masses and bands of the skin along the span, and
@@ -196,11 +195,6 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     change: those of gauges and defect regions from the root, and that of the test load from the
     tip. The net load in a turning flight, the thicknesses of skin and webs, and the size of the
     largest cell of the mesh do not change either.
-
-    Parameters
-    ----------
-    design : WingDesign
-        The design before the measurement.
 
     Raises
     ------

@@ -17,12 +17,7 @@ _FOLDERS_OF_STEPS = (Path(), Path("datafiles"), Path("src") / "datafiles")
 def possible_locations(folder: Path, name: Path) -> Iterator[Path]:
     """Yield the possible locations of a file or folder below a user's folder.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder that the user names.
-    name : Path
-        The file or folder in the authors' layout, such as `step1/geometry_data.csv`.
+    `name` is the path in the authors' layout, such as `step1/geometry_data.csv`.
     """
     for folder_of_steps in _FOLDERS_OF_STEPS:
         yield folder / folder_of_steps / name
@@ -37,7 +32,7 @@ def find_in_lab_folder(folder: Path, name: Path) -> Path | None:
 
 
 def lab_table(path: Path | str, name: Path) -> TextTable:
-    """Return a table of a laboratory.
+    """Read a table of a laboratory.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
 """Simulated experiments on a wing whose true state is known.
 
-`TestBench` is the interface that every experiment needs of a wing. `VirtualWing` implements it by a
-reduced model with a digital state as its truth, and `twin_master.assets.virtual_experiments` by an
-FMU. The functions `measure_...` do the experiments of the paper on a bench, with reading errors and
-a seed.
+Every experiment needs a `TestBench`. `VirtualWing` implements it by a reduced model with a known
+digital state, and `twin_master.assets.virtual_experiments` by an FMU. The functions `measure_...`
+do the experiments of the paper on a bench, with reading errors and a seed.
 """
 
 import math
@@ -14,8 +13,8 @@ import numpy as np
 
 from calibration.dynamics.records import RingDownRecord
 from calibration.errors import ExperimentDataError
-from calibration.joint.wing_table import weighed
-from calibration.result.record import FigureReading
+from calibration.joint.wing_table import weighed_mass
+from calibration.result.record import QuantityReading
 from calibration.static.experiments import (
     HALF_WIDTH_95,
     LoadDisplacementData,
@@ -50,14 +49,14 @@ _RELEASE_DEVIATION = 0.05  # relative standard deviation of the tip displacement
 
 
 RingDownSignal = tuple[Float, Float]
-"""A recorded signal: instants (N,) from the release on [s] and values (N,) [V]."""
+"""A recorded signal: times (N,) from the release on [s] and values (N,) [V]."""
 
 
 class TestBench(Protocol):
-    """A wing, real or not, that can be loaded and released, and is read without error."""
+    """A wing, real or simulated, that can be loaded and released, and is read without error."""
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement [m] of the point 5 cm from the tip, under a load there [N]."""
+        """Return the displacement [m] of the point 5 cm from the tip under a load there [N]."""
 
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
@@ -76,13 +75,7 @@ class TestBench(Protocol):
 
 
 def check_recorded(gauges: int) -> None:
-    """Refuse a wing with too few gauges.
-
-    Raises
-    ------
-    ExperimentDataError
-        If the number of gauges is smaller than `RECORDED_GAUGE`.
-    """
+    """Raise `ExperimentDataError` if a wing has fewer than `RECORDED_GAUGE` gauges."""
     if gauges < RECORDED_GAUGE:
         raise ExperimentDataError(
             f"the wing has {gauges} gauges, but a release is recorded at gauge {RECORDED_GAUGE}."
@@ -90,7 +83,7 @@ def check_recorded(gauges: int) -> None:
 
 
 def sampling_times(duration: float, sampling_rate: float) -> Float:
-    """Return the instants of a record [s], from 0 to `duration`.
+    """Return the times of a record [s], from 0 to `duration`.
 
     Raises
     ------
@@ -125,7 +118,7 @@ class VirtualWing:
     ExperimentDataError
         If the wing has fewer gauges than `RECORDED_GAUGE`, or a frequency error is not above -1.
     fe.runtime.errors.OutsideModelError
-        If the truth lies outside the model.
+        If the true state lies outside the range of the model.
     """
 
     model: ReducedModel
@@ -143,15 +136,15 @@ class VirtualWing:
         self.model.modes(self.truth.values, self.truth.stiffness_loss)
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement [m] of the point 5 cm from the tip, under a load there [N]."""
-        truth = self.truth
-        stiffness = self.model.tip_stiffness(truth.young_modulus_factor, truth.stiffness_loss)
+        """Return the displacement [m] of the point 5 cm from the tip under a load there [N]."""
+        state = self.truth
+        stiffness = self.model.tip_stiffness(state.young_modulus_factor, state.stiffness_loss)
         return load / stiffness
 
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Return the strain signal after a release of the tip, as the sum of all modes' decays.
+        """Return the strain signal after a release of the tip, the sum of all modes' decays.
 
         Parameters
         ----------
@@ -163,8 +156,8 @@ class VirtualWing:
             The sampling rate [Hz].
         """
         time = sampling_times(duration, sampling_rate)
-        truth = self.truth
-        vector = self.model.vector(truth.values, truth.stiffness_loss)
+        state = self.truth
+        vector = self.model.vector(state.values, state.stiffness_loss)
         modes = self.model.modes(vector)
         static_response = self.model.static_response(vector, load=np.array((0.0, 1.0)))
 
@@ -179,7 +172,7 @@ class VirtualWing:
         for mode, error in zip(modes.followed, self.frequency_error, strict=True):
             angular_frequency[mode] *= 1.0 + error
         damping_ratio = rayleigh_damping_ratio(
-            truth.damping_alpha, truth.damping_beta, modes.frequency
+            state.damping_alpha, state.damping_beta, modes.frequency
         )
         strain = np.zeros_like(time)
         for mode, amplitude in enumerate(initial_strain):
@@ -192,16 +185,7 @@ class VirtualWing:
 def _free_decay(omega: float, zeta: float, time: Float) -> Float:
     """Return the free decay of an oscillator from a displacement of 1.
 
-    It solves q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0.
-
-    Parameters
-    ----------
-    omega : float
-        The natural angular frequency [rad/s].
-    zeta : float
-        The damping ratio [1], which may exceed 1.
-    time : (N,) array
-        The instants [s].
+    It solves q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0; zeta may exceed 1.
     """
     root = np.sqrt(complex(zeta**2 - 1.0))
     if abs(root) < 1e-8:  # critical damping, where both poles are equal
@@ -216,7 +200,7 @@ def _free_decay(omega: float, zeta: float, time: Float) -> Float:
 
 
 def measure_load_test(bench: TestBench, seed: Seed) -> LoadDisplacementData:
-    """Return the readings of a load test as in the paper: two runs of 250 to 1000 g near the tip.
+    """Simulate a load test as in the paper: two runs of 250 to 1000 g near the tip.
 
     The true load is the nominal one; load and displacement are both read with the paper's errors.
     """
@@ -239,7 +223,7 @@ def measure_ring_down(
     noise: float = 1e-4,
     quantisation: float | None = None,
 ) -> tuple[RingDownRecord, ...]:
-    """Return records of the strain after several releases of the tip.
+    """Simulate records of the strain after several releases of the tip.
 
     Parameters
     ----------
@@ -289,7 +273,7 @@ def measure_lengths(
     *,
     designed: Geometry | None = None,
 ) -> Lengths:
-    """Return the readings of semi-span and chords of a wing.
+    """Simulate readings of semi-span and chords of a wing.
 
     Parameters
     ----------
@@ -309,8 +293,8 @@ def measure_lengths(
     return Lengths(*lengths)
 
 
-def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> FigureReading:
-    """Return the reading of a weighing of two servos and the pitot tube.
+def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> QuantityReading:
+    """Simulate a weighing of two servos and the pitot tube.
 
     Parameters
     ----------
@@ -322,4 +306,4 @@ def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) 
     generator = np.random.default_rng(child_seed(seed, _WEIGHING))
     error = float(generator.normal(0.0, standard_deviation))
     total_mass = 2.0 * truth.servo_mass + truth.pitot_mass
-    return weighed(total_mass + error, standard_deviation)
+    return weighed_mass(total_mass + error, standard_deviation)

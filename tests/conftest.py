@@ -245,7 +245,7 @@ def synthetic_calibration(
     import xarray as xr
 
     from calibration.joint.wing_table import QUANTITIES, wing_priors
-    from calibration.result.record import Calibration, FigureReading
+    from calibration.result.record import Calibration, QuantityReading
     from fe.wing.design import load_design
 
     generator = np.random.default_rng(seed)
@@ -276,7 +276,7 @@ def synthetic_calibration(
         provenance={"versions": {"numpy": "2"}, "input_hashes": {}},
         design_hash=design.hash,
         quantities=QUANTITIES,
-        readings=(FigureReading("tip_stiffness", "load test", 682.1, 6.5),),
+        readings=(QuantityReading("tip_stiffness", "load test", 682.1, 6.5),),
         measured=xr.Dataset(
             {
                 name: ("pair", np.array(values), {"units": unit, "long_name": f"{name} of the test"})

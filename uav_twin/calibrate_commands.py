@@ -133,7 +133,9 @@ def _calibration_record(result: "Calibration") -> dict[str, Any]:
         "explained": result.explained,
         "seed": result.seed,
         "parameters": [
-            asdict(prior) | posterior(prior.name) | {"prior_left": result.kept_share(prior.name)}
+            asdict(prior)
+            | posterior(prior.name)
+            | {"prior_left": result.posterior_over_prior(prior.name)}
             for prior in result.priors
         ],
         "quantities": [asdict(figure) | posterior(figure.name) for figure in result.quantities],

@@ -29,7 +29,7 @@ from calibration.joint.measured_modes import measured_modes
 from calibration.joint.posterior import joint_posterior
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, wing_priors
 from calibration.paper.procedure import fit_masses
-from calibration.result.record import STATE, FigureReading, prior_samples
+from calibration.result.record import STATE, QuantityReading, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import LoadDisplacementData
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down, weigh
@@ -71,7 +71,7 @@ class MeasuredWing:
 
     truth: NDArray[np.float64]
     static: LoadDisplacementData
-    readings: tuple[FigureReading, ...]
+    readings: tuple[QuantityReading, ...]
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""A sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22).
+"""Fit a sum of damped cosines, an offset and a drift: Kapteyn et al. 2021, eq. (22).
 
 A damped cosine ("wave") is the real part of A exp(s t) with the complex amplitude A and the pole
 s = -decay rate + i damped angular frequency [1/s].
@@ -23,7 +23,7 @@ _MOST_EVALUATIONS = 300  # of the least squares, for each unknown
 
 
 class RingDownMode(NamedTuple):
-    """One damped cosine of a record as a mode: Kapteyn et al. 2021, eqs. (23) and (24).
+    """A damped cosine of a record as a mode: Kapteyn et al. 2021, eqs. (23) and (24).
 
     The natural angular frequency is |s|, so f = |s| / 2 pi and zeta = -Re s / |s|. Standard errors
     are propagated to first order with the full covariance of Re s and Im s, for independent
@@ -79,7 +79,7 @@ class RingDownMode(NamedTuple):
 
 
 def modal_gradients(pole: complex) -> Float:
-    """Return the derivatives of natural frequency and damping ratio with respect to a pole.
+    """Return the derivatives of natural frequency and damping ratio by the real and imaginary pole.
 
     Parameters
     ----------
@@ -145,14 +145,14 @@ class DampedCosineFit(NamedTuple):
 class DampedCosines:
     """A model of one record: the sum of damped cosines and a line, in one or more signals.
 
-    Each signal has its own noise variance. If a value of the record is an average over an interval
+    Each signal has its own noise variance. If the values of the record are averages over intervals
     of width w, the model is averaged too: the average of a wave is the wave times g(s) = sinh(s w /
     2) / (s w / 2).
 
     Parameters
     ----------
     time : (N,) array
-        The instants [s].
+        The times [s].
     signal : (N,) or (N, C) array
         The signals [V].
     averaging_width : float
@@ -174,18 +174,7 @@ class DampedCosines:
             self._line = offset[:, None]
 
     def residual(self, poles: ComplexArray) -> Float:
-        """Return the residuals at given poles, with the best amplitudes and the best line.
-
-        Parameters
-        ----------
-        poles : (K,) array
-            The poles s [1/s].
-
-        Returns
-        -------
-        (N C,) array
-            The residuals of all signals [V].
-        """
+        """Return the residuals (N C,) [V] for poles (K,) [1/s] and the best amplitudes and line."""
         # Variable projection (Golub and Pereyra 1973): the linear unknowns are eliminated by an
         # orthogonal projection on the columns of the basis.
         orthogonal_basis = np.linalg.qr(self._basis(self._waves(poles)))[0]
@@ -195,12 +184,12 @@ class DampedCosines:
     def fit(
         self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True
     ) -> DampedCosineFit:
-        """Return the least-squares fit to the record, with the poles as unknowns.
+        """Fit poles, amplitudes and line by nonlinear least squares.
 
         Parameters
         ----------
         start : (K,) array
-            The poles at which the iteration begins [1/s].
+            Initial poles [1/s].
         frequencies_fitted : bool
             Whether the damped frequencies are unknown; otherwise they keep their values.
         """
@@ -227,7 +216,7 @@ class DampedCosines:
         return self.solve(pole_of(optimum.x), frequencies_fitted=frequencies_fitted)
 
     def solve(self, pole: ComplexArray, *, frequencies_fitted: bool = True) -> DampedCosineFit:
-        """Return the fit with the best amplitudes at given poles, and its covariance.
+        """Fit amplitudes and line for fixed poles, and return the covariance.
 
         Parameters
         ----------
@@ -268,18 +257,8 @@ class DampedCosines:
     ) -> tuple[Float, Float]:
         """Return the variance of the residuals (C,), and the covariance (U, U) of all unknowns.
 
-        Parameters
-        ----------
-        wave : (N, K) array
-            The waves of unit amplitude.
-        basis : (N, B) array
-            The basis of the linear unknowns of a signal.
-        amplitude : (K, C) array
-            The complex amplitude of each wave in each signal [V].
-        sum_of_squares : (C,) array
-            The sum of squared residuals of each signal.
-        frequencies_fitted : bool
-            Whether the damped frequencies are unknown.
+        `wave` (N, K) are the waves of unit amplitude, `basis` (N, B) the basis of a signal's linear
+        unknowns, `amplitude` (K, C) the complex amplitudes [V].
         """
         count = wave.shape[1]
         channels = self._signal.shape[1]
@@ -318,7 +297,7 @@ class DampedCosines:
         return variance, covariance
 
     def _waves(self, pole: ComplexArray) -> ComplexArray:
-        """Return the waves of unit amplitude (N, K), averaged over the intervals of the record.
+        """Return the waves (N, K) of unit amplitude, averaged over the intervals of the record.
 
         Growth is limited, so that an iteration that passes through it does not overflow.
         """
@@ -329,41 +308,16 @@ class DampedCosines:
         return np.asarray(averaging_factor * np.exp(np.multiply.outer(self._time, s)))
 
     def _basis(self, wave: ComplexArray) -> Float:
-        """Return the basis of the linear unknowns of a signal.
-
-        Its columns multiply K Re A, K Im A and the coefficients of the line.
-
-        Parameters
-        ----------
-        wave : (N, K) array
-            The waves of unit amplitude.
-
-        Returns
-        -------
-        (N, 2 K + 1) or (N, 2 K + 2) array
-        """
+        """Return the basis of a signal's linear unknowns: K Re A, K Im A and the line."""
         # Re(A w) = Re A Re w - Im A Im w
         return np.hstack([wave.real, -wave.imag, self._line])
 
 
 def _wave_chi_square(count: int, basis: Float, coefficient: Float, sum_of_squares: Float) -> Float:
-    """Return the chi-square of each wave: its squared amplitudes over their covariance.
+    """Return the chi-square (K,) of each wave: squared amplitudes over their covariance.
 
-    Parameters
-    ----------
-    count : int
-        The number of waves K.
-    basis : (N, B) array
-        The basis, whose first 2 K columns belong to Re A and Im A.
-    coefficient : (B, C) array
-        The coefficients of each signal.
-    sum_of_squares : (C,) array
-        The sum of squared residuals of each signal.
-
-    Returns
-    -------
-    (K,) array
-        Sums over the signals.
+    It is summed over the signals. The first 2 K columns of the basis belong to Re A and Im A;
+    `coefficient` (B, C) are the coefficients of each signal.
     """
     channels = coefficient.shape[1]
     # Covariance of Re A and Im A of each wave at unit variance, (K, 2, 2), and its inverse

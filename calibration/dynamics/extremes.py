@@ -1,9 +1,9 @@
-"""Fit of two modes to the extremes of a record that was read off a plot.
+"""Fit two modes to the extremes of a record that was read off a plot.
 
-For such records, a fit to the extremes is better. The middle of the ink in a column of
-pixels is not quite the average of the signal there, while its lowest and highest points are the
-extremes of the signal within the column, except for the width of the line. A fit to these two keeps
-more of a fast mode that dies away within a few columns.
+In a column of pixels, the middle of the ink is not quite the average of the signal, while its
+lowest
+and highest points are the extremes of the signal within the column, except for the width of the
+line. A fit to these two retains more of a fast mode that dies away within a few columns.
 """
 
 import math
@@ -23,9 +23,9 @@ _INSTANTS = 17  # within a column of pixels, at which the model is evaluated
 
 
 def refine_by_extremes(trials: Fits) -> Fits:
-    """Return trials fitted to the extremes of their records.
+    """Fit trials again, to the extremes of their records.
 
-    Amplitudes, phases and decay rates are fitted again; damped frequencies keep their values.
+    Amplitudes, phases and decay rates are fitted; damped frequencies keep their values.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def refine_by_extremes(trials: Fits) -> Fits:
 
 
 class _ExtremesUnknowns(NamedTuple):
-    """The unknowns of a fit to the extremes of a record, which are an array (9,) for the solver.
+    """The unknowns of a fit to the extremes of a record, an array (9,) for the solver.
 
     Attributes
     ----------
@@ -67,22 +67,19 @@ class _ExtremesUnknowns(NamedTuple):
         )
 
     def signal(self, time: Float, omega: Float) -> Float:
-        """Return the signal at some instants [s], for damped angular frequencies (2,) [1/s]."""
+        """Return the signal at times [s], for damped angular frequencies (2,) [1/s]."""
         wave = np.exp(np.multiply.outer(time, self.decay + 1j * omega)) @ self.wave
         return np.asarray(self.offset + self.drift * time + wave.real)
 
 
 def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
-    """Return one trial fitted to the extremes of its record.
+    """Fit one trial to the extremes of its record, starting from its previous fit.
 
-    The record was read off a plot: in each column of pixels it has the lowest and the highest ink.
-    The model signal is evaluated at several instants of a column; its extremes, extended by half
-    the thickness of the line, are fitted to the ink.
-
-    Parameters
-    ----------
-    fit : RingDownFit
-        The trial, fitted to the middle of the ink; the start of this fit.
+    In each column of pixels the record has the lowest and the highest ink. The model signal is
+    evaluated
+    at several times in a column; its extremes, extended by half the thickness of the line, are
+    fitted to
+    the ink.
     """
     record = fit.record
     if record.lowest is None or record.highest is None:
@@ -96,7 +93,7 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
     wave = np.array([mode.wave for mode in fit.modes])
     time = record.time - record.time[0]
     offsets_in_column = np.linspace(-0.5, 0.5, _INSTANTS) * record.averaging_width
-    instants = time[:, np.newaxis] + offsets_in_column
+    times_in_columns = time[:, np.newaxis] + offsets_in_column
 
     # Unknowns are scaled to about one: amplitudes by the range of the signal, decays by the start.
     signal_range = float(np.ptp(record.signal))
@@ -117,7 +114,7 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
 
     def residual(relative_values: Float) -> Float:
         unknowns = _ExtremesUnknowns.from_array(relative_values * scale)
-        signal = unknowns.signal(instants, pole.imag)
+        signal = unknowns.signal(times_in_columns, pole.imag)
         lowest_ink = signal.min(axis=1) - unknowns.half_line
         highest_ink = signal.max(axis=1) + unknowns.half_line
         return np.hstack([lowest_ink - lowest, highest_ink - highest])

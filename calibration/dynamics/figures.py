@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from reporting import figures as style
 
 from .damped_cosine import RingDownMode
-from .trials import Fits, ModalFigure, RingDownFit, amplitude_dependence, average, spectrum
+from .trials import Fits, ModalQuantity, RingDownFit, amplitude_dependence, average, spectrum
 
 _MILLIVOLTS_PER_VOLT = 1e3
 
@@ -18,7 +18,7 @@ class _AmplitudePanel(NamedTuple):
     """A panel that shows a quantity of the first mode over its amplitude."""
 
     axes: Axes
-    quantity: ModalFigure
+    quantity: ModalQuantity
     scale: float
     ylabel: str
     letter: str
@@ -27,9 +27,9 @@ class _AmplitudePanel(NamedTuple):
 
 @style.publication_style()
 def ring_down_figure(trials: Fits) -> Figure:
-    """Return a figure with four panels of fitted ring-down trials.
+    """Draw the fitted ring-down trials in four panels.
 
-    It shows the first trial with its two modes, the spectra of all trials, and natural frequency
+    They show the first trial with its two modes, the spectra of all trials, and natural frequency
     and damping ratio of the first mode over its amplitude.
     """
     figure, (upper, lower) = style.panels(
@@ -63,7 +63,7 @@ def ring_down_figure(trials: Fits) -> Figure:
 def _draw_amplitude_dependence(
     panel: _AmplitudePanel, windows: list[RingDownMode], mean: float
 ) -> None:
-    """Draw a modal value of the windows over their amplitudes, and its mean over whole records."""
+    """Draw a modal value of the windows over their amplitudes, and its mean over records."""
     axes = panel.axes
     amplitudes = [window.amplitude * _MILLIVOLTS_PER_VOLT for window in windows]
     values = [panel.scale * getattr(window, panel.quantity) for window in windows]
@@ -78,7 +78,7 @@ def _draw_amplitude_dependence(
 def _draw_record(axes: Axes, fit: RingDownFit) -> None:
     """Draw a measured record, its fit, and the envelopes of the two modes.
 
-    The style names colours by what they show in most figures; here they only tell curves apart.
+    The style names colours by their meaning in most figures; here they only distinguish curves.
     """
     time = fit.record.time
     time_from_start = time - time[0]

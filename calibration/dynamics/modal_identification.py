@@ -31,13 +31,13 @@ LARGEST_ORDER = 24
 the correlations of the record within their scatter: with more states, poles of noise appear next to
 those of modes and disturb them."""
 BLOCKS = 50
-"""Number of blocks of a record, from whose differences the covariance follows."""
+"""Number of blocks of a record whose differences give the covariance."""
 _FEWEST_BLOCKS = 10
 _DIFFERENCE_STEP = 1e-4
 """Step of the numerical derivative of poles, as a fraction of a block's difference from the mean
 correlations. It is small, so that changed poles can be assigned to the original ones."""
 _MOST_LAGS = 40
-_SMALLEST_RELATIVE_SIZE = 1e-2  # of a mode that is fitted to a free decay, over the strongest mode
+_SMALLEST_CONTRIBUTION = 1e-2  # of a mode that is fitted to a free decay, over the strongest mode
 
 
 _FREQUENCY = 0
@@ -89,7 +89,7 @@ def identify_modes(
     bands: ArrayLike,
     kind: RecordKind = "ambient",
 ) -> IdentifiedModes:
-    """Return the strongest mode of a record in each band of frequency.
+    """Return the strongest mode of a record in each frequency band.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def identify_modes(
 
 
 def _centred_record(acceleration: ArrayLike) -> Float:
-    """Return a record of N samples of A accelerometers without the mean of each."""
+    """Check a record of N samples of A accelerometers, and remove the mean of each."""
     record = np.array(nan_where_masked(acceleration))
     if record.ndim == 1:
         record = record[:, None]
@@ -139,7 +139,7 @@ def _centred_record(acceleration: ArrayLike) -> Float:
 
 
 def _check_bands(limits: Float, sampling_rate: float) -> None:
-    """Refuse bands (M, 2) [Hz] that are empty, overlap, or exceed half the sampling rate [Hz]."""
+    """Raise `ExperimentDataError` if bands (M, 2) [Hz] are empty, overlap or end too high."""
     if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
         raise ExperimentDataError(
             "each band must be two positive frequencies [Hz], the lower one first."
@@ -166,7 +166,7 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
 
 
 def _refuse_dead_accelerometers(record: Float) -> None:
-    """Refuse a record (N, A) with an accelerometer that shows a constant value."""
+    """Raise `ExperimentDataError` if an accelerometer shows a constant value."""
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(
@@ -180,15 +180,6 @@ def _number_of_lags(limits: Float, sampling_rate: float, channels: int) -> int:
 
     They should last two periods of the lowest mode. The Hankel matrix must have at least as many
     rows as the largest system has states.
-
-    Parameters
-    ----------
-    limits : (M, 2) array
-        The frequency bands of the modes [Hz].
-    sampling_rate : float
-        The sampling rate [Hz].
-    channels : int
-        The number of accelerometers.
     """
     smallest_number = LARGEST_ORDER // channels + 2
     samples_of_two_periods = np.ceil(2.0 * sampling_rate / limits.min())
@@ -196,7 +187,7 @@ def _number_of_lags(limits: Float, sampling_rate: float, channels: int) -> int:
 
 
 def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
-    """Refuse a record (N, A) that has too few samples for the lags of its correlations."""
+    """Raise `ExperimentDataError` if a record (N, A) is too short for its correlations."""
     # The correlations of a block have 2 `lags` lags. A decay is not divided into blocks, but must
     # be longer than its correlations.
     blocks = BLOCKS if kind == "ambient" else 4
@@ -220,16 +211,9 @@ class _Identification(Protocol):
 def _modes_in_bands(
     identification: _Identification, limits: Float, values_per_mode: int
 ) -> IdentifiedModes:
-    """Return the strongest pole in each frequency band as a mode.
+    """Return the strongest pole in each frequency band (M, 2) [Hz] as a mode.
 
-    Parameters
-    ----------
-    identification : _Identification
-        The poles of the record.
-    limits : (M, 2) array
-        The lowest and the highest frequency of each band [Hz].
-    values_per_mode : int
-        The number of modal values, 1 + A.
+    A mode has 1 + A values.
     """
     poles = identification.poles
     pole_of_mode: dict[int, int] = {}
@@ -259,7 +243,7 @@ class _AmbientIdentification:
     lags : int
         Half the number of lags of the correlations.
     mode_count : int
-        The number of modes that are wanted.
+        The number of wanted modes.
     """
 
     poles: IdentifiedPoles
@@ -291,12 +275,7 @@ class _AmbientIdentification:
         return np.stack(correlations, axis=1)
 
     def covariances(self, numbers: Sequence[int]) -> list[Float]:
-        """Return the covariances (1 + A, 1 + A) of the modal values of given poles.
-
-        Parameters
-        ----------
-        numbers : sequence of int
-            The numbers of the poles.
+        """Return the covariances (1 + A, 1 + A) of the modal values of some poles.
 
         Raises
         ------
@@ -326,23 +305,10 @@ class _AmbientIdentification:
         return covariances
 
     def _correlate_long_blocks(self, poles: ComplexArray) -> Float:
-        """Return the correlations of long, nearly independent blocks.
+        """Return the correlations (B', 2 L, A, A) of long, nearly independent blocks.
 
-        Consecutive blocks are joined until they last as long as the slowest mode decays.
-
-        Parameters
-        ----------
-        poles : (P,) array
-            The poles of the modes [1/s].
-
-        Returns
-        -------
-        (B', 2 L, A, A) array
-
-        Raises
-        ------
-        ExperimentDataError
-            If there are too few such blocks.
+        Consecutive blocks are joined until they last as long as the slowest mode decays. Raises
+        `ExperimentDataError` if there are too few such blocks.
         """
         decay_time = float(np.max(-1.0 / poles.real))
         blocks_per_group = int(np.ceil(decay_time * self._sampling_rate / self._block_length))
@@ -395,18 +361,9 @@ class _DecayIdentification:
 
 
 def _starting_poles(record: Float, sampling_rate: float, lags: int) -> ComplexArray:
-    """Return the structural poles (P,) [1/s] that the correlations of a decay show.
+    """Return the structural poles (P,) [1/s] in the correlations of a decay.
 
     Poles whose contribution is below 1 % of the strongest one are left out.
-
-    Parameters
-    ----------
-    record : (N, A) array
-        The record, without its mean.
-    sampling_rate : float
-        The sampling rate [Hz].
-    lags : int
-        Half the number of lags of the correlations.
     """
     sample_count = len(record) - 2 * lags
     earlier_samples = record[:sample_count]
@@ -415,33 +372,23 @@ def _starting_poles(record: Float, sampling_rate: float, lags: int) -> ComplexAr
         for lag in range(1, 2 * lags + 1)
     ]
     poles, _ = Subspace(np.stack(correlations), sampling_rate).poles(LARGEST_ORDER)
-    is_strong = poles.size > _SMALLEST_RELATIVE_SIZE * poles.size.max()
+    is_strong = poles.contribution > _SMALLEST_CONTRIBUTION * poles.contribution.max()
     return np.asarray(poles.pole[poles.is_structural & is_strong])
 
 
 def _poles_of_fit(fit: DampedCosineFit) -> IdentifiedPoles:
-    """Return the poles of a fit of damped cosines; the amplitudes are their shapes."""
+    """Return the poles of a fit of damped cosines; their shapes are the amplitudes."""
     return IdentifiedPoles(
         pole=fit.pole,
         shape=fit.amplitude,
-        size=np.linalg.norm(fit.amplitude, axis=1),
+        contribution=np.linalg.norm(fit.amplitude, axis=1),
         chi_square=fit.chi_square,
         frequency_count=len(fit.fitted),
     )
 
 
 def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
-    """Return the covariance of the modal values of one damped cosine, to first order.
-
-    Parameters
-    ----------
-    number : int
-        The number of the damped cosine.
-
-    Returns
-    -------
-    (1 + A, 1 + A) array
-    """
+    """Return the covariance (1 + A, 1 + A) of a damped cosine's modal values, to first order."""
     count, channels = fit.amplitude.shape
     first_amplitude, *other_amplitudes = fit.amplitude[number].tolist()
     gradient = np.zeros((1 + channels, len(fit.covariance)))

@@ -46,7 +46,7 @@ class RingDownRecord:
     Attributes
     ----------
     time : (N,) array
-        The instants [s]. They are evenly spaced, up to 0.1 ms by the rounding of a printed time.
+        The times [s]. They are evenly spaced, up to 0.1 ms by the rounding of a printed time.
     signal : (N,) array
         The spanwise strain signal [V]; its scale does not matter.
     lowest, highest : (N,) array or None
@@ -55,7 +55,7 @@ class RingDownRecord:
         The interval over which each value is an average [s]: the width of a column of pixels; 0 for
         samples.
     source : str
-        Where the record is from.
+        The name of the file, or another origin, for messages.
 
     Raises
     ------
@@ -97,12 +97,12 @@ class RingDownRecord:
 
     @property
     def sampling_rate(self) -> float:
-        """Number of samples in a second [Hz]."""
+        """Number of samples per second [Hz]."""
         return float((self.count - 1) / (self.time[-1] - self.time[0]))
 
 
 def _refuse_uneven_time(record: RingDownRecord) -> None:
-    """Refuse a record whose time does not increase in even steps, up to its rounding."""
+    """Raise `ExperimentDataError` if the times do not increase in even steps, up to rounding."""
     time = record.time
     step = np.diff(time)
     mean_step = float(time[-1] - time[0]) / (record.count - 1)
@@ -120,7 +120,7 @@ def _refuse_uneven_time(record: RingDownRecord) -> None:
 
 
 def _refuse_constant_signal(record: RingDownRecord) -> None:
-    """Refuse a record whose signal never changes."""
+    """Raise `ExperimentDataError` if the signal never changes."""
     if np.ptp(record.signal) == 0.0:
         raise ExperimentDataError(
             f"{record.source}: the signal is constant, so that it is not a ring-down."
@@ -128,16 +128,9 @@ def _refuse_constant_signal(record: RingDownRecord) -> None:
 
 
 def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name: str) -> None:
-    """Refuse a record that stays at an extreme value for several samples, as if clipped.
+    """Raise `ExperimentDataError` if the signal (N,) stays at an extreme, as if clipped.
 
-    Parameters
-    ----------
-    signal : (N,) array
-        The signal, or its lowest or highest values.
-    extreme : float
-        The smallest or largest value of the signal.
-    name : str
-        The word for this extreme in the message.
+    `name` is the word for this extreme in the message.
     """
     is_extreme = np.abs(signal - extreme) <= 1e-9 * np.ptp(signal)
     # Runs of extreme values begin and end where the padded mask changes, in turn.
@@ -154,7 +147,7 @@ def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name
 
 
 def read_records(path: Path) -> tuple[RingDownRecord, ...]:
-    """Return the ring-down trials in the authors' calibration folder, or the record in one file.
+    """Read the ring-down records in the authors' calibration folder, or in one file.
 
     Parameters
     ----------
@@ -183,7 +176,7 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
 
 
 def find_records(path: Path) -> tuple[Path, ...]:
-    """Return the files that `read_records` reads: all files of the kind that it prefers.
+    """Return the files that `read_records` reads: all files of the best kind present.
 
     Raises
     ------
@@ -206,7 +199,7 @@ def find_records(path: Path) -> tuple[Path, ...]:
 
 
 def _read_record(file: Path) -> RingDownRecord:
-    """Return the ring-down record in a file of any of the known layouts."""
+    """Read the ring-down record in a file of any known layout."""
     text = read_text(file, ExperimentFileError)
     layout = _layout_of(text, file)
     table = parse_table(
@@ -232,9 +225,9 @@ class _Layout(NamedTuple):
     Attributes
     ----------
     separator : str or None
-        The character between cells; None for blanks.
+        The character between cells; None for white space.
     rows : str
-        The text, in which the header line is a comment.
+        The text, with the header line turned into a comment.
     """
 
     header: Sequence[str]
@@ -243,7 +236,7 @@ class _Layout(NamedTuple):
 
 
 def _layout_of(text: str, file: Path) -> _Layout:
-    """Return the layout of a record file from its first line.
+    """Infer the layout of a record file from its first line.
 
     The line is a header if it contains anything but numbers; a file without header has the columns
     of the published records.
@@ -283,12 +276,9 @@ def _column_names(header_line: str, separator: str | None, file: Path) -> list[s
 
 
 def _column_name(cell: str, file: Path) -> str:
-    """Return the name in a cell of a header, without unit and remarks in brackets.
+    """Return the name in a header cell, without unit and remarks in brackets.
 
-    Raises
-    ------
-    ExperimentDataError
-        If the time has another unit than s.
+    Raises `ExperimentDataError` if the time has another unit than s.
     """
     name = re.split(r"\s*[(\[]", cell, maxsplit=1)[0]
     unit = re.search(r"[(\[]\s*(\w+)\s*[)\]]", cell)

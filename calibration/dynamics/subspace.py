@@ -1,4 +1,4 @@
-"""Subspace identification of the poles of a system from the correlations of its outputs.
+"""Identify the poles of a system from the correlations of its outputs, by subspace methods.
 
 The correlations of the response to white noise decay like free vibration. A realisation as by Ho
 and Kalman (1966) therefore gives the poles from the block Hankel matrix of the correlations.
@@ -17,11 +17,11 @@ from .damped_cosine import ComplexArray
 LARGEST_RATIO = 0.3
 """Largest damping ratio of a mode of a structure."""
 _FALSE_MODE_PROBABILITY = 1e-3
-"""Probability that a record of noise alone gives a mode at any of its frequencies."""
+"""Probability of a mode at any frequency if a record is noise alone."""
 
 
 class IdentifiedPoles(NamedTuple):
-    """P poles with positive frequency that were identified from the record of A accelerometers.
+    """P poles with positive frequency, identified from the record of A accelerometers.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class IdentifiedPoles(NamedTuple):
         The poles s [1/s].
     shape : (P, A) array
         The complex mode shapes.
-    size : (P,) array
+    contribution : (P,) array
         The norm of each pole's contribution to the record or to its correlations.
     chi_square : (P,) array
         The reduction of the sum of squares by each pole, divided by the variance; it has a
@@ -40,7 +40,7 @@ class IdentifiedPoles(NamedTuple):
 
     pole: ComplexArray
     shape: ComplexArray
-    size: Float
+    contribution: Float
     chi_square: Float
     frequency_count: int
 
@@ -52,7 +52,7 @@ class IdentifiedPoles(NamedTuple):
 
     @property
     def is_beyond_noise(self) -> NDArray[np.bool_]:
-        """Whether each of the P poles is larger than a pole of noise alone would be."""
+        """Whether each of the P poles is significant, and not due to noise alone."""
         # Bonferroni: the probability of a false mode is divided among the independent
         # frequencies. Unknowns of a pole: Re s and Im s, and for each channel two complex
         # factors.
@@ -61,18 +61,11 @@ class IdentifiedPoles(NamedTuple):
         return np.asarray(self.chi_square > chdtri(degrees_of_freedom, probability))
 
     def modal_values(self, number: int) -> Float:
-        """Return the modal values of a pole: its frequency, damping ratio and relative shape.
+        """Return the modal values (1 + A,) of a pole.
 
-        Parameters
-        ----------
-        number : int
-            The number of the pole.
-
-        Returns
-        -------
-        (1 + A,) array
-            Natural frequency [Hz], damping ratio [1], and the real part of the shape at the
-            accelerometers after the first, divided by that at the first [1].
+        They are the natural frequency [Hz], the damping ratio [1], and the real part of the shape
+        at the
+        accelerometers after the first, divided by that at the first [1].
         """
         # s = -zeta omega +- i omega sqrt(1 - zeta^2) with |s| = omega
         s = self.pole[number]
@@ -84,41 +77,24 @@ class IdentifiedPoles(NamedTuple):
         return np.array([frequency, damping_ratio, *relative_shape])
 
     def strongest(self, low: float, high: float) -> int | None:
-        """Return the number of the largest structural pole in a frequency band.
+        """Return the index of the strongest structural pole in a frequency band [Hz].
 
-        Parameters
-        ----------
-        low, high : float
-            The ends of the band [Hz].
-
-        Returns
-        -------
-        int or None
-            None if there is no such pole, or if noise may have given it.
+        It is None if there is no such pole, or if the pole may be due to noise.
         """
         frequency = np.abs(self.pole) / (2.0 * np.pi)
         is_in_band = (frequency >= low) & (frequency <= high)
         is_candidate = is_in_band & self.is_structural
         if not is_candidate.any():
             return None
-        size_of_candidates = np.where(is_candidate, self.size, -1.0)
-        strongest = int(np.argmax(size_of_candidates))
+        candidate_contributions = np.where(is_candidate, self.contribution, -1.0)
+        strongest = int(np.argmax(candidate_contributions))
         return strongest if self.is_beyond_noise[strongest] else None
 
 
 def _hankel(correlation: Float) -> Float:
-    """Return the block Hankel matrix of the correlations of C channels.
+    """Return the block Hankel matrix (L C, L C) of correlations (2 L, C, C) at the lags 1 to 2 L.
 
     Block (i, j) is the correlation at the lag i + j + 1.
-
-    Parameters
-    ----------
-    correlation : (2 L, C, C) array
-        The correlations at the lags 1 to 2 L.
-
-    Returns
-    -------
-    (L C, L C) array
     """
     lags = len(correlation) // 2
     channels = correlation.shape[1]
@@ -146,7 +122,7 @@ class _Realisation(NamedTuple):
 
 
 class Subspace:
-    """Realisations of any order of the system whose outputs have given correlations.
+    """Realisations of any order of the system whose outputs have certain correlations.
 
     Parameters
     ----------
@@ -162,15 +138,11 @@ class Subspace:
         _, self._singular_values, self._right_vectors = np.linalg.svd(_hankel(correlation))
 
     def _realisation(self, correlation: Float, basis: Float) -> _Realisation:
-        """Return the modal form of the system with given correlations.
+        """Return the modal form of the system with some correlations.
 
-        Parameters
-        ----------
-        correlation : (2 L, C, C) array
-            The correlations at the lags 1 to 2 L.
-        basis : (L C, n) array
-            The matrix that projects the Hankel matrix on n states: its product is the observability
-            matrix.
+        The basis (L C, n) projects the Hankel matrix on n states: their product is the
+        observability
+        matrix.
         """
         channels = correlation.shape[1]
         observability = _hankel(correlation) @ basis
@@ -192,7 +164,7 @@ class Subspace:
         return np.asarray(vectors / np.sqrt(self._singular_values[:order]))
 
     def poles(self, order: int, variance: Float | float = 1.0) -> tuple[IdentifiedPoles, float]:
-        """Return the poles of the system of a given order, and the misfit of its correlations.
+        """Return the poles of the system of some order, and the misfit of its correlations.
 
         Parameters
         ----------
@@ -230,11 +202,11 @@ class Subspace:
         correlation_of_pair = 2.0 * correlation_of_positive.real
         residual_without_pair = residual + correlation_of_pair
         increase_without_pole = residual_without_pair**2 - residual**2
-        squared_size = np.abs(correlation_of_positive) ** 2
+        squared_magnitude = np.abs(correlation_of_positive) ** 2
         poles = IdentifiedPoles(
             pole=realisation.pole[is_positive],
             shape=realisation.shape.T[is_positive],
-            size=np.sqrt(np.sum(squared_size, axis=(1, 2, 3))),
+            contribution=np.sqrt(np.sum(squared_magnitude, axis=(1, 2, 3))),
             chi_square=np.sum(increase_without_pole / variance, axis=(1, 2, 3)),
             frequency_count=lags,
         )
@@ -243,7 +215,7 @@ class Subspace:
     def modal_values_after_change(
         self, change: Float, order: int, poles: ComplexArray
     ) -> list[Float]:
-        """Return the modal values of poles after a small change of the correlations.
+        """Return the modal values of P poles after a small change of the correlations.
 
         Parameters
         ----------
@@ -252,12 +224,8 @@ class Subspace:
         order : int
             The number of states.
         poles : (P,) array
-            The poles before the change [1/s]. Each is assigned the nearest pole after the change.
-
-        Returns
-        -------
-        list of P (1 + A,) arrays
-            See `IdentifiedPoles.modal_values`.
+            The poles before the change [1/s]. Each is matched with the nearest pole after the
+            change.
         """
         realisation = self._realisation(self._correlation + change, self._basis(order))
         nearest_pole = np.argmin(np.abs(realisation.pole - poles[:, None]), axis=1)
@@ -265,7 +233,7 @@ class Subspace:
         changed_poles = IdentifiedPoles(
             pole=realisation.pole[nearest_pole],
             shape=realisation.shape.T[nearest_pole],
-            size=not_needed,
+            contribution=not_needed,
             chi_square=not_needed,
             frequency_count=1,
         )

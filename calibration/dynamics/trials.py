@@ -1,7 +1,7 @@
 """Ring-down trials: two damped modes of each, their averages, and their change with amplitude.
 
-Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (23) and (24) turn
-damped frequency and decay rate into natural frequency and damping ratio.
+Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (23) and (24) convert
+damped frequency and decay rate to natural frequency and damping ratio.
 """
 
 import cmath
@@ -20,7 +20,7 @@ from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord
 
 FIRST_PEAK = 0.00548
-"""Instant of the first peak in the published records, at which the authors crop them [s]."""
+"""Time of the first peak in the published records, where the authors crop them [s]."""
 
 WORKING_RATE = 2000.0
 """Rate to which faster records are decimated, as in the authors' script [Hz]."""
@@ -70,7 +70,7 @@ Fits = tuple[RingDownFit, ...]
 
 
 def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord:
-    """Return a record decimated to about 2 kHz and cropped.
+    """Decimate a record to about 2 kHz and crop it.
 
     Decimation runs forwards and backwards through a low-pass filter, so that it does not shift the
     phase. Drift is not removed here but fitted together with the modes, which biases neither.
@@ -78,7 +78,7 @@ def prepare(record: RingDownRecord, start: float = FIRST_PEAK) -> RingDownRecord
     Parameters
     ----------
     start : float
-        The instant after which the record begins [s].
+        The record begins after this time [s].
 
     Raises
     ------
@@ -157,7 +157,7 @@ def spectrum(record: RingDownRecord) -> tuple[Float, Float]:
 
 
 def _visible_band(record: RingDownRecord) -> tuple[float, float]:
-    """Return the part of the search band below half the sampling rate [Hz]."""
+    """Return the search band, cut off at half the sampling rate [Hz]."""
     return SEARCH_BAND[0], min(SEARCH_BAND[1], 0.5 * record.sampling_rate)
 
 
@@ -195,13 +195,10 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
 def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
     """Return the frequencies of significant peaks [Hz], the most prominent first.
 
-    A second mode that has died away after a tenth of the record is lost in the noise of the rest
-    and in the skirts of the first. A decay reduces both and moves no frequency.
-
-    Parameters
-    ----------
-    decay : float
-        The decay rate lambda of the factor exp(-lambda t) on the record [1/s].
+    The record is multiplied by exp(-decay t). A second mode that has died away after a tenth of the
+    record is lost in the noise of the rest and in the skirts of the first; the factor reduces both
+    and
+    moves no frequency.
     """
     time_from_start = record.time - record.time[0]
     decay_factor = np.exp(-decay * time_from_start)
@@ -240,7 +237,7 @@ def _noise_amplitude(record: RingDownRecord) -> float:
 def fit_ring_down(
     record: RingDownRecord, *, frequencies_fitted: bool = False, start: float = FIRST_PEAK
 ) -> RingDownFit:
-    """Return the fit of two damped cosines, an offset and a drift to one record.
+    """Fit two damped cosines, an offset and a drift to one record.
 
     The authors hold the damped frequencies fixed at the two highest peaks of the spectrum. The
     Levenberg-Marquardt iteration finds the decay rates, and the damped frequencies if they are
@@ -255,7 +252,7 @@ def fit_ring_down(
     frequencies_fitted : bool
         Whether the frequencies are fitted, too.
     start : float
-        The instant at which the record is cropped [s].
+        The time at which the record is cropped [s].
 
     Raises
     ------
@@ -282,7 +279,7 @@ def fit_ring_down(
 
 
 def _refuse_steady(record: RingDownRecord) -> None:
-    """Refuse a record whose signal does not decay."""
+    """Raise `ExperimentDataError` if the signal does not decay."""
     signal = detrend(record.signal)
     third = record.count // 3
     first_rms = math.sqrt(float(np.mean(signal[:third] ** 2)))
@@ -296,19 +293,9 @@ def _refuse_steady(record: RingDownRecord) -> None:
 
 
 def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
-    """Refuse modes that are not decaying oscillations.
+    """Raise `ExperimentDataError` if a mode does not decay, or decays faster than it oscillates.
 
-    Parameters
-    ----------
-    modes : iterable of RingDownMode
-        The modes of a record.
-    source : str
-        Where the record is from; begins the message.
-
-    Raises
-    ------
-    ExperimentDataError
-        If a mode does not decay, or decays faster than it oscillates.
+    `source` is the name of the record, which begins the message.
     """
     for number, mode in enumerate(modes, start=1):
         decay_rate = -mode.pole.real
@@ -325,7 +312,7 @@ PUBLISHED_FREQUENCIES = (5.6492, 29.9699)
 PUBLISHED_DAMPING_RATIOS = (0.0281, 0.0717)
 """Damping ratios found by the authors, mean of five trials [1]."""
 
-ModalFigure = Literal["frequency", "damping_ratio"]
+ModalQuantity = Literal["frequency", "damping_ratio"]
 """A quantity of a mode."""
 
 
@@ -337,7 +324,7 @@ class Averaged(NamedTuple):
     standard_error: float
 
 
-def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
+def average(trials: Fits, name: ModalQuantity, mode: int) -> Averaged:
     """Return the mean of a modal quantity over trials, with its scatter and standard error.
 
     Parameters
@@ -345,7 +332,7 @@ def average(trials: Fits, name: ModalFigure, mode: int) -> Averaged:
     name : {"frequency", "damping_ratio"}
         The natural frequency [Hz] or the damping ratio [1].
     mode : {0, 1}
-        The mode.
+        The index of the mode.
     """
     values = [float(getattr(fit.modes[mode], name)) for fit in trials]
     mean = float(np.mean(values))
@@ -361,7 +348,7 @@ def fit_trials(
     frequencies_fitted: bool = False,
     start: float = FIRST_PEAK,
 ) -> Fits:
-    """Return the fits of all records; the arguments are those of `fit_ring_down`.
+    """Fit all records; the arguments are those of `fit_ring_down`.
 
     Raises
     ------
@@ -387,16 +374,11 @@ _VISIBLE_AMPLITUDE = 4.0  # of the first mode in a window, over the residuals
 
 
 def amplitude_dependence(fit: RingDownFit) -> tuple[RingDownMode, ...]:
-    """Return the first mode as fitted within windows that slide over the record.
+    """Fit the first mode in windows that slide over the record.
 
     A linear wing has the same frequency and damping ratio in each. Amplitudes are those in the
     middle of the windows. Windows in which the mode does not exceed four times the residuals are
     left out.
-
-    Parameters
-    ----------
-    fit : RingDownFit
-        A fitted record, whose first mode is the start of the fit in each window.
     """
     record = fit.record
     first_start = record.time[0] + FIRST

@@ -1,4 +1,4 @@
-"""Readings of the two flapwise modes of a wing, from ring-downs, with all their uncertainty."""
+"""Readings of a wing's two flapwise modes from ring-downs, with their whole uncertainty."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from calibration.dynamics.trials import (
     amplitude_dependence,
 )
 from calibration.errors import ExperimentDataError
-from calibration.result.record import FigureReading
+from calibration.result.record import QuantityReading
 from reporting.arrays import Float
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
@@ -32,7 +32,7 @@ _VISIBLE = 1.0  # amplitude of the second mode at the later start, over the resi
 
 def modal_readings(
     values: Sequence[float], deviations: Sequence[float]
-) -> tuple[FigureReading, ...]:
+) -> tuple[QuantityReading, ...]:
     """Return the readings of two modes.
 
     Parameters
@@ -52,7 +52,7 @@ def modal_readings(
                 f"ring-down: {name} is estimated as {value:g} without any uncertainty; give the "
                 "records as they were measured, with their noise."
             )
-        readings.append(FigureReading(name, "ring-down", value, deviation))
+        readings.append(QuantityReading(name, "ring-down", value, deviation))
     return tuple(readings)
 
 
@@ -70,7 +70,7 @@ class _SystematicTerms(NamedTuple):
     damping_ratio: float
 
 
-def measured_modes(trials: Fits) -> tuple[FigureReading, ...]:
+def measured_modes(trials: Fits) -> tuple[QuantityReading, ...]:
     """Return mean frequencies and damping ratios of fitted trials, with their uncertainty.
 
     *Statistical*: the standard error of the mean over the trials, from the least-squares fits;
@@ -87,11 +87,6 @@ def measured_modes(trials: Fits) -> tuple[FigureReading, ...]:
     - the second mode over the choice of the fit: both modes are fitted again with free frequencies,
       from the start of the cropped record (only if the frequencies had been taken from the
       spectrum) and from 40 and 80 ms later; the term is the root mean square of the differences.
-
-    Parameters
-    ----------
-    trials : Fits
-        The fitted records, by `calibration.dynamics.trials.fit_trials`.
 
     Raises
     ------
@@ -135,13 +130,8 @@ def _mean_damping_ratio(modes: Sequence[RingDownMode]) -> _Estimate:
 def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
     """Return the mean over trials and its standard error.
 
-    The standard error follows from the errors of the values. If the values scatter significantly
-    more than these errors explain, it follows from the scatter.
-
-    Parameters
-    ----------
-    values, errors : sequence of float
-        The value of each trial and its standard error.
+    The standard error follows from the standard errors of the values or, if the values scatter
+    significantly more than these explain, from the scatter.
     """
     count = len(values)
     mean = math.fsum(values) / count
@@ -161,7 +151,7 @@ def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
 
 
 def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
-    """Return the systematic change of frequency and damping of the first mode with its amplitude.
+    """Return the systematic change of the first mode's frequency and damping with its amplitude.
 
     The change is zero if there are too few windows with different amplitudes.
     """
@@ -183,16 +173,11 @@ def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
 def _term_of_slope(logarithm: Float, value: Float) -> float:
     """Return the systematic change of a modal value with the amplitude.
 
-    A line is fitted to the value over the logarithm of the amplitude. The result is the change of
-    the line over one standard deviation of the logarithm, less its standard error (see
-    `_beyond_chance`).
-
-    Parameters
-    ----------
-    logarithm : (N,) array
-        The logarithm of the amplitude in each window, minus its mean.
-    value : (N,) array
-        The value in each window.
+    A line is fitted to the values (N,) over the centred logarithm (N,) of the amplitude. The result
+    is
+    the change of the line over one standard deviation of the logarithm, reduced by its standard
+    error
+    (see `_beyond_chance`).
     """
     deviation = float(logarithm.std())
     slope = float(logarithm @ value / (logarithm @ logarithm))
@@ -206,10 +191,7 @@ def _term_of_slope(logarithm: Float, value: Float) -> float:
 def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTerms:
     """Return the systematic uncertainty of the second mode from the choice of the fit.
 
-    Parameters
-    ----------
-    frequency, ratio : float
-        The mean frequency [Hz] and damping ratio [1] of the second mode in these fits.
+    `frequency` [Hz] and `ratio` [1] are the means of the second mode in the original fits.
     """
     delays = _LATER_STARTS if trials[0].frequencies_fitted else (0.0, *_LATER_STARTS)
     changes = []
@@ -235,8 +217,8 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
 def _beyond_chance(difference: float, error: float) -> float:
     """Return the part of a difference that exceeds its standard error.
 
-    This part is the root of the squared difference minus the squared standard error. It is zero if
-    the difference is not significant.
+    This is the root of the squared difference minus the squared standard error. It is zero if the
+    difference is not significant.
     """
     if abs(difference) <= _SIGNIFICANT_DIFFERENCE * error:
         return 0.0
@@ -244,17 +226,9 @@ def _beyond_chance(difference: float, error: float) -> float:
 
 
 def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
-    """Return the second mode of a record, fitted from a later start.
+    """Fit the second mode of a record again, from a start that is later by `delay` [s].
 
-    Parameters
-    ----------
-    delay : float
-        The delay of the start [s].
-
-    Returns
-    -------
-    RingDownMode or None
-        None if the second mode has died away by then.
+    The result is None if the mode has died away by then.
     """
     record = fit.record
     is_after_start = record.time >= record.time[0] + delay
@@ -274,9 +248,8 @@ def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
 PUBLISHED_MODES = modal_readings(
     (*PUBLISHED_FREQUENCIES, *PUBLISHED_DAMPING_RATIOS), (0.062, 0.63, 0.0039, 0.0162)
 )
-"""The published means of the five trials, with the uncertainty that our records of them show.
+"""The published means of the five trials, with an uncertainty of ours, as the paper gives none.
 
-The paper gives no uncertainty. These are the standard deviations that `measured_modes` returns for
-the same five trials read off the published plots, with frequencies from the spectral peaks as in
-the paper.
+The standard deviations are those that `measured_modes` returns for the same five trials read off
+the published plots, with frequencies from the spectral peaks as in the paper.
 """

@@ -24,7 +24,7 @@ from scipy.stats import multivariate_t
 
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
 from calibration.joint.wing_table import MODEL_ERROR, QUANTITIES, WingTable, wing_priors
-from calibration.result.record import FigureReading, ParameterPrior
+from calibration.result.record import ParameterPrior, QuantityReading
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior, Seed, child_seed
@@ -47,7 +47,7 @@ class Comparison(NamedTuple):
 
 
 LEAST_EFFECTIVE_SAMPLE_SIZE = 200.0
-"""Smallest effective number of weighted draws that describe a posterior."""
+"""Smallest effective sample size of weighted draws that describe a posterior."""
 
 _DEGREES_OF_FREEDOM = 10.0  # of Student's t as proposal: heavier tails than a truncated Gaussian
 _INFLATION = 1.05  # of the proposal's covariance over the posterior's
@@ -77,9 +77,7 @@ def infer(
     priors : tuple of ParameterPrior
         The priors of P parameters: Gaussians, truncated to the ranges of the parameters.
     compare : callable
-        Compares all readings with the model at states (N, P) within their ranges.
-    seed : int or SeedSequence
-        The same seed gives the same samples.
+        Compares all readings with the model in states (N, P) within their ranges.
 
     Returns
     -------
@@ -128,13 +126,6 @@ class _WhitenedPosterior:
     There are three kinds of coordinates: the state x in the units of the parameters; u, with
     x = prior mean + prior standard deviation * u; and the whitened points v, with
     u = optimum + v @ whitening, where the optimum is the maximum of the posterior.
-
-    Parameters
-    ----------
-    priors : tuple of ParameterPrior
-        The priors of P parameters.
-    compare : callable
-        Compares all readings with the model at states (N, P).
     """
 
     def __init__(
@@ -162,11 +153,11 @@ class _WhitenedPosterior:
         self._whitening = right_vectors / singular_values[:, None]
 
     def states(self, points: Float) -> Float:
-        """Return the N states, each of P parameters, at whitened coordinates (N, P)."""
+        """Return the states (N, P) at whitened coordinates (N, P)."""
         return self._states(self._optimum_u + points @ self._whitening)
 
     def _states(self, u: Float) -> Float:
-        """Return the states (N, P) of coordinates u (N, P), limited to their ranges."""
+        """Return the states (N, P) at coordinates u (N, P), limited to their ranges."""
         # Rounding must not put a state outside its range.
         return np.asarray(np.clip(self._mean + self._deviation * u, self._low, self._high))
 
@@ -188,16 +179,11 @@ class _WhitenedPosterior:
     def draw(
         self, mean: Float, covariance: Float, size: int, generator: np.random.Generator
     ) -> _WeightedDraws:
-        """Draw from Student's t, and weight the draws by the posterior.
+        """Draw `size` points from Student's t, and weight them by the posterior.
 
-        Parameters
-        ----------
-        mean : (P,) array
-            The mean of the proposal, in whitened coordinates.
-        covariance : (P, P) array
-            The shape matrix of the proposal.
-        size : int
-            The number of draws N.
+        `mean` (P,) and `covariance` (P, P) are the mean and the shape matrix of the proposal, in
+        whitened
+        coordinates.
         """
         proposal = multivariate_t(mean, covariance, _DEGREES_OF_FREEDOM)
         points = proposal.rvs(size, generator).reshape(size, -1)
@@ -220,7 +206,7 @@ _IMPROBABLE = 2.33  # standard deviations that one in a hundred exceeds
 def joint_posterior(
     wing: WingTable,
     static: LoadDisplacementData,
-    readings: Sequence[FigureReading],
+    readings: Sequence[QuantityReading],
     *,
     priors: tuple[ParameterPrior, ...] | None = None,
     model_error: tuple[float, float] = MODEL_ERROR,
@@ -231,16 +217,12 @@ def joint_posterior(
 
     Parameters
     ----------
-    wing : WingTable
-        The wing, by `tabulate_wing`.
-    readings : sequence of FigureReading
+    readings : sequence of QuantityReading
         The weighed mass and the readings of both modes; others are ignored.
     priors : tuple of ParameterPrior, optional
         The priors; `wing_priors` of the model by default.
     model_error : (float, float)
         The relative standard deviations tau_1, tau_2 of the model's frequencies about the wing's.
-    seed : int
-        The same seed gives the same samples.
 
     Returns
     -------
@@ -275,8 +257,8 @@ def joint_posterior(
     return samples
 
 
-def _readings_of_outputs(readings: Sequence[FigureReading]) -> dict[str, FigureReading]:
-    """Return, by name, the readings of a wing's outputs other than its stiffness."""
+def _readings_of_outputs(readings: Sequence[QuantityReading]) -> dict[str, QuantityReading]:
+    """Return the readings of a wing's outputs by name, without its stiffness."""
     names = {quantity.name for quantity in QUANTITIES[1:]}
     return {reading.name: reading for reading in readings if reading.name in names}
 
@@ -284,24 +266,13 @@ def _readings_of_outputs(readings: Sequence[FigureReading]) -> dict[str, FigureR
 def _comparison_with_wing(
     wing: WingTable,
     static: LoadDisplacementData,
-    readings: Sequence[FigureReading],
+    readings: Sequence[QuantityReading],
     model_error: tuple[float, float],
 ) -> Callable[[Float], Comparison]:
-    """Return a function that compares the readings with what a wing in a given state would show.
+    """Return a function that compares the readings with a wing in states (N, 5).
 
-    Parameters
-    ----------
-    wing : WingTable
-        The outputs of the wing at each state.
-    readings : sequence of FigureReading
-        The weighed mass, and the frequencies and damping ratios of the modes.
-    model_error : (float, float)
-        The relative standard deviations of the model's two frequencies.
-
-    Returns
-    -------
-    callable
-        Takes states (N, 5) and returns a `Comparison` with the pairs of the load test first.
+    Its `Comparison` has the pairs of the load test first. `model_error` are the relative standard
+    deviations of the model's two frequencies.
     """
     output_names = [quantity.name for quantity in QUANTITIES]
     columns = [output_names.index(reading.name) for reading in readings]
@@ -330,7 +301,7 @@ def _comparison_with_wing(
 
 
 def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
-    """Refuse samples of e (N,) that accumulate at an end of its range."""
+    """Raise `OutsideValidityError` if samples of e (N,) accumulate at an end of its range."""
     margin = _LIMIT_MARGIN * (prior.high - prior.low)
     for limit in (prior.low, prior.high):
         fraction = float(np.mean(np.abs(e - limit) < margin))
@@ -342,8 +313,8 @@ def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
             )
 
 
-def _refuse_negative_damping(readings: Mapping[str, FigureReading]) -> None:
-    """Refuse damping ratios that almost certainly need a negative Rayleigh coefficient."""
+def _refuse_negative_damping(readings: Mapping[str, QuantityReading]) -> None:
+    """Raise `ExperimentDataError` if damping ratios almost surely need a negative coefficient."""
     omega = 2.0 * math.pi * np.array([readings[f"frequency_{mode}"].value for mode in (1, 2)])
     # Ratios zeta_i = (alpha / omega_i + beta omega_i) / 2, solved for alpha and beta
     inverse = np.linalg.inv(0.5 * np.column_stack([1.0 / omega, omega]))

@@ -1,6 +1,7 @@
-"""Priors of a wing's parameters, its weighed mass, and its outputs as a table.
+"""Priors of a wing's parameters, its weighed mass, and a table of its outputs.
 
-The table holds polynomials of the parameters of a healthy wing, so that many states cost little.
+The table consists of polynomials of the parameters of a healthy wing, so that many states can be
+evaluated at little cost.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike
 
 from calibration.errors import OutsideValidityError, PosteriorError
-from calibration.result.record import CalibratedFigure, FigureReading, ParameterPrior
+from calibration.result.record import CalibratedQuantity, ParameterPrior, QuantityReading
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
@@ -30,7 +31,7 @@ state, and independent delta_i ~ N(0, tau_i^2); these are tau_1 and tau_2. See
 """
 
 
-def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> FigureReading:
+def weighed_mass(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> QuantityReading:
     """Return the reading of a weighing of two servos and the pitot tube.
 
     The paper gives no uncertainty. Our choice is 1 g: a scale that shows grams, and leads that may
@@ -41,7 +42,7 @@ def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> FigureReading:
     mass, deviation : float
         The mass and its standard deviation [kg].
     """
-    return FigureReading("weighed_mass", "weighing", mass, deviation)
+    return QuantityReading("weighed_mass", "weighing", mass, deviation)
 
 
 class _Prior(NamedTuple):
@@ -83,7 +84,7 @@ _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 def wing_priors(
     validity: Mapping[str, tuple[float, float]], **stated: tuple[float, float]
 ) -> tuple[ParameterPrior, ...]:
-    """Return the priors of a wing's parameters: stiffness, two masses and two damping coefficients.
+    """Return the priors of a wing's stiffness, two masses and two damping coefficients.
 
     The stiffness is given by e, a factor on Young's modulus of the skin. Its prior is that of the
     paper, N(1, (0.05 / 1.96)^2). The other priors are weak:
@@ -93,8 +94,8 @@ def wing_priors(
       total, the standard deviation of a servo's mass is then 30 g.
     - The Rayleigh damping coefficients alpha and beta are not negative. Their priors are the
       halves above zero of Gaussians with mean zero and standard deviations 3 1/s and 1.5e-3 s. A
-      coefficient of this size alone gives a damping ratio of 4 % (alpha, mode 1) or 14 % (beta,
-      mode 2), twice the measured ratio.
+      coefficient of one standard deviation alone gives a damping ratio of 4 % (alpha, mode 1) or
+      14 % (beta, mode 2), twice the measured ratio.
 
     Parameters
     ----------
@@ -125,12 +126,14 @@ def wing_priors(
 
 
 QUANTITIES = (
-    CalibratedFigure("tip_stiffness", "N/m", "tip stiffness"),
-    CalibratedFigure("frequency_1", "Hz", "natural frequency of the first flapwise bending mode"),
-    CalibratedFigure("frequency_2", "Hz", "natural frequency of the second flapwise bending mode"),
-    CalibratedFigure("damping_ratio_1", "1", "damping ratio of the first flapwise bending mode"),
-    CalibratedFigure("damping_ratio_2", "1", "damping ratio of the second flapwise bending mode"),
-    CalibratedFigure("weighed_mass", "kg", "mass of two servos and the pitot tube"),
+    CalibratedQuantity("tip_stiffness", "N/m", "tip stiffness"),
+    CalibratedQuantity("frequency_1", "Hz", "natural frequency of the first flapwise bending mode"),
+    CalibratedQuantity(
+        "frequency_2", "Hz", "natural frequency of the second flapwise bending mode"
+    ),
+    CalibratedQuantity("damping_ratio_1", "1", "damping ratio of the first flapwise bending mode"),
+    CalibratedQuantity("damping_ratio_2", "1", "damping ratio of the second flapwise bending mode"),
+    CalibratedQuantity("weighed_mass", "kg", "mass of two servos and the pitot tube"),
 )
 """The measured quantities that follow from the parameters of a wing."""
 
@@ -140,7 +143,7 @@ TOLERANCE = 1e-5
 _DEGREES = (
     (5, 7, 7),
     (8, 11, 11),
-)  # of the polynomials in the three parameters, to be tried in turn
+)  # of the polynomials in the three parameters, which are tried in turn
 _CHECK_COUNT = 128
 _PARAMETERS = ("young_modulus_factor", "servo_mass", "pitot_mass")
 
@@ -167,23 +170,18 @@ class WingTable:
 
     @property
     def validity(self) -> dict[str, tuple[float, float]]:
-        """The ranges of e and the masses in which the table holds."""
+        """The ranges of e and the masses for which the table is valid."""
         lower, upper = self.limits.T.tolist()
         ranges = zip(lower, upper, strict=True)
         return dict(zip(_PARAMETERS, ranges, strict=True))
 
     def frequency(self, states: ArrayLike) -> Float:
-        """Return the natural frequencies of both flapwise modes of the wing in N states.
+        """Return the natural frequencies (N, 2) [Hz] of both flapwise modes in N states.
 
         Parameters
         ----------
         states : (N, 3 or more) array
             States, whose first values are e [1] and the masses [kg].
-
-        Returns
-        -------
-        (N, 2) array
-            The frequencies f1 and f2 [Hz].
 
         Raises
         ------
@@ -196,7 +194,7 @@ class WingTable:
         if not is_inside.all():
             state, parameter = np.argwhere(~is_inside)[0]
             prior = wing_priors(self.validity)[parameter]
-            unit = f" {prior.figure.shown_unit}".rstrip()
+            unit = f" {prior.quantity.printed_unit}".rstrip()
             raise OutsideValidityError(
                 f"the {prior.title} is {points[state, parameter]:.4g}{unit}, but the model holds "
                 f"for {prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a "
@@ -206,17 +204,12 @@ class WingTable:
         return _evaluate(unit_points, self.coefficients)
 
     def outputs(self, states: Float) -> Float:
-        """Return the measurable quantities of the wing in N states.
+        """Return the `QUANTITIES` (N, 6) [SI] of the wing in N states.
 
         Parameters
         ----------
         states : (N, 5 or more) array
             States, whose first values are e, masses, alpha and beta [SI].
-
-        Returns
-        -------
-        (N, 6) array
-            The `QUANTITIES` [SI].
 
         Raises
         ------
@@ -234,14 +227,9 @@ class WingTable:
 
 
 def _evaluate(unit_points: Float, coefficients: Float) -> Float:
-    """Return the frequencies (N, 2) [Hz] that Chebyshev polynomials of their logarithms give.
+    """Evaluate the frequencies (N, 2) [Hz] from the polynomials of their logarithms.
 
-    Parameters
-    ----------
-    unit_points : (N, 3) array
-        The values of e, servo mass and pitot mass, each scaled to [-1, 1].
-    coefficients : (I, J, K, 2) array
-        The coefficients of ln f1 and ln f2, see `WingTable`.
+    The points (N, 3) are values of e, servo mass and pitot mass, each scaled to [-1, 1].
     """
     x, y, z = unit_points.T
     return np.asarray(np.exp(chebval3d(x, y, z, coefficients)).T)
@@ -250,7 +238,7 @@ def _evaluate(unit_points: Float, coefficients: Float) -> Float:
 def _interpolating_coefficients(
     nodes: Float, frequencies: Float, degrees: tuple[int, int, int]
 ) -> Float:
-    """Return the Chebyshev coefficients with which ln f1 and ln f2 are exact at the nodes.
+    """Return the Chebyshev coefficients that interpolate ln f1 and ln f2 at the nodes.
 
     Parameters
     ----------
@@ -259,8 +247,7 @@ def _interpolating_coefficients(
     frequencies : (N, 2) array
         The frequencies f1 and f2 at the nodes [Hz].
     degrees : (int, int, int)
-        The degrees I - 1, J - 1, K - 1 of the polynomials in the three parameters. The nodes are as
-        many as the coefficients: N = I J K.
+        The degrees I - 1, J - 1, K - 1 of the polynomials in the three parameters, with N = I J K.
 
     Returns
     -------
@@ -276,7 +263,7 @@ def _interpolating_coefficients(
 
 
 def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
-    """Return the grid (N, 3) of Chebyshev nodes for polynomials of these degrees."""
+    """Return the grid (N, 3) of Chebyshev nodes for polynomials of some degrees."""
     nodes = []
     for degree in degrees:
         angles = np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
@@ -285,7 +272,7 @@ def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
 
 
 def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTable:
-    """Return polynomials of a wing's frequencies and stiffness, checked between their nodes.
+    """Approximate a wing's frequencies and stiffness by polynomials, checked between their nodes.
 
     The flapwise modes are identified by their shapes, so that a crossing of frequencies does not
     exchange them.
@@ -330,14 +317,10 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
 
 
 def _model_frequencies(model: ReducedModel, limits: Float, unit_points: Float) -> Float:
-    """Return the frequencies (N, 2) [Hz] of the flapwise modes of a model in N states.
+    """Return the frequencies (N, 2) [Hz] of a model's flapwise modes in N states.
 
-    Parameters
-    ----------
-    limits : (3, 2) array
-        The ranges of e [1], servo mass and pitot mass [kg].
-    unit_points : (N, 3) array
-        The states: values of these parameters, each scaled from its range to [-1, 1].
+    The states are values of e, servo mass and pitot mass (N, 3), each scaled from its range to [-1,
+    1].
     """
     centre = limits.mean(axis=1)
     lower, upper = limits.T

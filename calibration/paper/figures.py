@@ -29,13 +29,11 @@ WORDS = Words("calibration.paper", "table_1.toml")
 
 
 @dataclass(frozen=True)
-class PaperFigure:
+class PublishedQuantity:
     """The authors' value of a quantity, and how it is printed.
 
     Attributes
     ----------
-    title : str
-        The title of the quantity.
     scale : float
         The factor from SI to `unit`.
     unit : str
@@ -64,14 +62,9 @@ class PaperFigure:
         return f"{self.title}, {self.unit}" if self.unit else self.title
 
     def printed(self, mean: float, deviation: float | None = None, *, sign: str = "") -> str:
-        """Return a value as printed, without its unit.
+        """Format a value [SI] and its standard deviation in the printed unit, without the unit.
 
-        Parameters
-        ----------
-        mean, deviation : float
-            The value and its standard deviation [SI].
-        sign : str
-            "+" to print the sign of a positive value, too.
+        `sign` may be "+", to print the sign of a positive value, too.
         """
         text = f"{mean * self.scale:{sign}.{self.digits}f}"
         if deviation is not None:
@@ -79,7 +72,7 @@ class PaperFigure:
         return text.replace("-", "−")
 
 
-PAPER = {name: PaperFigure(**entry) for name, entry in WORDS.content["paper"].items()}
+PAPER = {name: PublishedQuantity(**entry) for name, entry in WORDS.content["paper"].items()}
 """The quantities of Table 1 by name."""
 
 
@@ -96,14 +89,12 @@ class TableRow:
 
     Attributes
     ----------
-    name : str
-        The name of the quantity.
     prior, posterior : Moments
         The prior, and the posterior of the calibration.
     paper_procedure : Moments
         The result of the paper's procedure: for e the particle filter on the paper's stiffness
         line, for masses and damping eqs. (19), (20) and (25) on our model.
-    paper : PaperFigure
+    paper : PublishedQuantity
         The authors' value.
     """
 
@@ -111,7 +102,7 @@ class TableRow:
     prior: Moments
     posterior: Moments
     paper_procedure: Moments
-    paper: PaperFigure
+    paper: PublishedQuantity
 
     @property
     def difference(self) -> float:
@@ -125,12 +116,12 @@ class TableRow:
 
 
 def _printed_moments(row: TableRow, moments: Moments) -> str:
-    """Return mean and standard deviation of a quantity, as printed."""
+    """Format the mean and standard deviation of a quantity."""
     return row.paper.printed(moments.mean, moments.standard_deviation)
 
 
 def printed_table_1(rows: Sequence[TableRow]) -> TitledTable:
-    """Return the cells of Table 1 of the paper, with the values of this calibration added."""
+    """Return Table 1 of the paper with the values of this calibration added."""
     columns: list[RecordColumn[TableRow]] = [
         text_cells(
             "figure", lambda row: ", ".join(filter(None, (row.paper.title, row.paper.unit)))
@@ -157,7 +148,7 @@ def table_1(
     Parameters
     ----------
     procedure : Calibration
-        The calibration of the same model by the paper's procedure, to compare with.
+        The calibration of the same model by the paper's procedure, for comparison.
     particle : ParticlePosterior
         The posterior of the Young's modulus factor by the paper's particle filter.
     """
@@ -179,7 +170,7 @@ def table_1(
 
 
 def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
-    """Write the table as CSV, in SI.
+    """Write the table as CSV in SI units; return the path.
 
     Raises
     ------
@@ -213,7 +204,7 @@ _RUN_LINES = ("-", "--", "-.", ":")
 
 @style.publication_style()
 def calibration_figure(result: StaticCalibration) -> Figure:
-    """Return Fig. 5 of the paper: the load test with bands; densities of e and stiffness."""
+    """Draw Fig. 5 of the paper: the load test with bands; densities of e and stiffness."""
     figure = style.new_figure(height=4.4)
     axes = figure.subplot_mosaic(
         [
@@ -326,12 +317,7 @@ def _draw_densities(
 ) -> None:
     """Draw prior, exact posterior with its 95 % interval, and the particles as a histogram.
 
-    Parameters
-    ----------
-    prior, exact, particle : ScalarPosterior
-        The densities [SI].
-    scale : float
-        The factor from SI to the unit of the panel.
+    `scale` is the factor from SI to the unit of the panel.
     """
     lower, upper = exact.interval(0.95)
     is_inside = (exact.grid >= lower) & (exact.grid <= upper)

@@ -24,10 +24,10 @@ DEFAULT_PARTICLE_COUNT = 1_000_000
 """Number of particles, and of samples of each measured pair, in the authors' script."""
 
 CELLS_PER_BANDWIDTH = 128
-"""Cells of a kernel density within one bandwidth; the error by binning is then below 0.1 %."""
+"""Cells of a kernel density in one bandwidth; the error by binning is then below 0.1 %."""
 
 CELLS_PER_STORED_VALUE = 32
-"""Cells of a kernel density for one value of the stored posterior."""
+"""Number of cells of a kernel density for one value of the stored posterior."""
 
 _KERNEL_REACH = 8.0  # bandwidths; the probability of the kernel beyond is 1e-15
 _MEDIAN_DEVIATION_OF_GAUSSIAN = 0.6745  # of a standard Gaussian, as rounded in the rule
@@ -66,15 +66,10 @@ def reference_bandwidth_factor(count: float) -> float:
 
 
 def normal_reference_bandwidth(samples: Float) -> float:
-    """Return the optimal bandwidth for Gaussian data: sigma_robust * (4 / (3 n))^(1/5).
+    """Return the optimal bandwidth for Gaussian samples (n,): sigma_robust * (4 / (3 n))^(1/5).
 
     sigma_robust is the median absolute deviation from the median over 0.6745. This is the default
     of MATLAB's `fitdist(samples, 'kernel')`, which the authors used (Bowman and Azzalini 1997).
-
-    Parameters
-    ----------
-    samples : (n,) array
-        The samples.
     """
     absolute_deviations = np.abs(samples - np.median(samples))
     sigma = float(np.median(absolute_deviations)) / _MEDIAN_DEVIATION_OF_GAUSSIAN
@@ -82,7 +77,7 @@ def normal_reference_bandwidth(samples: Float) -> float:
 
 
 class KernelDensity(NamedTuple):
-    """A density (N,) at the points of an even grid (N,)."""
+    """A density (N,) at evenly spaced points (N,)."""
 
     grid: Float
     density: Float
@@ -98,15 +93,13 @@ def kernel_density(
     window: tuple[float, float],
     weights: Float | None = None,
 ) -> KernelDensity:
-    """Return the Gaussian kernel density of samples, on an even grid.
+    """Return the Gaussian kernel density of samples (n,) on an even grid.
 
     The samples are counted in cells much narrower than the kernel, and the counts are smoothed,
     which is far faster than a sum over the samples.
 
     Parameters
     ----------
-    samples : (n,) array
-        The samples.
     bandwidth : float
         The standard deviation of the kernel.
     window : (float, float)
@@ -144,13 +137,13 @@ def particle_filter(
     The likelihood of a pair is the paper's: loads and displacements are drawn from the Gaussians of
     their readings; each drawn pair gives a stiffness and, by the inverse of eq. (14), a sample of
     e; the likelihood is the kernel density of these samples. As their number grows, it tends to the
-    measure "ratio" of `errors_in_variables`, which is known in closed form. Logarithms of weights
-    are added; the result repeats bit for bit with the seed.
+    measure "ratio" of `errors_in_variables`, which is known in closed form. Equal seeds give equal
+    results, bit for bit.
 
     Parameters
     ----------
     curve : StiffnessCurve
-        The tip stiffness k(e) [N/m] as a function of the factor e.
+        The tip stiffness k(e) [N/m].
     prior : GaussianPrior, optional
         The prior of e; the paper's by default.
     particle_count : int
@@ -228,16 +221,9 @@ def _pair_density(
     generator: np.random.Generator,
     count: int,
 ) -> KernelDensity:
-    """Return the paper's likelihood of e by one measured pair: a kernel density of samples.
+    """Return the paper's likelihood of e given one pair: a kernel density of samples.
 
-    Parameters
-    ----------
-    pair : int
-        The number of the pair.
-    curve : StiffnessCurve
-        The tip stiffness k(e) [N/m] as a function of the factor e.
-    window : (float, float)
-        The range of e in which the density is needed.
+    `window` is the range of e in which the density is needed.
     """
     load_error = data.load_standard_deviation * generator.standard_normal(count)
     displacement_error = data.displacement_standard_deviation * generator.standard_normal(count)
@@ -255,7 +241,7 @@ class _Moments(NamedTuple):
 
 
 def _weighted_moments(weight: Float, value: Float) -> _Moments:
-    """Return the moments of values (N,) with weights (N,), whose sum is 1."""
+    """Return the moments of values (N,) with weights (N,) that sum to 1."""
     # Pairwise sums rather than dot products, whose last bits depend on the number of BLAS threads.
     mean = float(np.sum(weight * value))
     variance = float(np.sum(weight * (value - mean) ** 2))
@@ -269,7 +255,7 @@ class StaticCalibration:
     Attributes
     ----------
     curve : StiffnessCurve
-        The tip stiffness k(e) [N/m] as a function of the factor e.
+        The tip stiffness k(e) [N/m].
     prior : GaussianPrior
         The prior p(e).
     particle : ParticlePosterior
@@ -325,8 +311,6 @@ def calibrate_static(
         model.
     data : LoadDisplacementData, optional
         The measured pairs; the eight published ones by default.
-    seed : int
-        The seed of the particle filter.
     particle_count : int
         The number of particles of the filter.
 
@@ -371,14 +355,7 @@ def calibrate_static(
 def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
     """Return the density of the stiffness k(e), given that of e: p(k) = p(e) / (dk/de).
 
-    Values of e with a stiffness that is not positive are left out.
-
-    Parameters
-    ----------
-    posterior : ScalarPosterior
-        The density of e.
-    curve : StiffnessCurve
-        The tip stiffness k(e) [N/m] as a function of the factor e.
+    Values of e for which the stiffness is not positive are left out.
     """
     stiffness = curve.stiffness(posterior.grid)
     is_positive = stiffness > 0.0

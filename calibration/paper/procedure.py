@@ -16,7 +16,7 @@ from calibration.dynamics.records import STEP_FOLDER
 from calibration.errors import ExperimentDataError
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
-from calibration.result.record import FigureReading
+from calibration.result.record import QuantityReading
 from fe.runtime.modal_system import rayleigh_coefficients
 from reporting.arrays import Float
 
@@ -26,7 +26,7 @@ RESULTS_FILE = "massoptimizationresults.csv"
 _AT_LIMIT = 1e-6  # kg between a mass and the end of its range
 
 FrequencyModel = Callable[[Float], Float]
-"""Returns the flapwise frequencies (N, 2) [Hz] of rows of e, servo and pitot mass (N, 3) [kg]."""
+"""Returns the flapwise frequencies (N, 2) [Hz] for rows (N, 3) of e, servo and pitot mass [kg]."""
 
 
 class PaperSamples(NamedTuple):
@@ -48,9 +48,9 @@ def fit_masses(
     frequencies: FrequencyModel,
     young_modulus_factor: Float,
     validity: Mapping[str, tuple[float, float]],
-    readings: Sequence[FigureReading],
+    readings: Sequence[QuantityReading],
 ) -> PaperSamples:
-    """Return the masses and the damping coefficients that fit the readings, for each sample of e.
+    """Fit the masses and the damping coefficients to the readings, for each sample of e.
 
     The weighed total leaves one unknown mass: that of a servo; the pitot tube has the rest. It
     minimises the mean relative error of the two frequencies. The search (bounded Brent) ends at
@@ -64,7 +64,7 @@ def fit_masses(
         The samples of e [1].
     validity : mapping of str to (float, float)
         The ranges of the masses in the model [kg].
-    readings : sequence of FigureReading
+    readings : sequence of QuantityReading
         The weighed mass and both modes.
 
     Raises
@@ -100,25 +100,9 @@ def _nearest_servo_mass(
     target: Float,
     limits: tuple[float, float],
 ) -> float:
-    """Return the servo mass [kg] that brings the model's frequencies nearest to a target.
+    """Return the servo mass [kg] that brings the model's frequencies nearest to `target` (2,) [Hz].
 
-    Parameters
-    ----------
-    frequencies : callable
-        The flapwise frequencies of the model, for rows of e, servo mass and pitot mass.
-    modulus_factor : float
-        The paper's e: the factor of the wing's Young's modulus [1].
-    total_mass : float
-        The weighed mass of two servos and the pitot tube [kg].
-    target : (2,) array
-        The measured frequencies [Hz].
-    limits : (float, float)
-        The range of the servo mass [kg].
-
-    Raises
-    ------
-    ExperimentDataError
-        If the mass lies at an end of its range.
+    Raises `ExperimentDataError` if the mass lies at an end of its range `limits` [kg].
     """
 
     def mean_error(servo_mass: float) -> float:
@@ -165,7 +149,7 @@ def damping_coefficients(
 
 
 def read_published_results(path: Path) -> PaperSamples:
-    """Return the authors' masses and frequencies, with alpha and beta by eq. (25).
+    """Read the authors' masses and frequencies, with alpha and beta by eq. (25).
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import gaussian_kde
 
-from calibration.result.record import Calibration, FigureReading
+from calibration.result.record import Calibration, QuantityReading
 from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
 from reporting import figures as style
@@ -23,10 +23,10 @@ _MOST_READINGS = 12
 _TITLE_WIDTH = 14  # of a line beside an axis, in characters
 
 
-def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
-    """Return the columns and titles of the parameters without a reading of their own.
+def unmeasured_parameters(result: Calibration) -> tuple[list[int], list[str]]:
+    """Return the columns and axis titles of parameters that have no reading.
 
-    These parameters are drawn pair by pair.
+    The corner figures show these parameters.
     """
     measured_names = {reading.name for reading in result.readings}
     columns = []
@@ -34,13 +34,13 @@ def drawn_parameters(result: Calibration) -> tuple[list[int], list[str]]:
     for column, prior in enumerate(result.priors):
         if prior.name not in measured_names:
             columns.append(column)
-            titles.append(fill(prior.figure.axis_title, _TITLE_WIDTH))
+            titles.append(fill(prior.quantity.axis_title, _TITLE_WIDTH))
     return columns, titles
 
 
 @style.publication_style()
 def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
-    """Return a corner figure: a panel of samples for each pair of parameters, with correlations.
+    """Draw a corner plot: a panel of samples for each pair of parameters, and correlations.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
 
 
 def _write_correlation(axes: Axes, correlation: float) -> None:
-    """Write a correlation in a panel; the larger it is, the larger the print."""
+    """Write a correlation in a panel, in a font size that grows with its magnitude."""
     axes.set_axis_off()
     is_noticeable = abs(correlation) > NOTICEABLE_CORRELATION
     axes.text(
@@ -107,7 +107,7 @@ def _prepare_corner_axes(axes: Axes) -> None:
 
 
 def _draw_histograms(axes: Axes, samples: Sequence[Float], limits: tuple[float, float]) -> None:
-    """Draw the histograms of up to three sets of samples (N,), the first filled."""
+    """Draw histograms of up to three sets of samples (N,), the first one filled."""
     axes.set(ylim=(0.0, 1.12), yticks=[])
     axes.spines["left"].set_visible(False)
     bins = np.linspace(*limits, 31)
@@ -136,12 +136,9 @@ def _draw_scatter(axes: Axes, samples: Sequence[Float], column: int, row: int) -
 
 
 def _limits(samples: Sequence[Float]) -> tuple[float, float]:
-    """Return the limits of an axis for several sets of samples.
+    """Return the limits of an axis for several sets of samples (N,).
 
-    Parameters
-    ----------
-    samples : sequence of (N,) arrays
-        The sets. Outliers of the first set are left out; the other sets are shown completely.
+    Outliers of the first set are cut off; the other sets are shown completely.
     """
     first_set, *other_sets = samples
     low, high = np.quantile(first_set, [0.002, 0.998])
@@ -156,7 +153,7 @@ def _limits(samples: Sequence[Float]) -> tuple[float, float]:
 
 @style.publication_style()
 def readings_figure(result: Calibration) -> Figure:
-    """Return the figure of the measured quantities before and after, with their readings."""
+    """Draw the prior and posterior of each measured quantity, with its reading."""
     readings = result.readings[:_MOST_READINGS]
     rows = math.ceil(len(readings) / _COLUMNS)
     height = 0.5 + 1.55 * rows
@@ -176,8 +173,8 @@ def readings_figure(result: Calibration) -> Figure:
     return figure
 
 
-def _draw_reading(axes: Axes, result: Calibration, reading: FigureReading) -> None:
-    """Draw the prior and the posterior density of a quantity, with its reading."""
+def _draw_reading(axes: Axes, result: Calibration, reading: QuantityReading) -> None:
+    """Draw the prior and posterior density of a quantity, with its reading."""
     prior = result.draws_of(reading.name, prior=True)
     posterior = result.draws_of(reading.name)
     value = reading.value
@@ -208,7 +205,7 @@ def _draw_reading(axes: Axes, result: Calibration, reading: FigureReading) -> No
     else:
         axes.axvline(mean, color=style.PAST, lw=1.3, label="after the calibration")
     axes.plot(grid, prior_density, color=style.REFERENCE, lw=1.2, ls="--", label="before")
-    titles = {figure.name: figure.axis_title for figure in result.figures}
+    titles = {quantity.name: quantity.axis_title for quantity in result.all_quantities}
     axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * highest_density), yticks=[])
     axes.set_xlabel(titles[reading.name])
     axes.spines["left"].set_visible(False)

@@ -1,8 +1,8 @@
-"""The file of a calibration: NetCDF-4 in the layout of ArviZ, sufficient by itself.
+"""The file of a calibration: self-contained NetCDF-4 in the layout of ArviZ.
 
-The groups `posterior` and `prior` hold samples of each figure by (chain, draw) with its unit, and
-`observed_data` the readings that are more than one number. The attributes of the root hold priors,
-readings, residuals, findings, provenance and, for a wing, its tailored design.
+The groups `posterior` and `prior` hold samples of each quantity by (chain, draw) with its unit, and
+`observed_data` the measurements that are arrays. The attributes of the root hold priors, readings,
+residuals, findings, provenance and, for a wing, its tailored design.
 """
 
 import hashlib
@@ -49,7 +49,7 @@ Root = Mapping[str, Any]
 
 
 def save_calibration(calibration: Calibration, path: Path | str) -> Path:
-    """Write a calibration in one step; equal calibrations give equal bytes.
+    """Write the file of a calibration atomically; equal calibrations give equal bytes.
 
     Raises
     ------
@@ -77,15 +77,15 @@ def result_bytes(calibration: Calibration) -> bytes:
 
 
 def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
-    """Return samples (N, F) of the calibrated quantities as a dataset in the layout of ArviZ."""
+    """Return samples (N, F) of all quantities as a dataset in the layout of ArviZ."""
     return xr.Dataset(
         {
-            figure.name: (
+            quantity.name: (
                 ("chain", "draw"),
                 column[None],
-                {"units": figure.unit, "long_name": f"{what} of {figure.title}"},
+                {"units": quantity.unit, "long_name": f"{what} of {quantity.title}"},
             )
-            for figure, column in zip(calibration.figures, values.T, strict=True)
+            for quantity, column in zip(calibration.all_quantities, values.T, strict=True)
         }
     )
 
@@ -118,14 +118,11 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
-    """Refuse a folder with another calibration, before the work on a new one begins.
+    """Check that a new calibration may be written to a folder, before its work begins.
 
-    A file that is not a calibration may be replaced.
-
-    Parameters
-    ----------
-    wing : bool
-        Whether the new calibration is that of a wing from its laboratory.
+    A file that is not a calibration may be replaced. `wing` says whether the new calibration is
+    that of
+    a wing from its laboratory.
 
     Raises
     ------
@@ -156,7 +153,7 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
 
 
 def _calibration(groups: Groups, root: Root) -> Calibration:
-    """Return the calibration that the groups and the root attributes of a file describe."""
+    """Build a calibration from the groups and the root attributes of a file."""
     values: dict[str, Any] = {}
     for name, adapter in _JSON_FIELDS.items():
         if name in root or name not in _NEWER_FIELDS:
@@ -164,7 +161,7 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
     for name in _PLAIN_FIELDS:
         values[name] = root[name]
     values["seed"] = int(root["seed"])
-    names = [figure.name for figure in (*values["priors"], *values["quantities"])]
+    names = [quantity.name for quantity in (*values["priors"], *values["quantities"])]
     calibration = Calibration(
         **values,
         samples=_sample_columns(groups["posterior"], names),
@@ -178,7 +175,7 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
 
 
 def _sample_columns(group: xr.Dataset, names: list[str]) -> Float:
-    """Return the samples (N, F) of the figures with given names in a group."""
+    """Return the samples (N, F) of named quantities in a group."""
     return np.column_stack([group[name].values[0] for name in names])
 
 
@@ -202,25 +199,20 @@ def _read(path: Path) -> tuple[Groups, Root]:
 
 @lru_cache(maxsize=8)
 def _tree(path: Path, content: bytes) -> xr.DataTree:
-    """Return the groups of a file; they are cached by the hash of the content.
+    """Read the groups of a file, cached by path and SHA-256 of the content.
 
     A run reads the same calibration some twenty times.
-
-    Parameters
-    ----------
-    content : bytes
-        The hash of its content; a changed file is read again.
     """
     return read_groups(path)
 
 
 def _json(content: object) -> str:
-    """Return plain data as JSON; equal data give equal text."""
+    """Return plain data as JSON with sorted keys."""
     return json.dumps(content, sort_keys=True, ensure_ascii=False)
 
 
 def _content_hash(groups: Groups, root: Root) -> str:
-    """Return a hash of all values and attributes, which reveals a damaged file."""
+    """Return a SHA-256 of all values and attributes, by which damage is detected."""
     digest = hashlib.sha256()
     for name in sorted(set(root) - {_HASH}):
         digest.update(f"{name}\0{root[name]}\0".encode())
@@ -256,7 +248,8 @@ def tailoring(calibration: Calibration) -> Tailoring:
     """Return the arguments of `pack_wing` (`fmu_asset`) for the FMU of a calibrated wing.
 
     The FMU starts at the posterior means of e, masses and damping. Its description contains the
-    name of the wing and the standard deviations. Its file `RESOURCE_NAME` contains all figures with
+    name of the wing and the standard deviations. Its file `RESOURCE_NAME` contains all quantities
+    with
     intervals and correlations. Equal calibrations give equal bytes.
     """
     record_text = json.dumps(
@@ -271,32 +264,34 @@ def tailoring(calibration: Calibration) -> Tailoring:
 
 
 def description(calibration: Calibration) -> str:
-    """Return one sentence with the name of the wing, and the means and deviations of its state."""
+    """Return a sentence with the wing's name, and means and standard deviations of its state."""
     texts = []
-    for figure in calibration.figures:
-        if figure.name in STATE:
-            mean = calibration.mean(figure.name)
-            deviation = calibration.standard_deviation(figure.name)
-            text = f"{figure.name} {mean:.6g} +- {deviation:.3g} {figure.shown_unit}"
+    for quantity in calibration.all_quantities:
+        if quantity.name in STATE:
+            mean = calibration.mean(quantity.name)
+            deviation = calibration.standard_deviation(quantity.name)
+            text = f"{quantity.name} {mean:.6g} +- {deviation:.3g} {quantity.printed_unit}"
             texts.append(text.rstrip())
-    figures = ", ".join(texts)
-    return f"Calibrated for the wing '{calibration.asset}' (mean +- standard deviation): {figures}."
+    all_texts = ", ".join(texts)
+    return (
+        f"Calibrated for the wing '{calibration.asset}' (mean +- standard deviation): {all_texts}."
+    )
 
 
 def plain_record(calibration: Calibration) -> dict[str, object]:
-    """Return a calibration as plain data: its figures with intervals, and the correlations."""
-    figures = {
-        figure.name: {
-            "title": figure.title,
-            "unit": figure.unit,
-            "mean": calibration.mean(figure.name),
-            "standard_deviation": calibration.standard_deviation(figure.name),
-            "interval_95": list(calibration.interval(figure.name, 0.95)),
+    """Return a calibration as plain data: quantities with intervals, and correlations."""
+    records = {
+        quantity.name: {
+            "title": quantity.title,
+            "unit": quantity.unit,
+            "mean": calibration.mean(quantity.name),
+            "standard_deviation": calibration.standard_deviation(quantity.name),
+            "interval_95": list(calibration.interval(quantity.name, 0.95)),
         }
-        for figure in calibration.figures
+        for quantity in calibration.all_quantities
     }
     parameters = [prior.name for prior in calibration.priors]
-    quantities = [figure.name for figure in calibration.quantities]
+    quantities = [quantity.name for quantity in calibration.quantities]
     field_names = ("asset", "procedure", "seed", "model", "design_hash")
     return {
         "schema": SCHEMA,
@@ -305,8 +300,8 @@ def plain_record(calibration: Calibration) -> dict[str, object]:
         "calibration_sha256": hash_bytes(result_bytes(calibration)),
         "campaign" if calibration.design is None else "laboratory": calibration.source,
         "findings": list(calibration.findings),
-        "state": {name: figures[name] for name in parameters},
-        "quantities": {name: figures[name] for name in quantities},
+        "state": {name: records[name] for name in parameters},
+        "quantities": {name: records[name] for name in quantities},
         "correlation": {"names": parameters, "matrix": calibration.correlation.tolist()},
         # JSON is written with sorted keys; pages list the quantities in the order of the
         # calibration.
@@ -317,12 +312,7 @@ def plain_record(calibration: Calibration) -> dict[str, object]:
 def run_record(calibration: Calibration, parameter: str) -> dict[str, object]:
     """Return the content of `calibration.json` of a run folder.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration of the twin.
-    parameter : str
-        The parameter or quantity of which the twin has several values.
+    `parameter` is the parameter or quantity of which the twin has several values.
     """
     measured_tables = calibration.measured
     return {

@@ -1,11 +1,11 @@
-"""The folder of a calibration with its page, replaced as a whole or not at all."""
+"""Write a calibration with its page to a folder, as a whole or not at all."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from calibration.result.figures import corner_figure, drawn_parameters, readings_figure
+from calibration.result.figures import corner_figure, readings_figure, unmeasured_parameters
 from calibration.result.file import FILE_NAME, result_bytes
 from calibration.result.record import Calibration
 from calibration.result.tables import (
@@ -28,7 +28,7 @@ WING_FIELDS = "wing.vtu"
 MODE_FIELDS = "modes.vtu"
 
 _DRAWN = (REPORT_NAME, WING_FIELDS, MODE_FIELDS, f"{FIGURES}/*.svg", f"{FIGURES}/*.png")
-"""Files that are drawn from a calibration; those of an older one must not stay beside a newer
+"""Files that show a calibration; those of an older one must not stay beside a newer
 `calibration.nc`."""
 
 
@@ -40,11 +40,6 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
     other files. At the end of the context they are moved to `folder`, followed by `calibration.nc`,
     which this function writes. Older files of the same names are replaced, and other drawings of an
     older calibration are removed.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder that gets the files; it is made if it is missing.
 
     Raises
     ------
@@ -69,12 +64,9 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
 
 
 def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
-    """Remove the drawings of an older calibration that no new file replaces.
+    """Remove drawings of an older calibration, except those that new files replace.
 
-    Parameters
-    ----------
-    new_files : sequence of Path
-        The paths of the new files, relative to the folder.
+    The paths of the new files are relative to the folder.
     """
     for pattern in _DRAWN:
         for drawing in list(folder.glob(pattern)):
@@ -85,12 +77,7 @@ def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
 
 
 def write_calibration_folder(result: Calibration, folder: Path, *, report: bool = True) -> Path:
-    """Write a calibration and perhaps its report to a folder, and return its `calibration.nc`.
-
-    Parameters
-    ----------
-    report : bool
-        Whether to write a page with its figures, too.
+    """Write a calibration to a folder, with a report if wanted; return its `calibration.nc`.
 
     Raises
     ------
@@ -100,24 +87,18 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
     with calibration_folder(result, folder) as new_folder:
         if report:
             with stage("Drawing the report"):
-                end_page(begun_page(result, new_folder), result, new_folder)
+                finish_page(start_page(result, new_folder), result, new_folder)
     return folder / FILE_NAME
 
 
 def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
-    """Add a figure to a page, and write its files to the folder of the page."""
+    """Add a figure to a page, and write its files beside the page."""
     drawing = save_figure(figure.figure, folder / FIGURES, figure.name)
     page.add_figure(drawing, figure.caption, title=figure.title)
 
 
-def begun_page(result: Calibration, folder: Path) -> Page:
-    """Return a page with the sections that every calibration has; write their figures.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder of the page, in which the figures are written.
-    """
+def start_page(result: Calibration, folder: Path) -> Page:
+    """Start a page with the sections of every calibration; write their figures to the folder."""
     hashes = result.provenance["input_hashes"].items()
     inputs = ", ".join(f"{name} {value[:12]}" for name, value in hashes)
     page = Page(
@@ -128,8 +109,10 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     page.add_section("Result")
     highlights = []
     for prior in result.priors[:6]:
-        value = prior.figure.shown(result.mean(prior.name), result.standard_deviation(prior.name))
-        highlights.append((value, prior.figure.title))
+        value = prior.quantity.printed(
+            result.mean(prior.name), result.standard_deviation(prior.name)
+        )
+        highlights.append((value, prior.quantity.title))
     page.add_highlights(highlights)
     for sentence in result.findings:
         page.add_notice(sentence)
@@ -137,7 +120,7 @@ def begun_page(result: Calibration, folder: Path) -> Page:
         page.add_paragraph(
             "The residuals agree with noise and priors, and the data determine every parameter."
         )
-    parameter_columns, titles = drawn_parameters(result)
+    parameter_columns, titles = unmeasured_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
     posterior = ReportFigure(
@@ -186,7 +169,7 @@ def _add_residuals(page: Page, result: Calibration, folder: Path) -> None:
         add_titled_table(page, sensors_table(result))
 
 
-def end_page(page: Page, result: Calibration, folder: Path) -> None:
+def finish_page(page: Page, result: Calibration, folder: Path) -> None:
     """Add the last section, the origin of the calibration, to its page, and write the page."""
     page.begin_fold("Where the calibration comes from")
     add_titled_table(page, origin_table(result))

@@ -1,7 +1,7 @@
-"""The record of a calibration: samples of named figures, with their data, origin and findings.
+"""The record of a calibration: samples of named quantities, with their data, origin and findings.
 
-A wing's calibration from the folder of its laboratory and any model's from a campaign are of this
-class.
+It holds the calibration of a wing from the folder of its laboratory, or of any model from a
+campaign.
 """
 
 from collections.abc import Sequence
@@ -26,30 +26,30 @@ if TYPE_CHECKING:  # it takes long to import
     from matplotlib.axes import Axes
 
 Procedure = Literal["quadrature", "Gaussian", "several optima", "joint", "paper"]
-"""The method of the samples: quadrature of one parameter and the others given it, the Gaussian at
-the optimum where the posterior is one, or Gaussians at several optima; for a wing importance
-sampling, or the paper's procedure."""
+"""How the samples were drawn: by quadrature of one parameter and the others given it, from the
+Gaussian at the optimum where the posterior is one, or from Gaussians at several optima; for a wing
+by importance sampling, or by the paper's procedure."""
 
 FROM_LABORATORY = "from the laboratory of a wing (`uav-twin calibrate`)"
 FROM_CAMPAIGN = "from a campaign (`uav-twin calibrate campaign`)"
 
 LONGEST_NAME = 80
-"""Longest name of an asset, in characters."""
+"""Largest length of an asset's name, in characters."""
 
 STATE = ("young_modulus_factor", "servo_mass", "pitot_mass", "damping_alpha", "damping_beta")
 """The parameters of a calibrated wing that belong to its digital state."""
 
 
 @dataclass(frozen=True)
-class CalibratedFigure:
-    """Name, unit (SI) and meaning of a calibrated figure."""
+class CalibratedQuantity:
+    """Name, unit (SI) and title of a calibrated parameter or quantity."""
 
     name: str
     unit: str
     title: str
 
     @property
-    def shown_unit(self) -> str:
+    def printed_unit(self) -> str:
         """The printed unit: nothing for a plain number."""
         return "" if self.unit == "1" else self.unit
 
@@ -57,13 +57,13 @@ class CalibratedFigure:
     def axis_title(self) -> str:
         """Name and unit as the title of an axis."""
         title = self.name.replace("_", " ")
-        if self.shown_unit:
-            return f"{title} ({self.shown_unit})"
+        if self.printed_unit:
+            return f"{title} ({self.printed_unit})"
         return title
 
-    def shown(self, mean: float, deviation: float) -> str:
-        """Return a mean ± standard deviation with the unit."""
-        return f"{plus_minus(mean, deviation)} {self.shown_unit}".rstrip()
+    def printed(self, mean: float, deviation: float) -> str:
+        """Format a mean ± standard deviation with the unit."""
+        return f"{plus_minus(mean, deviation)} {self.printed_unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,6 @@ class ParameterPrior:
 
     Attributes
     ----------
-    name, unit : str
-        The name of the parameter and its unit.
     mean, deviation : float
         The mean and the standard deviation before the truncation [unit].
     low, high : float
@@ -94,9 +92,9 @@ class ParameterPrior:
     title: str = ""
 
     @property
-    def figure(self) -> CalibratedFigure:
-        """The parameter as a calibrated figure."""
-        return CalibratedFigure(self.name, self.unit, self.title or self.name.replace("_", " "))
+    def quantity(self) -> CalibratedQuantity:
+        """The parameter as a calibrated quantity."""
+        return CalibratedQuantity(self.name, self.unit, self.title or self.name.replace("_", " "))
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class ChannelFit:
         The number of readings.
     before, after : float
         The rms residual at the prior means and at the optimum, in standard deviations of the noise
-        [1]; NaN where the noise is not known. Gains, zeros and the like are fitted in both.
+        [1]; NaN if the noise is not known. Gains, zeros and initial states are fitted in both.
     """
 
     name: str
@@ -122,13 +120,13 @@ class ChannelFit:
 
 
 @dataclass(frozen=True)
-class FigureReading:
-    """A measured value of a figure.
+class QuantityReading:
+    """A measured value of a quantity.
 
     Attributes
     ----------
     value, deviation : float
-        The measured value and its standard deviation [unit of the figure].
+        The measured value and its standard deviation [unit of the quantity].
     """
 
     name: str
@@ -139,20 +137,21 @@ class FigureReading:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The posterior of the parameters of a model, given a campaign or a laboratory's experiments.
+    """The posterior of a model's parameters, given a campaign or a laboratory's experiments.
 
     Attributes
     ----------
     model, model_hash : str
         The name of the model, and the SHA-256 of all its files.
     procedure : Procedure
-        The method of the samples.
+        How the samples were drawn.
     priors : tuple of ParameterPrior
         The priors of the P calibrated parameters.
     samples, prior_samples : (N, P + Q), (M, P + Q) array
-        The equally weighted samples of posterior and prior, parameters first [units of `figures`].
+        The equally weighted samples of posterior and prior, parameters first [units of
+        `all_quantities`].
     explained : bool or None
-        Whether noise and priors explain the residuals of the calibrated model; None where the data
+        Whether noise and priors explain the residuals of the calibrated model; None if the data
         cannot decide.
     findings : tuple of str
         Sentences on what the data do not determine, and on what disagrees.
@@ -164,12 +163,12 @@ class Calibration:
         The versions and hashes.
     design_hash : str
         The SHA-256 of the design or structure of the model; empty if it is not known.
-    quantities : tuple of CalibratedFigure
-        The Q figures of the model that follow from the parameters.
-    readings : tuple of FigureReading
+    quantities : tuple of CalibratedQuantity
+        The Q quantities of the model that follow from the parameters.
+    readings : tuple of QuantityReading
         The measured values of parameters and quantities.
     measured : Dataset
-        The readings that are more than one number, by name, with units.
+        Measurements that are arrays, by name, with units.
     design : WingDesign or None
         The design with the measured planform, for a wing.
     sensors : tuple of SensorFit
@@ -195,8 +194,8 @@ class Calibration:
     seed: int
     provenance: JsonRecord
     design_hash: str = ""
-    quantities: tuple[CalibratedFigure, ...] = ()
-    readings: tuple[FigureReading, ...] = ()
+    quantities: tuple[CalibratedQuantity, ...] = ()
+    readings: tuple[QuantityReading, ...] = ()
     measured: xr.Dataset = field(default_factory=xr.Dataset)
     design: WingDesign | None = None
     sensors: tuple[SensorFit, ...] = ()
@@ -211,23 +210,23 @@ class Calibration:
         )
 
     def _repr_html_(self) -> str:
-        """Return prior and posterior of each parameter, for a notebook."""
+        """Return prior and posterior of each parameter as HTML, for a notebook."""
         rows = []
         for prior in self.priors:
             name = prior.name
             posterior = plus_minus(self.mean(name), self.standard_deviation(name))
             prior_text = plus_minus(*self.prior_moments(name))
-            rows.append([prior.figure.title, prior_text, posterior, prior.figure.shown_unit])
+            rows.append([prior.quantity.title, prior_text, posterior, prior.quantity.printed_unit])
         title = f"Calibration of {self.asset}: parameters of {self.model}"
         return html_table(title, ("parameter", "prior", "posterior", "unit"), rows, self.findings)
 
     def plot(self, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
-        """Draw the prior and the posterior of each parameter as densities of their samples.
+        """Draw prior and posterior of each parameter as histograms of their samples.
 
         Parameters
         ----------
         axes : Axes or sequence of Axes, optional
-            A panel for each parameter; new ones of pyplot by default.
+            A panel for each parameter; by default new ones of pyplot.
 
         Returns
         -------
@@ -242,7 +241,7 @@ class Calibration:
                 samples = self.draws_of(prior.name, prior=is_prior)
                 label = "prior" if is_prior else "posterior"
                 panel.hist(samples, bins="auto", density=True, color=color, alpha=0.6, label=label)
-            panel.set_xlabel(prior.figure.axis_title)
+            panel.set_xlabel(prior.quantity.axis_title)
             panel.set_ylabel("density")
         panels[0].legend(frameon=False)
         return panels
@@ -250,27 +249,27 @@ class Calibration:
     def __post_init__(self) -> None:
         check_name(self.asset)
         for samples in (self.samples, self.prior_samples):
-            is_complete = len(samples) > 0 and samples.shape[1:] == (len(self.figures),)
+            is_complete = len(samples) > 0 and samples.shape[1:] == (len(self.all_quantities),)
             if not is_complete or not np.isfinite(samples).all():
                 raise CalibrationRecordError(
                     f"the calibration of {self.asset} must have samples of posterior and prior, "
-                    "finite ones, of each of its figures."
+                    "finite ones, of each of its quantities."
                 )
 
     @property
-    def figures(self) -> tuple[CalibratedFigure, ...]:
+    def all_quantities(self) -> tuple[CalibratedQuantity, ...]:
         """Parameters and quantities, in the order of the samples."""
-        return (*(prior.figure for prior in self.priors), *self.quantities)
+        return (*(prior.quantity for prior in self.priors), *self.quantities)
 
     def draws_of(self, name: str, *, prior: bool = False) -> Float:
-        """Return all samples (N,) of one figure [unit].
+        """Return all samples (N,) of a parameter or quantity, in its unit.
 
         Raises
         ------
         CalibrationRecordError
-            If the calibration has no figure of this name.
+            If the calibration has no quantity of this name.
         """
-        names = [figure.name for figure in self.figures]
+        names = [quantity.name for quantity in self.all_quantities]
         if name not in names:
             raise CalibrationRecordError(
                 f"the calibration of {self.asset} has no samples of `{name}`; "
@@ -280,23 +279,23 @@ class Calibration:
         return samples[:, names.index(name)]
 
     def mean(self, name: str) -> float:
-        """Return the posterior mean of a figure, SI."""
+        """Return the posterior mean of a parameter or quantity, in its unit."""
         return float(np.mean(self.draws_of(name)))
 
     def standard_deviation(self, name: str) -> float:
-        """Return the posterior standard deviation of a figure, SI; zero for a fixed figure."""
+        """Return the posterior standard deviation of a parameter or quantity, in its unit."""
         return moments(self.draws_of(name))[1]
 
     def prior_moments(self, name: str) -> tuple[float, float]:
-        """Return mean and standard deviation of a figure in the prior samples [unit]."""
+        """Return the prior mean and standard deviation, from the prior samples."""
         return moments(self.draws_of(name, prior=True))
 
-    def kept_share(self, name: str) -> float:
-        """Return the standard deviation of a figure divided by that of its prior [1]."""
+    def posterior_over_prior(self, name: str) -> float:
+        """Return the ratio of the posterior to the prior standard deviation [1]."""
         return self.standard_deviation(name) / self.prior_moments(name)[1]
 
     def interval(self, name: str, probability: float = 0.9) -> tuple[float, float]:
-        """Return the central interval of a figure [unit]."""
+        """Return the central posterior interval with a probability, in the quantity's unit."""
         probabilities = [0.5 - 0.5 * probability, 0.5 + 0.5 * probability]
         low, high = np.quantile(self.draws_of(name), probabilities)
         return float(low), float(high)
@@ -310,7 +309,7 @@ class Calibration:
     def information(self) -> float | None:
         """Information gained [nat]: the Kullback-Leibler divergence of posterior from prior.
 
-        Both are taken for Gaussians with the moments of the samples. The value is None if a
+        Both are approximated by Gaussians with the moments of the samples. The value is None if a
         parameter follows from the others, as the paper's masses follow from e.
         """
         # Parameters in units of their prior standard deviations
@@ -335,8 +334,8 @@ class Calibration:
         trace = np.trace(prior_precision @ posterior_covariance)
         return 0.5 * float(trace + shift @ prior_precision @ shift - len(shift) + log_volume_ratio)
 
-    def score(self, reading: FigureReading) -> float:
-        """Return the difference between model and reading, in standard deviations of both [1]."""
+    def score(self, reading: QuantityReading) -> float:
+        """Return model minus reading, in standard deviations of both together [1]."""
         deviation = np.hypot(reading.deviation, self.standard_deviation(reading.name))
         return (self.mean(reading.name) - reading.value) / float(deviation)
 
@@ -344,12 +343,9 @@ class Calibration:
         """Return minus the mean absolute difference between readings and model [1].
 
         Each difference is divided by the half-width of the 95 % interval of the reading, as in the
-        error reward of Kapteyn et al. 2021.
-
-        Parameters
-        ----------
-        prior : bool
-            Whether the model has the prior means, instead of the posterior means.
+        error reward of Kapteyn et al. 2021. With `prior`, the model has the prior means instead of
+        the
+        posterior means.
         """
         errors = []
         for reading in self.readings:
@@ -359,58 +355,52 @@ class Calibration:
         return -float(np.mean(errors))
 
     def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return draws (count,) of one figure from strata of equal probability, shuffled [unit].
+        """Return draws (count,), one from each of `count` strata of equal probability, shuffled.
 
-        There is one draw from each stratum. The means of functions of this figure thus have a far
-        smaller variance than those of independent draws.
-
-        Parameters
-        ----------
-        count : int
-            The number of draws, and of strata.
-        seed : int or SeedSequence
-            The same seed gives the same draws.
+        The means of functions of this quantity thus have a far smaller variance than those of
+        independent draws.
 
         Raises
         ------
         CalibrationRecordError
-            If the calibration has no figure of this name.
+            If the calibration has no quantity of this name.
         """
         values = np.sort(self.draws_of(name))
         generator = np.random.default_rng(child_seed(seed, 0))
         ranks = (stratified(generator, count) * len(values)).astype(np.int64)
         return values[np.minimum(ranks, len(values) - 1)]
 
-    def given(self, name: str, values: Float) -> dict[str, Float]:
-        """Return the conditional expectations of all other parameters, given values of one.
+    def conditional_means(self, name: str, values: Float) -> dict[str, Float]:
+        """Return the conditional means of all other parameters, given values of one quantity.
 
-        They follow by linear regression on the samples, which is exact for a Gaussian posterior.
-        They are limited to the range of the samples.
+        They follow by linear regression on the samples, which is exact for a Gaussian posterior,
+        and are
+        limited to the range of the samples.
 
         Parameters
         ----------
         name : str
-            The parameter whose values are given.
+            The parameter or quantity whose values are given.
         values : (n,) array
-            The values of that figure, in its unit.
+            Its values, in its unit.
 
         Returns
         -------
         dict of str to (n,) array
-            The expectations of the other parameters by name [units].
+            The means of the other parameters by name, in their units.
         """
         draws = self.draws_of(name)
         variance = float(np.var(draws))
-        expectations: dict[str, Float] = {}
+        means: dict[str, Float] = {}
         for prior in self.priors:
             if prior.name == name:
                 continue
             other_draws = self.draws_of(prior.name)
             covariance = float(np.mean((draws - draws.mean()) * (other_draws - other_draws.mean())))
             slope = covariance / variance if variance else 0.0
-            expected_draws = other_draws.mean() + slope * (values - draws.mean())
-            expectations[prior.name] = np.clip(expected_draws, other_draws.min(), other_draws.max())
-        return expectations
+            conditional_mean = other_draws.mean() + slope * (values - draws.mean())
+            means[prior.name] = np.clip(conditional_mean, other_draws.min(), other_draws.max())
+        return means
 
     @property
     def wing_design(self) -> WingDesign:
@@ -430,34 +420,24 @@ class Calibration:
 
     def mean_state(self) -> DigitalState:
         """Return the digital state of a healthy wing at the posterior mean."""
-        return self._state(np.array([self.mean(figure.name) for figure in self.figures]))
+        return self._state(np.array([self.mean(quantity.name) for quantity in self.all_quantities]))
 
     def states(self) -> tuple[DigitalState, ...]:
-        """Return the digital state of a healthy wing with the tailored planform for each sample."""
+        """Return the digital state of a healthy wing for each sample."""
         return tuple(self._state(row) for row in self.samples)
 
     def _state(self, row: Float) -> DigitalState:
-        """Return the digital state of a wing whose figures have given values (P + Q,)."""
-        names = [figure.name for figure in self.figures]
+        """Return the digital state of a wing from the values (P + Q,) of its quantities."""
+        names = [quantity.name for quantity in self.all_quantities]
         values = dict(zip(names, row.tolist(), strict=True))
         return DigitalState(self.wing_design.geometry, **{name: values[name] for name in STATE})
 
 
-_SINGULAR = 1e10  # condition of a correlation matrix in which one figure follows from the others
+_SINGULAR = 1e10  # condition of a correlation matrix in which one parameter follows from the others
 
 
 def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> Float:
-    """Return stratified samples of truncated Gaussian priors.
-
-    Parameters
-    ----------
-    priors : tuple of ParameterPrior
-        The priors of P parameters.
-
-    Returns
-    -------
-    (count, P) array
-    """
+    """Return stratified samples (count, P) of truncated Gaussian priors."""
     from scipy.special import ndtr, ndtri  # slow to import, and a file is read without it
 
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
@@ -481,7 +461,7 @@ def moments(values: Float) -> tuple[float, float]:
 def correlation(values: Float) -> Float:
     """Return the correlation matrix (F, F) of samples (N, F).
 
-    The correlation of a constant figure with all others is 0.
+    A constant column has zero correlation with all others.
     """
     centred = values - values.mean(axis=0)
     norm = np.linalg.norm(centred, axis=0)
@@ -492,12 +472,12 @@ def correlation(values: Float) -> Float:
 
 
 def check_name(asset: str) -> str:
-    """Return the name of an asset; refuse a name that cannot be printed.
+    """Return the name of an asset if it can be printed.
 
     Raises
     ------
     CalibrationRecordError
-        If it is empty, too long or holds control characters.
+        If it is empty, too long or contains control characters.
     """
     has_good_length = 0 < len(asset) <= LONGEST_NAME
     if not (has_good_length and asset.isprintable() and asset.strip()):

@@ -1,4 +1,4 @@
-"""Fitted gains and zeros of channels, and their table beside what the campaign states of them."""
+"""Fitted gains and zeros of channels, and a table that compares them with stated values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from reporting.record_table import RecordColumn, number_cells, text_cells
 from reporting.words import plus_minus
 
 MOST_PRINTED_SENSORS = 12
-"""Most rows that are printed; a report has all channels."""
+"""Largest number of rows that are printed; a report has all channels."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class SensorFit:
 
     @property
     def deviations(self) -> float:
-        """Fitted value in stated standard deviations; not a number if nothing is stated [1]."""
+        """Fitted value in stated standard deviations [1]; NaN if none is stated."""
         return self.value / self.stated_deviation if isfinite(self.stated_deviation) else nan
 
     @property
     def label(self) -> str:
-        """What was fitted: the gain, its error, or the zero in a trial."""
+        """The fitted quantity: the gain, its error, or the zero in a trial."""
         if self.is_free_gain:
             return "gain"
         if self.kind == "gain":
@@ -85,22 +85,17 @@ class SensorFit:
 
     @property
     def deviations_text(self) -> str:
-        """The distance from the stated value in stated standard deviations; empty if none is."""
+        """The distance from the stated value in stated standard deviations, or nothing."""
         if not isfinite(self.deviations):
             return ""
         return f"{self.deviations:+.1f}".replace("-", "\N{MINUS SIGN}")
 
 
 def gains_and_farthest_zeros(fits: Sequence[SensorFit]) -> list[SensorFit]:
-    """Return the gain of each channel, and the farthest of its zeros that are not free.
+    """Return the gain of each channel, and its zero farthest from the stated value.
 
-    A zero is free if its deviation is not stated: then it says nothing of the sensor. A channel
-    with free zeros only has the first of them.
-
-    Parameters
-    ----------
-    fits : sequence of SensorFit
-        All fitted gains and zeros.
+    Zeros without a stated standard deviation are not ranked; a channel with no others has its first
+    one.
     """
     rows = []
     for channel in dict.fromkeys(fit.channel for fit in fits):
@@ -113,14 +108,14 @@ def gains_and_farthest_zeros(fits: Sequence[SensorFit]) -> list[SensorFit]:
 
 
 def printed_rows(fits: Sequence[SensorFit]) -> list[SensorFit]:
-    """Return the rows for a terminal: of too many, those farthest from what is stated."""
+    """Return the rows for a terminal: the farthest from the stated value, if there are too many."""
     rows = gains_and_farthest_zeros(fits)
     farthest = sorted(rows, key=lambda row: -distance(row))[:MOST_PRINTED_SENSORS]
     return [row for row in rows if row in farthest]
 
 
 def distance(fit: SensorFit) -> float:
-    """Return the distance from the stated value in stated deviations; -1 if none is stated."""
+    """Return the distance from the stated value in standard deviations; -1 if not stated."""
     return abs(fit.deviations) if isfinite(fit.deviations) else -1.0
 
 

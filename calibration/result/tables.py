@@ -2,7 +2,7 @@
 
 from math import isfinite
 
-from calibration.result.record import Calibration, ChannelFit, FigureReading, ParameterPrior
+from calibration.result.record import Calibration, ChannelFit, ParameterPrior, QuantityReading
 from calibration.result.sensors import (
     SENSOR_COLUMNS,
     SensorFit,
@@ -39,13 +39,13 @@ def parameters_table(result: Calibration) -> TitledTable:
         return between(low, high, result.standard_deviation(prior.name))
 
     def prior_left(prior: ParameterPrior) -> str:
-        percent = 100 * result.kept_share(prior.name)
+        percent = 100 * result.posterior_over_prior(prior.name)
         decimals = 0 if percent > 9.5 else 1
         return f"{percent:.{decimals}f} %"
 
     columns: list[RecordColumn[ParameterPrior]] = [
-        text_cells("parameter", lambda prior: prior.figure.title),
-        text_cells("unit", lambda prior: prior.figure.shown_unit),
+        text_cells("parameter", lambda prior: prior.quantity.title),
+        text_cells("unit", lambda prior: prior.quantity.printed_unit),
         number_cells("prior", lambda prior: _prior_text(result, prior.name)),
         number_cells("posterior", posterior),
         number_cells("90 % interval", interval),
@@ -62,15 +62,15 @@ def parameters_table(result: Calibration) -> TitledTable:
 
 
 def _prior_text(result: Calibration, name: str) -> str:
-    """Return mean and standard deviation of a figure before the calibration."""
+    """Return the prior mean and standard deviation of a quantity as text."""
     mean, deviation = result.prior_moments(name)
     return plus_minus(mean, deviation)
 
 
 def readings_table(result: Calibration) -> TitledTable:
-    """Return the table of measured figures, with the model's before and after calibration."""
-    units = {figure.name: figure.shown_unit for figure in reversed(result.figures)}
-    columns: list[RecordColumn[FigureReading]] = [
+    """Return the table of measured quantities, with the model's before and after calibration."""
+    units = {quantity.name: quantity.printed_unit for quantity in reversed(result.all_quantities)}
+    columns: list[RecordColumn[QuantityReading]] = [
         text_cells("experiment", lambda reading: reading.experiment),
         text_cells("figure", lambda reading: reading.name),
         text_cells("unit", lambda reading: units[reading.name]),
@@ -119,7 +119,7 @@ def channels_table(result: Calibration) -> TitledTable:
 
 
 def sensors_table(result: Calibration) -> TitledTable:
-    """Return the table of fitted gains and zeros beside what is stated, for the page."""
+    """Return the table of fitted gains and zeros beside the stated values, for the page."""
     return _sensors_table(gains_and_farthest_zeros(result.sensors))
 
 
@@ -147,7 +147,7 @@ def _rms_text(rms: float) -> str:
 
 
 def origin_table(result: Calibration) -> TitledTable:
-    """Return a table with the origin of a calibration: asset, model, data, seed and software."""
+    """Return a table with the origin of a calibration: asset, model, data, seed, software."""
     versions = result.provenance["versions"].items()
     items = {
         "asset": result.asset,

@@ -1,4 +1,4 @@
-"""The figures of a calibration in words, for console and page."""
+"""A calibration in words, for console and page."""
 
 from collections.abc import Iterator
 
@@ -17,9 +17,9 @@ def correlation_lines(result: Calibration) -> list[str]:
     names = [prior.name for prior in result.priors]
     matrix = result.correlation
     rows, columns = np.triu_indices(len(names), 1)
-    by_size = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")
+    largest_first = np.argsort(-np.abs(matrix[rows, columns]), kind="stable")
     lines = []
-    for i, j in zip(rows[by_size], columns[by_size], strict=True):
+    for i, j in zip(rows[largest_first], columns[largest_first], strict=True):
         if abs(matrix[i, j]) >= NOTICEABLE_CORRELATION:
             lines.append(f"Correlation of {names[i]} and {names[j]}: {matrix[i, j]:+.2f}")
     return lines

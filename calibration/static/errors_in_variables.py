@@ -45,13 +45,13 @@ from .experiments import LoadDisplacementData
 from .posterior import PUBLISHED_LINE, GaussianPrior, ScalarPosterior, StiffnessCurve
 
 Measure = Literal["displacement", "load", "ratio"]
-"""The quantity of a pair with a flat prior: true displacement, true load, or the paper's ratio."""
+"""The quantity with a flat prior: true displacement, true load, or their ratio as in the paper."""
 
 GRID_SIZE = 2001
-"""Points of the posterior's grid, over +-10 standard deviations."""
+"""Number of points of the posterior's grid, over +-10 standard deviations."""
 
 NOTICEABLE_SCORE = 2.0
-"""Score from which a difference between runs, or a pair, is reported [standard deviations]."""
+"""Score above which a difference between runs, or a pair, is reported [standard deviations]."""
 
 _REACH = 10.0  # of the grid, in standard deviations
 _MOST_REFINEMENTS = 60
@@ -82,7 +82,7 @@ def pair_log_likelihoods(
     Parameters
     ----------
     curve : StiffnessCurve
-        The tip stiffness k(e) [N/m] as a function of the factor e.
+        The tip stiffness k(e) [N/m].
     young_modulus_factor : (N,) array
         The values of e.
     measure : {"displacement", "load", "ratio"}
@@ -144,8 +144,8 @@ def log_likelihood(
     curve, data, young_modulus_factor, measure
         As in `pair_log_likelihoods`.
     zero_offset_standard_deviation : float
-        The standard deviation of the zero offset of the displacement that the pairs of a loading
-        run share [m]. The measure "ratio" has no likelihood with an offset.
+        The standard deviation of the displacement's zero offset that the pairs of a loading run
+        share [m]. With an offset, the measure "ratio" is not a likelihood.
     """
     log_likelihoods = pair_log_likelihoods(curve, data, young_modulus_factor, measure).sum(axis=0)
     k = curve.stiffness(np.atleast_1d(young_modulus_factor))
@@ -215,9 +215,10 @@ def exact_posterior(
 def _first_grid_limits(
     data: LoadDisplacementData, curve: StiffnessCurve, prior: GaussianPrior
 ) -> tuple[float, float]:
-    """Return a wide range of e, which contains the prior and what each measured pair indicates.
+    """Return a wide range of e that contains the prior and the estimate of each pair.
 
-    A pair indicates a stiffness, load over displacement, within six standard deviations. The lower
+    A pair estimates the stiffness by load over displacement, within six standard deviations. The
+    lower
     limit keeps the stiffness k(e) positive.
     """
     stiffness = data.load / data.displacement
@@ -237,7 +238,7 @@ def _first_grid_limits(
 
 
 def _refuse_posterior_outside(posterior: ScalarPosterior, curve: StiffnessCurve) -> None:
-    """Refuse a posterior that reaches beyond the range of the stiffness curve."""
+    """Raise `OutsideValidityError` if a posterior exceeds the range of the stiffness curve."""
     below_lower, below_upper = posterior.cumulative([curve.lower, curve.upper])
     outside = 1.0 - float(below_upper - below_lower)
     if outside > _LARGEST_PROBABILITY_OUTSIDE:
@@ -250,7 +251,7 @@ def _refuse_posterior_outside(posterior: ScalarPosterior, curve: StiffnessCurve)
 
 
 class FitQuality(NamedTuple):
-    """Residuals of the measured pairs at one stiffness.
+    """Residuals of the measured pairs for one stiffness.
 
     Attributes
     ----------
@@ -273,13 +274,7 @@ class _RunOffset(NamedTuple):
 
 
 def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
-    """Return the residuals of the measured pairs at one stiffness, with remarks on what disagrees.
-
-    Parameters
-    ----------
-    stiffness : float
-        The tip stiffness [N/m].
-    """
+    """Return the residuals of the measured pairs for a tip stiffness [N/m], and remarks on them."""
     load_deviation = math.sqrt(float(residual_variance(data, stiffness)))
     residual = data.displacement - data.load / stiffness
     standardised = residual * stiffness / load_deviation

@@ -70,7 +70,7 @@ class LoadDisplacementData:
     load_standard_deviation, displacement_standard_deviation : float
         The standard deviations of the independent Gaussian errors of the readings [N], [m].
     source : str
-        Where the measurements are from.
+        The origin of the measurements, for messages.
 
     Raises
     ------
@@ -109,7 +109,7 @@ class LoadDisplacementData:
 
     @property
     def sha256(self) -> str:
-        """Hash of the values and their uncertainty (not of `source`), equal on every platform."""
+        """Hash of values and uncertainty, without `source`, the same on every platform."""
         return hash_record(
             [
                 float(self.load_standard_deviation),
@@ -138,7 +138,7 @@ def published_measurements() -> LoadDisplacementData:
 
 
 def read_measurements(path: Path) -> LoadDisplacementData:
-    """Return the pairs of step 2 in the authors' calibration folder, or in one CSV file.
+    """Read the pairs of step 2 in the authors' calibration folder, or in one CSV file.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def read_measurements(path: Path) -> LoadDisplacementData:
 
 
 def _refuse_other_units(file: str, load: Float, displacement_mm: Float) -> None:
-    """Refuse loads (N,) [N] and displacements (N,) [mm] whose ratio shows other units."""
+    """Raise `ExperimentDataError` if loads [N] over displacements [mm] suggest other units."""
     stiffness = float(np.median(load / displacement_mm))  # N/mm
     expected_stiffness = EXPECTED_TIP_STIFFNESS * 1e-3
     ratio = stiffness / expected_stiffness

@@ -1,4 +1,4 @@
-"""Densities of one unknown; the stiffness as a curve of it: Kapteyn et al. 2021, eq. (14)."""
+"""Densities of one unknown, and the stiffness as a curve of it: Kapteyn et al. 2021, eq. (14)."""
 
 import math
 from collections.abc import Callable
@@ -12,39 +12,26 @@ from calibration.errors import PosteriorError
 from reporting.arrays import Float
 
 Seed = int | np.random.SeedSequence
-"""A seed: a whole number, or a SeedSequence for one purpose."""
+"""A seed: an integer, or a SeedSequence for one purpose."""
 
 PRIOR_DEVIATION = 0.05 / 1.96
 """Half-width of the prior's 95 % interval of e (Kapteyn et al. 2021, calibration step 2)."""
 
 
 def stratified(generator: np.random.Generator, count: int) -> Float:
-    """Return stratified uniform random numbers: one from each of `count` equal intervals of [0, 1].
+    """Return uniform random numbers (count,), one from each of `count` equal intervals of [0, 1].
 
-    Parameters
-    ----------
-    count : int
-        The number of intervals.
-
-    Returns
-    -------
-    (count,) array
-        The numbers, in shuffled order.
+    They are shuffled.
     """
     strata = (np.arange(count) + generator.random(count)) / count
     return generator.permutation(strata)
 
 
 def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
-    """Return the seed for one of the purposes of a common seed.
+    """Return the seed of one purpose, by its number, derived from a common seed.
 
     Calls with equal arguments return equal seeds, while the result of `SeedSequence.spawn` depends
     on the number of its calls.
-
-    Parameters
-    ----------
-    purpose : int
-        The number of the purpose.
     """
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, purpose))
@@ -52,13 +39,7 @@ def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """A Gaussian prior; by default that of the paper, e ~ N(1, (0.05 / 1.96)^2).
-
-    Attributes
-    ----------
-    mean, standard_deviation : float
-        The mean and the standard deviation of the Young's modulus factor [1].
-    """
+    """A Gaussian prior of e; by default that of the paper, e ~ N(1, (0.05 / 1.96)^2)."""
 
     mean: float = 1.0
     standard_deviation: float = PRIOR_DEVIATION
@@ -81,7 +62,7 @@ class GaussianPrior:
 class ScalarPosterior:
     """The density p(value | measurements) on a grid.
 
-    The density is zero outside the grid, and constant within a cell.
+    The density is zero outside the grid, and its distribution function is linear in each cell.
 
     Attributes
     ----------
@@ -135,26 +116,18 @@ class ScalarPosterior:
         return float(lower), float(upper)
 
     def samples(self, seed: Seed, count: int) -> Float:
-        """Return one sample from each of `count` strata of equal probability, in shuffled order.
+        """Return samples (count,), one from each of `count` strata of equal probability, shuffled.
 
-        Their mean has far less variance than that of independent draws.
-
-        Parameters
-        ----------
-        seed : int or SeedSequence
-            The same seed gives the same samples, bit for bit.
-
-        Returns
-        -------
-        (count,) array
-            The samples, in the unit of `grid`.
+        Their mean has far less variance than that of independent draws. Equal seeds give equal
+        samples, bit
+        for bit.
         """
         generator = np.random.default_rng(child_seed(seed, 0))
         return self.quantile(stratified(generator, count))
 
 
 TABLE_TOLERANCE = 1e-7
-"""Largest relative error of a curve between the nodes at which the model is evaluated."""
+"""Largest relative error of a curve between the interpolation nodes."""
 
 _INVERSE_TABLE_SIZE = 4001
 _DEGREE = 16
@@ -167,8 +140,8 @@ class StiffnessCurve:
     Attributes
     ----------
     polynomial : Chebyshev
-        The stiffness k(e) [N/m] over the range in which the curve may be trusted. Straight lines
-        continue it, so that tails of a sampled density can be mapped; no posterior may lie there.
+        The stiffness k(e) [N/m] over the range in which the curve is valid. It is continued by its
+        tangents, so that tails of a sampled density can be mapped; no posterior may lie there.
     name : str
         The name of the curve, for reports.
     """
@@ -219,8 +192,6 @@ def stiffness_line(
     ----------
     gradient, intercept : float
         The coefficients of the line [N/m].
-    name : str
-        The name of the curve, for reports.
     lower, upper : float
         The range of e [1].
     """
@@ -237,7 +208,7 @@ def stiffness_curve_of(
     limits: tuple[float, float],
     name: str = "finite element model",
 ) -> StiffnessCurve:
-    """Return the tip stiffness of a structural model as a Chebyshev polynomial of e.
+    """Approximate the tip stiffness of a structural model by a Chebyshev polynomial of e.
 
     Between the interpolation nodes the polynomial must agree with the model within
     `TABLE_TOLERANCE`.
@@ -247,9 +218,7 @@ def stiffness_curve_of(
     tip_stiffness : callable
         Returns load over displacement 5 cm from the tip [N/m] for a value of e.
     limits : (float, float)
-        The range of e in which the model holds.
-    name : str
-        The name of the curve, for reports.
+        The range of e in which the model is valid.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The calibration of a wing: from a laboratory's measurements to the calibrated twin."""
+"""Calibrate a wing from a laboratory's measurements."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +18,8 @@ from calibration.result.file import save_calibration
 from calibration.result.record import (
     Calibration,
     ChannelFit,
-    FigureReading,
     Procedure,
+    QuantityReading,
     check_name,
     prior_samples,
 )
@@ -37,14 +37,14 @@ from reporting.progress import Progress, reporter
 from reporting.provenance import collect_provenance
 from reporting.words import brief
 
-KeptProcedure = Literal["joint", "paper"]
-"""The procedure whose samples a calibration keeps."""
+SavedProcedure = Literal["joint", "paper"]
+"""The procedure whose samples a calibration stores."""
 
 SAMPLE_COUNT = 1000
-"""Number of samples of the joint posterior that a calibration keeps."""
+"""Number of samples of the joint posterior that a calibration stores."""
 
 PAPER_SAMPLE_COUNT = 100
-"""Number of samples of e for which masses are sought, as in the paper."""
+"""Number of samples of e for which masses are fitted, as in the paper."""
 
 _PAPER_PURPOSE = 31  # of the seed: the paper's samples of e
 _LENGTHS_PURPOSE = 35  # of the seed: the samples of the lengths
@@ -52,14 +52,14 @@ _LENGTHS_PURPOSE = 35  # of the seed: the samples of the lengths
 
 @dataclass(frozen=True, eq=False)
 class WingCalibration:
-    """The calibration of a wing with all the contents of its report.
+    """The calibration of a wing with the contents of its report.
 
     Attributes
     ----------
     joint, paper : Calibration
         The calibration by the joint posterior, and by the paper's procedure, step after step.
     procedure : {"joint", "paper"}
-        The procedure that is kept.
+        The procedure whose calibration tailors the twin.
     model : ReducedModel
         The model of the tailored design.
     static, static_published : StaticCalibration
@@ -88,13 +88,13 @@ class WingCalibration:
         return table_1(self.result, self.paper, self.static_published.particle)
 
     def save(self, path: Path | str) -> Path:
-        """Write the calibration that tailors the twin in one step; `load_calibration` reads it."""
+        """Write the calibration that tailors the twin atomically; `load_calibration` reads it."""
         return save_calibration(self.result, path)
 
 
-def _check_request(procedure: KeptProcedure, seed: int) -> None:
-    """Refuse an unknown procedure, and a seed that is not a whole number of 63 bits."""
-    require_one_of(procedure, get_args(KeptProcedure), "procedure")
+def _check_request(procedure: SavedProcedure, seed: int) -> None:
+    """Raise an error for an unknown procedure, or a seed that is not a 63-bit integer from 0 on."""
+    require_one_of(procedure, get_args(SavedProcedure), "procedure")
     if seed not in range(2**63):
         raise CalibrationRecordError(
             f"`seed` must be a whole number from 0 to 2^63 - 1, but {seed!r} was given."
@@ -106,7 +106,7 @@ def calibrate(
     design: WingDesign | None = None,
     *,
     asset: str | None = None,
-    procedure: KeptProcedure = "joint",
+    procedure: SavedProcedure = "joint",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> WingCalibration:
@@ -117,11 +117,11 @@ def calibrate(
     lab : LabData or path, optional
         The measurements, or the lab folder that holds them; the published ones by default.
     design : WingDesign, optional
-        The wing as drawn; the shipped one by default. Its planform follows the measured lengths.
+        The wing as drawn; the shipped one by default. It gets the measured planform.
     asset : str, optional
         The name of the wing; that of the design by default.
     procedure : {"joint", "paper"}
-        The samples to keep: of the joint posterior, or of the paper's steps one after another.
+        Whether to store samples of the joint posterior, or of the paper's step-by-step procedure.
 
     Raises
     ------
@@ -172,17 +172,7 @@ def calibrate(
 
 
 class _RecordMaker:
-    """Makes the records of both procedures of one wing.
-
-    Parameters
-    ----------
-    drawn, tailored : WingDesign
-        The design as drawn, and with the measured planform.
-    table : WingTable
-        The outputs of the tailored model.
-    static : StaticCalibration
-        The result of step 2.
-    """
+    """Makes the records of both procedures for one wing."""
 
     def __init__(
         self,
@@ -215,14 +205,9 @@ class _RecordMaker:
         ).as_dict()
 
     def record(self, procedure: Procedure, states: Float) -> Calibration:
-        """Return the calibration by one of the procedures.
+        """Return the calibration by a procedure.
 
-        Parameters
-        ----------
-        procedure : Procedure
-            The procedure by which the wing was calibrated.
-        states : (N, 5) array
-            Its samples of e, masses and Rayleigh coefficients.
+        `states` (N, 5) are its samples of e, masses and Rayleigh coefficients.
         """
         lab = self._lab
         lengths = _length_samples(lab.lengths, len(states), self._seed)
@@ -254,12 +239,7 @@ class _RecordMaker:
 def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[ChannelFit, ...]:
     """Return the rms residuals of each loading run before and after the calibration.
 
-    Before, e has its prior mean.
-
-    Parameters
-    ----------
-    calibrated_factor : float
-        The calibrated value of e [1].
+    Before the calibration, e has its prior mean; after it, `calibrated_factor`.
     """
     data = static.data
     factors = [static.prior.mean, calibrated_factor]
@@ -282,13 +262,7 @@ def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[
 
 
 def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
-    """Return samples of the posterior of the three lengths.
-
-    Returns
-    -------
-    (count, 3) array
-        Semi-span and chords [m].
-    """
+    """Return samples (count, 3) of the posterior of semi-span and chords [m]."""
     generator = np.random.default_rng(child_seed(seed, _LENGTHS_PURPOSE))
     strata = (np.arange(count) + generator.random(count)) / count
     samples_of_lengths = [
@@ -297,7 +271,7 @@ def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
     return np.column_stack(samples_of_lengths)
 
 
-def _all_readings(lab: LabData) -> tuple[FigureReading, ...]:
+def _all_readings(lab: LabData) -> tuple[QuantityReading, ...]:
     """Return all readings of a laboratory: lengths, tip stiffness, mass and modes."""
     pairs = lab.pairs
     # The stiffness k by the pairs alone: least squares of f = k x, so k = f'x / x'x with the
@@ -308,7 +282,7 @@ def _all_readings(lab: LabData) -> tuple[FigureReading, ...]:
         pairs.load_standard_deviation, stiffness * pairs.displacement_standard_deviation
     )
     deviation = float(load_deviation / np.sqrt(displacement_square))
-    tip_stiffness = FigureReading("tip_stiffness", "load test", stiffness, deviation)
+    tip_stiffness = QuantityReading("tip_stiffness", "load test", stiffness, deviation)
     return (*(length.reading for length in lab.lengths), tip_stiffness, *lab.readings)
 
 

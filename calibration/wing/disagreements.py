@@ -21,17 +21,17 @@ from calibration.wing.lab_data import LabData
 from reporting.words import capital
 
 NOTICEABLE = 2.0
-"""Score from which a difference is reported [standard deviations]."""
+"""Score above which a difference is reported [standard deviations]."""
 
 NOTICEABLE_FREQUENCY = 0.02
-"""Relative difference from which that of a frequency is reported, whatever its score."""
+"""Relative difference above which a frequency is reported, whatever its score."""
 
 _NOTICEABLE_DAMPING = 0.1  # relative difference from the published damping ratio
 _NOTICEABLE_SOFTENING = 0.003  # relative difference of frequencies at large and small amplitudes
 _FEWEST_WINDOWS = 6
 
 AUTHORS_SECOND_FREQUENCY = 28.613
-"""Mean of the authors' model's second flapwise frequency after their calibration [Hz] (step 3)."""
+"""Mean second flapwise frequency of the authors' model after their calibration [Hz] (step 3)."""
 
 
 def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> list[str]:
@@ -52,21 +52,21 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
 
 def _reading_disagreements(result: Calibration, *, is_published: bool) -> list[str]:
     """Return sentences on readings that differ noticeably from the calibrated model."""
-    figures = {figure.name: figure for figure in result.figures}
+    quantities = {quantity.name: quantity for quantity in result.all_quantities}
     sentences = []
     for reading in result.readings:
         name = reading.name
-        figure = figures[name]
+        quantity = quantities[name]
         difference = result.mean(name) / reading.value - 1.0
         score = abs(result.score(reading))
         is_frequency = name.startswith("frequency")
         is_noticeable = is_frequency and abs(difference) > NOTICEABLE_FREQUENCY
         if not is_noticeable and score <= NOTICEABLE:
             continue
-        measured_text = figure.shown(reading.value, reading.deviation)
-        model = figure.shown(result.mean(name), result.standard_deviation(name))
+        measured_text = quantity.printed(reading.value, reading.deviation)
+        model = quantity.printed(result.mean(name), result.standard_deviation(name))
         sentence = (
-            f"{capital(figure.title)}: measured {measured_text}, calibrated model {model}, "
+            f"{capital(quantity.title)}: measured {measured_text}, calibrated model {model}, "
             f"{_percent(difference)} off ({score:.1f} standard deviations)."
         )
         if name == "frequency_2" and is_published:

@@ -1,4 +1,4 @@
-"""Measurements for the three steps of the calibration: published, or in a laboratory's folder."""
+"""Measurements for the three steps of the calibration: published, or from a lab folder."""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -20,10 +20,10 @@ from calibration.geometry import (
     read_lengths,
 )
 from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
-from calibration.joint.wing_table import weighed
+from calibration.joint.wing_table import weighed_mass
 from calibration.lab_folder import find_in_lab_folder, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
-from calibration.result.record import FigureReading
+from calibration.result.record import QuantityReading
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,
@@ -47,7 +47,7 @@ def write_lab_folder(
     lengths: Lengths,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
-    total_mass: FigureReading,
+    total_mass: QuantityReading,
 ) -> tuple[Path, ...]:
     """Write measurements into a folder, in the layout that `read_lab_folder` reads.
 
@@ -63,7 +63,7 @@ def write_lab_folder(
     records : sequence of RingDownRecord
         The records, for `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a
         chordwise column of zeros, because the wing model has no chordwise gauge.
-    total_mass : FigureReading
+    total_mass : QuantityReading
         The weighed total, for `step3/weighed_mass.csv` [g].
 
     Returns
@@ -102,20 +102,20 @@ def write_lab_folder(
 
 
 def _cells(values: Iterable[float]) -> list[str]:
-    """Return numbers as the cells of a table, with ten digits."""
+    """Format numbers as cells of a table, with ten digits."""
     return [f"{value:.10g}" for value in values]
 
 
 def _record_text(record: RingDownRecord) -> str:
-    """Return a ring-down record as the text of a file: time, spanwise signal, zeros."""
+    """Format a ring-down record as the text of a file: time, spanwise signal, zeros."""
     table = np.column_stack([record.time, record.signal, np.zeros(record.count)])
     stream = io.StringIO()
     np.savetxt(stream, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
     return stream.getvalue()
 
 
-def read_weighed_mass(file: Path) -> FigureReading:
-    """Return the weighed total of a laboratory.
+def read_weighed_mass(file: Path) -> QuantityReading:
+    """Read the weighed total of a laboratory.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def read_weighed_mass(file: Path) -> FigureReading:
             f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, "
             f"{mass:g} g."
         )
-    return weighed(1e-3 * mass, 1e-3 * deviation)
+    return weighed_mass(1e-3 * mass, 1e-3 * deviation)
 
 
 Targets = Literal["measured", "published"]
@@ -159,7 +159,7 @@ class StepOrigin(NamedTuple):
     read : bool
         Whether they were read from a folder; otherwise they are published.
     text : str
-        A few words about the origin.
+        The origin in a few words.
     """
 
     step: int
@@ -177,7 +177,7 @@ class LabData:
         The lengths of step 1.
     pairs : LoadDisplacementData
         The load test of step 2.
-    readings : tuple of FigureReading
+    readings : tuple of QuantityReading
         The weighed mass of two servos and the pitot tube, the frequencies and the damping ratios.
     origins : tuple of StepOrigin
         The origin of the measurements of each step.
@@ -191,7 +191,7 @@ class LabData:
 
     lengths: Lengths
     pairs: LoadDisplacementData
-    readings: tuple[FigureReading, ...]
+    readings: tuple[QuantityReading, ...]
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
     trials: Fits | None = None
@@ -206,7 +206,7 @@ def published_data() -> LabData:
     return LabData(
         lengths=lengths,
         pairs=pairs,
-        readings=(weighed(), *PUBLISHED_MODES),
+        readings=(weighed_mass(), *PUBLISHED_MODES),
         origins=tuple(origins),
         input_hashes={"lengths": lengths.sha256, "load_test": pairs.sha256},
     )
@@ -215,7 +215,7 @@ def published_data() -> LabData:
 def read_lab_folder(
     path: Path, targets: Targets | None = None, *, frequencies_fitted: bool = False
 ) -> LabData:
-    """Return the measurements in a lab folder; for a missing step, the published measurements.
+    """Read the measurements in a lab folder; a missing step gets the published measurements.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def read_lab_folder(
         The folder that holds `step1`, `step2`, `step3`, or some of them (also the folder above it
         in the authors' repository). Ring-down records may also lie in the folder itself.
     targets : {"measured", "published"}, optional
-        Whether step 3 uses the ring-down records; by default it does where there are any.
+        Whether step 3 uses the ring-down records; by default it does if there are any.
     frequencies_fitted : bool
         Whether the frequencies of a record are fitted; otherwise they are those of its spectrum, as
         in the authors' procedure.
@@ -232,7 +232,7 @@ def read_lab_folder(
     ------
     ExperimentFileError
         If the folder does not exist or holds no step at all, a step's folder lacks its file, or
-        records are asked for and there are none.
+        records are required and there are none.
     ExperimentDataError
         If a file holds impossible measurements; see the readers of the steps.
     InvalidChoiceError
@@ -291,14 +291,14 @@ def _with_hashes(lab: LabData, **hashes: str) -> LabData:
 
 
 def _with_lengths(lab: LabData, path: Path) -> LabData:
-    """Return lab data with the lengths of step 1 that a folder holds."""
+    """Return lab data with the lengths of step 1 from a folder."""
     lengths = read_lengths(path)
     lab = _with_hashes(replace(lab, lengths=lengths), lengths=lengths.sha256)
     return _with_origin(lab, 1, f"{GEOMETRY_FILE.as_posix()} read", read=True)
 
 
 def _with_load_test(lab: LabData, path: Path) -> LabData:
-    """Return lab data with the load test of step 2 that a folder holds."""
+    """Return lab data with the load test of step 2 from a folder."""
     pairs = read_measurements(path)
     lab = _with_hashes(replace(lab, pairs=pairs), load_test=pairs.sha256)
     text = f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs"
@@ -308,16 +308,9 @@ def _with_load_test(lab: LabData, path: Path) -> LabData:
 def _with_ring_downs(
     lab: LabData, path: Path, record_files: Sequence[Path], *, frequencies_fitted: bool
 ) -> LabData:
-    """Return lab data with the ring-downs of step 3, and the frequencies and damping from them.
+    """Return lab data with the ring-downs of step 3, and frequencies and damping from them.
 
-    Parameters
-    ----------
-    lab : LabData
-        The lab data so far. Its first reading is the mass, which is kept; the others are replaced.
-    record_files : sequence of Path
-        The files of the ring-downs.
-    frequencies_fitted : bool
-        Whether the frequencies of each record are fitted, too.
+    The first reading, the mass, is kept; the others are replaced.
     """
     trials = fit_trials(read_records(path), frequencies_fitted=frequencies_fitted)
     if all(fit.record.lowest is not None for fit in trials):
@@ -338,7 +331,7 @@ def _with_ring_downs(
 
 
 def _with_weighed_mass(lab: LabData, file: Path) -> LabData:
-    """Return lab data with the weighed mass that a file holds as its first reading."""
+    """Return lab data with the weighed mass in a file as the first reading."""
     mass = read_weighed_mass(file)
     _, *modes = lab.readings
     lab = replace(lab, readings=(mass, *modes))

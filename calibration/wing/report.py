@@ -1,4 +1,4 @@
-"""The folder of a calibrated wing: page, figures, table, and the wing for ParaView."""
+"""The folder of a calibrated wing: page, figures, Table 1, and the wing for ParaView."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from calibration.dynamics.figures import ring_down_figure
 from calibration.paper.figures import calibration_figure, printed_table_1, write_table_1
 from calibration.paper.load_test import StaticCalibration, push_forward
-from calibration.result.figures import corner_figure, drawn_parameters
+from calibration.result.figures import corner_figure, unmeasured_parameters
 from calibration.result.file import FILE_NAME
 from calibration.result.folder import (
     MODE_FIELDS,
     WING_FIELDS,
     add_figure,
-    begun_page,
     calibration_folder,
-    end_page,
+    finish_page,
+    start_page,
 )
 from calibration.wing.calibrate import WingCalibration
 from calibration.wing.lab_data import StepOrigin
@@ -46,19 +46,10 @@ TABLE_NAME = "table_1.csv"
 
 
 def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
-    """Write a calibrated wing to a folder: `calibration.nc`, Table 1, and perhaps a report.
+    """Write a calibrated wing to a folder: `calibration.nc`, Table 1, and a report if wanted.
 
-    The report is a page with figures, and the wing and its modes as files for ParaView.
-
-    Parameters
-    ----------
-    report : bool
-        Whether to write the report.
-
-    Returns
-    -------
-    Path
-        The path of `calibration.nc`, which `calibration_folder` writes.
+    The report is a page with figures, and the wing and its modes as files for ParaView. The path of
+    `calibration.nc` is returned.
 
     Raises
     ------
@@ -77,22 +68,16 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
             write_wing_vtu(new_folder / WING_FIELDS, fields, model_vector)
             write_modes_vtu(new_folder / MODE_FIELDS, fields, model_vector)
             with stage("Drawing the report"):
-                page = begun_page(result, new_folder)
+                page = start_page(result, new_folder)
                 _add_sections(page, calibration, fields, new_folder)
-                end_page(page, result, new_folder)
+                finish_page(page, result, new_folder)
     return folder / FILE_NAME
 
 
 def _add_sections(
     page: Page, calibration: WingCalibration, fields: WingFields, folder: Path
 ) -> None:
-    """Add the sections about a wing to the page of its calibration; write their figures.
-
-    Parameters
-    ----------
-    page : Page
-        The page, with the sections that every calibration has.
-    """
+    """Add the sections about a wing to the page of its calibration; write their figures."""
     _add_origins(page, calibration.lab.origins)
     page.add_section("Beside the paper")
     _add_comparison_with_paper(page, calibration, folder)
@@ -133,7 +118,7 @@ def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder:
         *_posterior_rows("line of the paper, eq. (14)", calibration.static_published),
     ]
     WORDS.add_table(page, "two_models", rows)
-    columns, names = drawn_parameters(calibration.joint)
+    columns, names = unmeasured_parameters(calibration.joint)
     sets = [
         ("joint posterior", calibration.joint.samples[:, columns]),
         ("the paper's procedure", calibration.paper.samples[:, columns]),
@@ -171,7 +156,7 @@ class _HasMoments(Protocol):
 
 
 def _moments(density: _HasMoments) -> str:
-    """Return the mean and the standard deviation of a density as a text."""
+    """Format the mean and the standard deviation of a density."""
     return plus_minus(density.mean, density.standard_deviation)
 
 
@@ -189,13 +174,7 @@ def _mode_titles(modes: ReducedModes) -> list[str]:
 
 @style.publication_style()
 def modes_figure(fields: WingFields, modes: ReducedModes, titles: Sequence[str]) -> Figure:
-    """Return the figure of the mode shapes of the upper skin, coloured by their displacement.
-
-    Parameters
-    ----------
-    titles : sequence of str
-        The title of each mode.
-    """
+    """Draw the mode shapes of the upper skin, coloured by their displacement."""
     # The skin with its damage regions, see `fe.reduction.model_cache.WingFields`
     is_skin = fields.region <= len(fields.regions)
     corners_of_skin = fields.cells[is_skin][:, :8]
@@ -255,8 +234,6 @@ def _draw_surface(
         The nodes of each triangle.
     shade : (N,) array
         The value at each node that its colour shows, from 0 to `largest`.
-    largest : float
-        The value that the last colour of the map stands for.
     """
     x, y, z = points.T
     # Oblique projection: the chord goes to the lower left of the panel.

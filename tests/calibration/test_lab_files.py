@@ -16,7 +16,7 @@ from calibration.geometry import (
     tailored_design,
     tailored_geometry,
 )
-from calibration.joint.wing_table import weighed
+from calibration.joint.wing_table import weighed_mass
 from calibration.paper.procedure import read_published_results
 from calibration.static.experiments import published_measurements, read_measurements
 from calibration.virtual_wing import measure_lengths, measure_load_test, measure_ring_down
@@ -293,7 +293,7 @@ def written_lab(request, tmp_path_factory):
         lengths=lengths,
         load_test=load_test,
         records=records,
-        total_mass=weighed(0.4711, 2e-3),
+        total_mass=weighed_mass(0.4711, 2e-3),
     )
     return WrittenLab(
         root=root,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from calibration.errors import ExperimentDataError, PosteriorError
 from calibration.joint.measured_modes import PUBLISHED_MODES
-from calibration.joint.wing_table import TOTAL_MASS, weighed
+from calibration.joint.wing_table import TOTAL_MASS, weighed_mass
 from calibration.paper.load_test import calibrate_static, particle_filter
 from calibration.paper.procedure import fit_masses
 from calibration.static.errors_in_variables import assess_fit, exact_posterior
@@ -169,7 +169,7 @@ def test_an_assumption_that_reaches_the_end_of_a_short_curve_is_left_out():
 # ---------------------------------------------------------------- masses
 
 MASS_LIMITS = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
-READINGS = (weighed(), *PUBLISHED_MODES)
+READINGS = (weighed_mass(), *PUBLISHED_MODES)
 
 
 def line_model(states):

@@ -90,7 +90,7 @@ def test_a_calibration_shows_prior_and_posterior_of_each_parameter():
     assert "<th>posterior</th>" in text
     panels = calibration.plot()
     assert len(panels) == len(calibration.priors)
-    assert panels[0].get_xlabel() == calibration.priors[0].figure.axis_title
+    assert panels[0].get_xlabel() == calibration.priors[0].quantity.axis_title
 
 
 def test_panels_are_below_one_another():

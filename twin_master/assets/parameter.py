@@ -123,7 +123,7 @@ def _draws_of_record(
         standard_deviation=record.standard_deviation(name),
         source=f"calibration of {record.asset}, {record.procedure}, {len(record.samples)} samples",
         record=run_record(record, name),
-        others=record.given(name, values),
+        others=record.conditional_means(name, values),
     )
 
 
@@ -147,7 +147,7 @@ def _draws_of_normal(
         mean=calibration.mean,
         standard_deviation=deviation,
         source="normal distribution of the scenario",
-        others={} if record is None else record.given(calibration.parameter, values),
+        others={} if record is None else record.conditional_means(calibration.parameter, values),
     )
 
 

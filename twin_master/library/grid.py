@@ -339,7 +339,7 @@ def grid_of_scenario(
     calibration = read_calibration(scenario.calibration)
     dependent_parameters = {}
     if calibration is not None:
-        expectations = calibration.given(draws.name, np.array(values))
+        expectations = calibration.conditional_means(draws.name, np.array(values))
         dependent_parameters = {
             name: tuple(expectations[name].tolist())
             for name in expectations

@@ -13,7 +13,7 @@ from calibration.dynamics.trials import amplitude_dependence, fit_trials
 from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes, modal_readings
 from calibration.joint.posterior import joint_posterior
-from calibration.joint.wing_table import MODEL_ERROR, WingTable, weighed, wing_priors
+from calibration.joint.wing_table import MODEL_ERROR, WingTable, weighed_mass, wing_priors
 from calibration.result.record import STATE
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import PUBLISHED_LINE, stiffness_line
@@ -63,7 +63,7 @@ def published_modes(**deviations):
 
 def draw_posterior(modes=PUBLISHED_MODES, load_test=LOAD_TEST, total_mass=None, **options):
     """Return samples of the posterior of the wing in closed form, with published readings."""
-    weight = weighed() if total_mass is None else total_mass
+    weight = weighed_mass() if total_mass is None else total_mass
     return joint_posterior(LINE_TABLE, load_test, (weight, *modes), **options)
 
 
@@ -229,7 +229,7 @@ def test_the_same_seed_draws_the_same_bytes():
 
 def test_a_total_mass_that_the_wing_cannot_have_is_refused():
     with pytest.raises(ExperimentDataError, match="cannot weigh 2 kg"):
-        draw_posterior(total_mass=weighed(2.0))
+        draw_posterior(total_mass=weighed_mass(2.0))
 
 
 def test_a_wing_far_stiffer_than_the_model_is_refused():

@@ -21,7 +21,7 @@ def calibration(make_calibration):
 @pytest.fixture(scope="module")
 def samples(calibration):
     """The samples of the calibration, by the name of their figure."""
-    names = [figure.name for figure in calibration.figures]
+    names = [figure.name for figure in calibration.all_quantities]
     return dict(zip(names, calibration.samples.T, strict=True))
 
 
@@ -205,13 +205,13 @@ def test_the_file_has_the_groups_of_arviz(file_content):
 
 
 def test_figures_of_the_file_have_chains_and_draws(calibration, file_content):
-    for figure in calibration.figures:
+    for figure in calibration.all_quantities:
         assert file_content["posterior"][figure.name].dims == ("chain", "draw")
         assert file_content["prior"][figure.name].shape == (1, 43)
 
 
 def test_figures_of_the_file_have_their_unit_and_title(calibration, file_content):
-    for figure in calibration.figures:
+    for figure in calibration.all_quantities:
         attributes = file_content["posterior"][figure.name].attrs
         assert attributes["units"] == figure.unit
         assert figure.title in attributes["long_name"]

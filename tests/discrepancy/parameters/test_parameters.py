@@ -132,7 +132,9 @@ def test_parameters_that_are_drawn_together_stay_together(linear_posterior):
     calibration = linear_posterior.calibration
     values = calibration.mean("p1") + np.array([-0.01, 0.0, 0.01])
     slope = np.cov(calibration.samples, rowvar=False)[0, 1] / calibration.samples[:, 0].var()
-    np.testing.assert_allclose(np.diff(calibration.given("p1", values)["p2"]), 0.01 * slope, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.diff(calibration.conditional_means("p1", values)["p2"]), 0.01 * slope, rtol=1e-3
+    )
 
 
 def test_the_file_of_a_calibration_holds_all_of_it(linear_posterior, tmp_path):
@@ -351,7 +353,7 @@ def tied():
 def test_a_parameter_that_is_not_told_is_said(tied):
     """Of the first one half of the variance is gone."""
     findings = " ".join(tied.findings)
-    assert tied.kept_share("p3") == pytest.approx(1.0, abs=0.05)
+    assert tied.posterior_over_prior("p3") == pytest.approx(1.0, abs=0.05)
     assert "does not determine p3: " in findings
     assert "does not determine p1" not in findings
 
@@ -369,7 +371,7 @@ def weakly_told():
 def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(weakly_told):
     samples = weakly_told.samples[:, 1]
     assert np.sum((samples == 1.25) | (samples == 3.75)) == 0
-    assert weakly_told.kept_share("p2") == pytest.approx(1.0, abs=0.05)
+    assert weakly_told.posterior_over_prior("p2") == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_parameter_that_is_not_told_does_not_reach_the_end_of_its_range(weakly_told):
