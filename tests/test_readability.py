@@ -55,7 +55,7 @@ CEILINGS = {
     "reporting": Counts(packed=0, bundles=1.1, walrus=0, columns=0.5, untyped=3.4, vague=0.2),
     "fe": Counts(packed=0.1, bundles=1.3, walrus=0, columns=1.2, untyped=1.8, vague=0.4),
     "fmu_asset": Counts(packed=0.2, bundles=1.2, walrus=0, columns=0.2, untyped=1.2, vague=0.4),
-    "calibration": Counts(packed=0, bundles=2.2, walrus=0, columns=3.3, untyped=0.3, vague=0.2),
+    "calibration": Counts(packed=0, bundles=2.2, walrus=0, columns=3.3, untyped=0.4, vague=0.2),
     "discrepancy": Counts(packed=0.3, bundles=1.3, walrus=0, columns=0.8, untyped=0.9, vague=0.3),
     "scenarios": Counts(packed=0, bundles=0, walrus=0, columns=0, untyped=0, vague=0),
     "twin_master": Counts(packed=0.1, bundles=1.2, walrus=0, columns=0.8, untyped=2.4, vague=0.3),

@@ -65,7 +65,7 @@ class MeasuredWing:
         True values of `STATE`.
     static : LoadDisplacementData
         Its load test.
-    readings : tuple of FigureReading
+    readings : tuple of QuantityReading
         Its weight, frequencies and damping.
     """
 

@@ -210,8 +210,8 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
         )
     if not changes:
         return _SystematicTerms(0.0, 0.0)
-    mean_square = np.mean(np.square(changes), axis=0)
-    return _SystematicTerms(*np.sqrt(mean_square).tolist())
+    frequency_rms, ratio_rms = np.sqrt(np.mean(np.square(changes), axis=0)).tolist()
+    return _SystematicTerms(frequency=frequency_rms, damping_ratio=ratio_rms)
 
 
 def _beyond_chance(difference: float, error: float) -> float:

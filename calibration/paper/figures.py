@@ -161,7 +161,8 @@ def table_1(
             paper_procedure = Moments(procedure.mean(name), procedure.standard_deviation(name))
         if name.startswith("damping"):
             # The prior is a Gaussian that is cut off at its mean, so its moments are others.
-            prior = Moments(*result.prior_moments(name))
+            prior_mean, prior_deviation = result.prior_moments(name)
+            prior = Moments(prior_mean, prior_deviation)
         else:
             prior = Moments(priors[name].mean, priors[name].deviation)
         posterior = Moments(result.mean(name), result.standard_deviation(name))

@@ -14,7 +14,7 @@ import pytest
 from fmpy import read_model_description
 
 from calibration.geometry import published_lengths, read_lengths
-from calibration.joint.wing_table import weighed
+from calibration.joint.wing_table import weighed_mass
 from calibration.result.record import STATE
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import read_measurements
@@ -203,7 +203,7 @@ def soft(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         lengths=published_lengths(),
         load_test=measure_load_test(bench, 0),
         records=measure_ring_down(bench, 0, trials=3, noise=2e-5),
-        total_mass=weighed(2.0 * SOFT.servo_mass + SOFT.pitot_mass, 1e-3),
+        total_mass=weighed_mass(2.0 * SOFT.servo_mass + SOFT.pitot_mass, 1e-3),
     )
     words, out = ("calibrate", "--data", lab, "--asset", "soft", "--fitted"), lab.with_name("calibrated")
     told = said(*words, "--out", out)
