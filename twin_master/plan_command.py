@@ -66,7 +66,11 @@ def plan(
     Example: `uav-twin plan inspected_wing --out policy.npz`
     """
     from reporting.figures import write_picture
-    from twin_master.mission.planning import compare_simple_rules, encode_policy, share_beyond_limit
+    from twin_master.mission.planning import (
+        compare_simple_rules,
+        encode_policy,
+        fraction_beyond_limit,
+    )
     from twin_master.report.planning import plan_figure
 
     knowledge, _ = _prepare(scenario, seed, calibration)
@@ -83,7 +87,7 @@ def plan(
         "upper": belief_plan.upper,
         "simulated": simulated.mean,
         "half_width": simulated.half_width,
-        "beyond_limit": share_beyond_limit(
+        "beyond_limit": fraction_beyond_limit(
             knowledge.scenario, knowledge.problem, knowledge.rewards, belief_plan.policy
         ),
     }

@@ -27,8 +27,8 @@ from twin_master.assets.resolution import (
     OverridesOrMapping,
     asset_source,
     believed_source,
+    memory_of_scenario,
     resolve_scenario,
-    scenario_bytes,
 )
 from twin_master.errors import NotResumableError
 from twin_master.mission import flights
@@ -434,5 +434,5 @@ def check_scenario(
         "steps": mission.steps,
         "prediction_steps": mission.prediction_steps,
         "step_name": mission.step_name,
-        "memory": sum(scenario_bytes(scenario).values()),
+        "memory": sum(memory_of_scenario(scenario).values()),
     }

@@ -234,7 +234,7 @@ _HISTORY_COPIES = 4
 """Copies of the beliefs: before and after the observation, its logarithm, and the smoothed one."""
 
 
-def scenario_bytes(scenario: Scenario) -> dict[str, float]:
+def memory_of_scenario(scenario: Scenario) -> dict[str, float]:
     """Return how much memory the arrays of a scenario's twin need, approximately.
 
     Returns
@@ -274,7 +274,7 @@ def check_scenario_fits(scenario: Scenario) -> None:
     InvalidModelError
         If it does not fit.
     """
-    check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
+    check_fits(memory_of_scenario(scenario), "take fewer levels, state factors, draws or steps")
 
 
 def asset_source(scenario: Scenario) -> AssetSource:

@@ -125,7 +125,7 @@ def promised_return(knowledge: Knowledge) -> ComparedPolicy:
     return ComparedPolicy(knowledge.scenario.planner.policy_name, returns)
 
 
-def promise_of_return(knowledge: Knowledge) -> tuple[Reference, ...]:
+def return_reference(knowledge: Knowledge) -> tuple[Reference, ...]:
     """Return the expected return of a mission as a reference value for the summary.
 
     The result is empty unless the policy was planned on the belief, goes by risk or was given. The

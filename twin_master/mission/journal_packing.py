@@ -94,23 +94,27 @@ def _unpack_belief(packed: Mapping[str, float] | str) -> list[float | None]:
 
 def _pack_learnt(learnt: Mapping[str, Mapping[str, object]]) -> JsonObject:
     """Return names, units and all numbers of the learnt quantities."""
-    figures = []
+    numbers = []
     for quantity in learnt.values():
         for name in ("mean", "standard_deviation", "lower", "upper"):
-            figures.append(quantity[name])
+            numbers.append(quantity[name])
     return {
         "names": list(learnt),
         "units": [quantity["unit"] for quantity in learnt.values()],
-        "figures": pack_numbers(figures),  # type: ignore[arg-type]
+        "figures": pack_numbers(numbers),  # type: ignore[arg-type]
     }
 
 
 def _unpack_learnt(packed: JsonObject) -> JsonObject:
     """Return the learnt quantities by name from what `_pack_learnt` returned."""
-    figures = np.array(unpack_numbers(packed["figures"]), dtype=object).reshape(-1, 4).tolist()
+    moments_of_quantities = (
+        np.array(unpack_numbers(packed["figures"]), dtype=object).reshape(-1, 4).tolist()
+    )
     learnt = {}
-    for name, unit, numbers in zip(packed["names"], packed["units"], figures, strict=True):
-        mean, standard_deviation, lower, upper = numbers
+    for name, unit, moments in zip(
+        packed["names"], packed["units"], moments_of_quantities, strict=True
+    ):
+        mean, standard_deviation, lower, upper = moments
         learnt[name] = {
             "mean": mean,
             "standard_deviation": standard_deviation,

@@ -88,7 +88,7 @@ def plan_within_limit(
     def keeps_limit(candidate: PricedPlan) -> bool:
         if allowed_probability is None:
             return True
-        fraction = share_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
+        fraction = fraction_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
         return fraction <= allowed_probability
 
     without_price = plan_with_price(0.0)
@@ -124,7 +124,7 @@ def _probability_beyond_limit(rewards: RewardModel) -> Float:
     return np.asarray(np.tensordot(rewards.quantity.draw_weight, is_beyond, axes=1))
 
 
-def share_beyond_limit(
+def fraction_beyond_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
 ) -> float:
     """Return the discounted fraction of steps beyond the health limit under a policy.

@@ -369,7 +369,7 @@ class Knowledge:
         health_reward = self.rewards.planning_reward(1.0, 0.0)
         return int(np.argmax(health_reward.mean(axis=0)))
 
-    def policy_with_doubt(self, unexplained: ArrayLike) -> Float:
+    def policy_with_safest_control(self, unexplained: ArrayLike) -> Float:
         """Return the policy p(control | state) of future steps, mixed with the safest control.
 
         The safest control is flown with the probability that no state explains the sensors.

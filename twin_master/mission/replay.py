@@ -116,7 +116,7 @@ def replay(
     scan = _BackwardScan(path, required_steps, noise_free)
     for line in records_backwards(path, end, RecentParts(path.parent)):
         try:
-            needs_earlier_lines = scan.take_in(line)
+            needs_earlier_lines = scan.read_line(line)
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             reason = f"it has another layout, {error}"
             raise damaged_line_error(path, line.begin, reason) from error
@@ -155,7 +155,7 @@ class _BackwardScan:
         self._later_step: int | None = None
         self._later_begin = 0
 
-    def take_in(self, line: JournalLine) -> bool:
+    def read_line(self, line: JournalLine) -> bool:
         """Evaluate the next line backwards, and return whether earlier lines are needed."""
         is_header = line.begin == 0
         step = -1 if is_header else int(line.record["step"])
@@ -167,10 +167,10 @@ class _BackwardScan:
             self.last_record = line.record
         self._later_step = step
         self._later_begin = line.begin
-        self._take_in_settled_state(line.record)
+        self._keep_settled_state(line.record)
         if step < self._first_revised_step:
             self._next_controls.setdefault(step, line.record["next_control"])
-        self._take_in_change(line.record, step)
+        self._keep_reading(line.record, step)
         return True
 
     def _check_order(self, line: JournalLine, step: int) -> None:
@@ -181,7 +181,7 @@ class _BackwardScan:
         begin = self._later_begin if step < later_step else line.begin
         raise damaged_line_error(self._path, begin, f"step {later_step} is out of place")
 
-    def _take_in_settled_state(self, record: JsonObject) -> None:
+    def _keep_settled_state(self, record: JsonObject) -> None:
         """Keep the settled state of a record if it is early enough and none is kept yet."""
         if self.settled is not None or "settled" not in record:
             return
@@ -191,7 +191,7 @@ class _BackwardScan:
         if all(step < required_step for required_step in self._required_steps):
             self.settled = SettledState(step, decode_state(state))
 
-    def _take_in_change(self, record: JsonObject, step: int) -> None:
+    def _keep_reading(self, record: JsonObject, step: int) -> None:
         """Keep the reading of a record, and the first step whose decisions the record revises.
 
         An adopted model and a late observation revise all decisions from their step on.
@@ -314,8 +314,8 @@ STATE_ALLOWANCE = 16_000_000
 This holds for the files of recent parts, to which the state of every step belongs, and for the
 journal, to which that of every `BLOCK_STEPS`-th step belongs.
 """
-STATE_SHARE = 4_000
-"""Largest size of a state beyond it, in bytes for each step since the last state that was kept.
+STATE_BYTES_PER_STEP = 4_000
+"""Beyond that size: largest size of a state for each step since the last kept state, in bytes.
 
 An asset that is replayed keeps the inputs of all its steps in its state. If every step kept it, the
 files would grow with the square of the number of steps. Steps after the last kept state are flown
@@ -378,4 +378,4 @@ def journal_sink(journal: JournalFile, plant: Plant) -> StepSink:
 def _may_keep(state: str, file_size: int, steps_since_state: int) -> bool:
     """Return whether a state is small enough for a file of this size, see `STATE_ALLOWANCE`."""
     is_within_allowance = file_size + len(state) <= STATE_ALLOWANCE
-    return is_within_allowance or len(state) <= STATE_SHARE * steps_since_state
+    return is_within_allowance or len(state) <= STATE_BYTES_PER_STEP * steps_since_state

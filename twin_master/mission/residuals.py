@@ -63,7 +63,7 @@ def expected_ahead(
         The probability of each control.
     """
     # (T, S, U), with the safest control by the probability that no state explains the sensors
-    policy = knowledge.policy_with_doubt(history.unexplained)
+    policy = knowledge.policy_with_safest_control(history.unexplained)
     state_and_control = predicted_beliefs[..., None] * policy[:, None]  # (T, H, S, U)
     control_probability = state_and_control.sum(axis=-2)
     learnt_expectation = knowledge.expectation

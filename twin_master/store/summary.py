@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index
 from reporting.json_file import JsonObject
 from reporting.words import counted, parameter_title
-from twin_master.mission.earnings import promise_of_return
+from twin_master.mission.earnings import return_reference
 from twin_master.network.estimator import is_state_believed
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import REWARD_NAMES, SUMMARY_TITLES, Scenario
@@ -264,7 +264,7 @@ def summarise(
     groups += _suspicion_groups(result)
     references = {reference.figure: reference for reference in result.scenario.reference}
     if result.flight.simulated:
-        promise = promise_of_return(result.knowledge)
+        promise = return_reference(result.knowledge)
         references = {entry.figure: entry for entry in promise} | references
     for group in groups:
         texts = SUMMARY_TITLES[group.name]

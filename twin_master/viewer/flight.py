@@ -248,11 +248,11 @@ class Flight:
                 self._start_with_file(status.st_ino)
             new_lines = islice(records_in_file(file, self._path, self._end), MOST_NEW_LINES)
             for record, begin, end in new_lines:
-                self._take_line(record, begin)
+                self._add_line(record, begin)
                 self._end = end
         return (self.number, self._end) != state_before
 
-    def _take_line(self, record: StepRecord, begin: int) -> None:
+    def _add_line(self, record: StepRecord, begin: int) -> None:
         """Add a new line of the journal: a new step, a late observation, or an event.
 
         An event is a line that belongs to no step, such as a verdict. `number` counts the revisions
@@ -272,12 +272,12 @@ class Flight:
             self._lines_of_steps.append(_StepLines(belief=begin, observation=begin))
             return
         if has_belief:
-            self._take_late_observation(record, begin)
+            self._add_late_observation(record, begin)
         else:
-            self._take_event(record, begin)
+            self._add_event(record, begin)
         self.number += 1
 
-    def _take_late_observation(self, record: StepRecord, begin: int) -> None:
+    def _add_late_observation(self, record: StepRecord, begin: int) -> None:
         """Add the line of an observation that came late.
 
         The line has the late observation of an earlier step, and the belief of the last step, which
@@ -300,7 +300,7 @@ class Flight:
         self._lines_of_steps[-1].belief = begin
         self._lines_of_steps[observed_step].observation = begin
 
-    def _take_event(self, record: StepRecord, begin: int) -> None:
+    def _add_event(self, record: StepRecord, begin: int) -> None:
         """Add a line that is not a step: notices, a verdict, or a changed model.
 
         Its notices are shown with the last step before it. If its verdict has a drawing of the
@@ -453,7 +453,9 @@ class Flight:
         ).predicted
         unexplained = _unexplained_probability(record)
         # p(state, control) = p(state) p(control | state), for n steps, S states, U controls
-        joint = predicted_beliefs[..., None] * knowledge.policy_with_doubt(unexplained)  # (n, S, U)
+        joint = predicted_beliefs[..., None] * knowledge.policy_with_safest_control(
+            unexplained
+        )  # (n, S, U)
         if knowledge.expectation is None:
             expectation = _expectation_without_learning(knowledge, joint, None)
         else:

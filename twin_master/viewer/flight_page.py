@@ -136,7 +136,7 @@ class FlightPage:
         readings = self._sensors.scale * self._flight.knowledge.sensor_model.mean
         return readings.min(), readings.max()
 
-    def ask(self, send: SendText, request: Request) -> None:
+    def add_request(self, send: SendText, request: Request) -> None:
         """Answer the request of a viewer now, or as soon as there is something new.
 
         A request replaces an earlier one of the same viewer that was not answered yet.
@@ -144,8 +144,8 @@ class FlightPage:
         self._open_requests[send] = request
         self._answer_viewer(send)
 
-    def forget(self, send: SendText) -> None:
-        """Forget a viewer."""
+    def remove_viewer(self, send: SendText) -> None:
+        """Drop the open request of a viewer that has gone."""
         self._open_requests.pop(send, None)
 
     def update(self) -> None:

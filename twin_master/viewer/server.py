@@ -72,20 +72,20 @@ class _StepsSocket(WebSocketHandler):
     def on_message(self, message: str | bytes) -> None:
         """Answer a request; close the connection if the message is not a request."""
         try:
-            self._page.ask(self.send, Request.model_validate_json(message))
+            self._page.add_request(self.send, Request.model_validate_json(message))
         except ValueError as error:
             self.close(_INVALID_MESSAGE, str(error)[:100])
 
     def on_close(self) -> None:
         """Forget the viewer, whose connection is closed."""
-        self._page.forget(self.send)
+        self._page.remove_viewer(self.send)
 
     def send(self, text: str) -> None:
         """Send an answer; forget the viewer if its connection is closed."""
         try:
             self.write_message(text)
         except WebSocketClosedError:
-            self._page.forget(self.send)
+            self._page.remove_viewer(self.send)
 
 
 class _TextHandler(RequestHandler):

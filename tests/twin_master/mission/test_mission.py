@@ -322,7 +322,7 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
 @pytest.mark.parametrize("known", [12], indirect=True)
 def test_large_states_are_kept_less_often_and_their_steps_flown_again(known, tmp_path, monkeypatch):
     monkeypatch.setattr(replay, "STATE_ALLOWANCE", 5000)
-    monkeypatch.setattr(replay, "STATE_SHARE", 50)
+    monkeypatch.setattr(replay, "STATE_BYTES_PER_STEP", 50)
     part(known, tmp_path, kind=Heavy)
     journal_before = (tmp_path / JOURNAL_NAME).read_bytes()
     has_state = ["asset_state" in record for record in journal(tmp_path)]

@@ -26,8 +26,8 @@ from twin_master.mission.knowledge_file import load_knowledge
 from twin_master.mission.planning import (
     compare_simple_rules,
     encode_policy,
+    fraction_beyond_limit,
     plan_within_limit,
-    share_beyond_limit,
     simulate_policy,
 )
 from twin_master.mission.preparation import Knowledge
@@ -297,11 +297,11 @@ def test_the_promise_of_a_plan_is_that_of_its_twin():
 
 def test_a_limit_is_kept_by_the_plan():
     known, (problem, plan) = knowledge(*FOUR_STATES), planned()
-    free = share_beyond_limit(known.scenario, problem, known.rewards, plan.policy)
+    free = fraction_beyond_limit(known.scenario, problem, known.rewards, plan.policy)
     limited = scenario(*FOUR_STATES, policy="belief", limit_probability=round(0.6 * free, 4))
     careful, price = plan_within_limit(limited, problem, known.rewards)
     assert price > 0.0
-    assert share_beyond_limit(limited, problem, known.rewards, careful.policy) <= 0.6 * free
+    assert fraction_beyond_limit(limited, problem, known.rewards, careful.policy) <= 0.6 * free
     assert (
         simulate_policy(limited, problem, careful.policy).mean
         < simulate_policy(limited, problem, plan.policy).mean

@@ -50,7 +50,7 @@ FURTHER_FILES = 60
 An asset itself keeps no file open: its journal is opened for each line, and the lock of the fleet's
 folder is that of all assets.
 """
-STATE_SHARE = 0.1
+STATE_BYTES_PER_STEP = 0.1
 """Fraction of the time that the writing of the state may take."""
 _ASSET_NAME = re.compile(r"\w[\w.-]{0,63}")
 
@@ -198,7 +198,7 @@ class FleetWatch:
                     if begin >= next_state:
                         self._write_state()
                         seconds = time.monotonic() - begin
-                        next_state = begin + max(STATE_SECONDS, seconds / STATE_SHARE)
+                        next_state = begin + max(STATE_SECONDS, seconds / STATE_BYTES_PER_STEP)
                     after_look()
                     if steps == 0:
                         if all(source.has_ended for source in self._sources):
