@@ -437,7 +437,7 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
 
 
 def _system_error_sentence(error: OSError) -> str:
-    """Return the sentence for an error of the operating system; those of streams name no file."""
+    """Return the sentence for an error of the operating system, which may name no file."""
     reason = error.strerror or error
     if error.filename is not None:
         return f"{error.filename}: {reason}."

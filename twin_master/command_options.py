@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def complete_scenario(incomplete: str) -> list[str]:
-    """Return the shipped scenarios whose names begin with what was typed, for the shell."""
+    """Return the shipped scenarios that begin with the typed text, for completion in the shell."""
     return [name for name in scenario_files() if name.startswith(incomplete)]
 
 

@@ -20,7 +20,7 @@ LARGEST_SHOWN = 4.0
 
 
 class HasTree(Protocol):
-    """A result with the arrays of a run, such as what `fly` returns."""
+    """A result with the stored arrays of a run, such as `fly` returns."""
 
     @property
     def tree(self) -> "xr.DataTree":

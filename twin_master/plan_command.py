@@ -365,7 +365,7 @@ def _compare_returns(
 
 
 def _print_design(record: Record, candidates: int) -> None:
-    """Print the chosen sensors with their information, and what no candidate separates."""
+    """Print the chosen sensors with their information, and the levels that none separates."""
     for sensor, information in zip(record["sensors"], record["information"], strict=True):
         terminal.say(f"{sensor}: {information:.3f} bit together with the sensors above.")
     terminal.say(f"All {candidates} candidates: {record['of_all']:.3f} bit.")

@@ -182,7 +182,7 @@ def lock_run_folder(folder: Path, *, fleet_is_locked: bool = False) -> int:
 
 
 def _is_watched_fleet(folder: Path) -> bool:
-    """Return whether a folder is that of a fleet which another process is watching."""
+    """Return whether another process is watching a fleet in this folder."""
     if find_config(folder, WATCHED_FLEET_KIND) is None:
         return False
     lock = lock_folder(folder, shared=True)

@@ -285,7 +285,7 @@ class AssetSource:
 
     @property
     def origin(self) -> FlownAndBelieved:
-        """What flies and what the twin believes, in words; here they are the same."""
+        """The asset and the believed model in words; here they are the same."""
         return FlownAndBelieved(self.description, self.description, self.differ)
 
     def draw_summary(self) -> tuple[str, int]:
@@ -398,12 +398,12 @@ class AssetSource:
 
 
 class AssetBelief(BeliefSection):
-    """The twin predicts with what flies itself; this is for assets without a memory."""
+    """The twin predicts with the asset itself, which must have no memory."""
 
     kind: Literal["asset"] = "asset"
 
     def source(self, scenario: Scenario, flown_source: AssetSource) -> AssetSource:
-        """Return the source of what flies."""
+        """Return the source of the asset."""
         return flown_source
 
 

@@ -374,7 +374,7 @@ class FmuSource(AssetSource):
             _logger.warning("%s", warning)
 
     def _check_state_units(self, binding: Binding) -> None:
-        """Refuse a state factor whose unit differs from that of its monitor or health input."""
+        """Refuse a state factor whose monitor or health input has another unit."""
         state_monitors = self._scenario.truth.state
         for factor in self._scenario.state:
             if state_monitors:

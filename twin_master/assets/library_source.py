@@ -201,7 +201,7 @@ class ObservationLibrary:
             raise self._other_parameter_error(name)
 
     def _other_parameter_error(self, name: str) -> MissionInputError:
-        """Return the error for a library whose parameter is not that of the scenario."""
+        """Return the error for a library that was sampled over another parameter."""
         return MissionInputError(
             f"the observation library was sampled over the parameter {self.parameter or 'none'}, "
             f"and the scenario calibrates {name}: {_ADVICE}"
@@ -389,7 +389,7 @@ class LibrarySource(AssetSource):
         return library
 
     def _check_labels(self, library: ObservationLibrary) -> None:
-        """Refuse a library whose role, sensors, units or load are not those of the scenario."""
+        """Refuse a library whose role, sensors, units or load differ from the scenario's."""
         scenario = self._scenario
         observation = scenario.observation
         self._check_same_texts("observes", [library.role], [observation.role])
@@ -409,7 +409,7 @@ class LibrarySource(AssetSource):
     def _check_same_texts(
         self, verb: str, library_labels: Sequence[str], scenario_labels: Sequence[str]
     ) -> None:
-        """Refuse a library whose labels differ from those of the scenario, in number or order."""
+        """Refuse a library whose labels differ from the scenario's in number or order."""
         if list(library_labels) != list(scenario_labels):
             raise MissionInputError(
                 f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "
@@ -418,7 +418,7 @@ class LibrarySource(AssetSource):
             )
 
     def check(self) -> None:
-        """Check that the library contains what the scenario needs."""
+        """Check that the library has everything that the scenario needs."""
         _ = self.library  # reading the library checks it
 
     def _build(self, progress: Progress) -> dict[str, str]:

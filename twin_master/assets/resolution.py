@@ -29,7 +29,7 @@ from twin_master.scenario.section import Section, Table
 
 @dataclass(frozen=True)
 class Overrides:
-    """The settings of the command line that replace those of the scenario file.
+    """Settings of the command line that override the scenario file.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ def resolve_scenario(
 
 
 def _override_asset(table: Table, overrides: Overrides) -> None:
-    """Replace the asset in the table of a scenario, in place, by that of the command line.
+    """Replace the asset of a scenario's table, in place, if the command line names another.
 
     The keys of the scenario's asset are kept if the kind of the new asset has them.
     """
@@ -206,7 +206,7 @@ def _design_tables(table: Table) -> list[Table]:
 
 
 def _use_calibrated_design(table: Table) -> None:
-    """Replace designs in the table of a scenario by that of the calibration file, in place.
+    """Replace designs in a scenario's table, in place, by the design of the calibration file.
 
     These are the design of the asset, the believed design, and the designs of components that equal
     it.
@@ -341,7 +341,7 @@ class LearntFile(Section):
     """The tables of each group of assets, by its name."""
 
     def tables_of_group(self, group: str | None) -> dict[str, Table]:
-        """Return the tables of a group; those of a new asset if the file does not have it."""
+        """Return the tables of a group; if the file lacks the group, those of a new asset."""
         if group in self.group:
             return self.group[group]
         tables = {
@@ -353,7 +353,7 @@ class LearntFile(Section):
 
 
 def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
-    """Replace assumptions in the table of a scenario by what a fleet has learnt.
+    """Replace assumptions in a scenario's table by the results of a fleet.
 
     These are the transitions, the sensor noise and the distribution of the parameter. The truth of
     the scenario stays the same.

@@ -28,7 +28,7 @@ MODEL_COPY = "asset/model/structure.toml"
 
 
 class StructureFiles(FileSection):
-    """A table that names a structure file, which names a mesh or matrices beside it."""
+    """A table that names a structure file, and through it a mesh or matrices."""
 
     def all_files(self) -> dict[str, Path]:
         """Return the structure file and the mesh or matrices that it names, by paths of copies.

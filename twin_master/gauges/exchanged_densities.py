@@ -26,7 +26,7 @@ where it sees that the arrays were made one by one."""
 
 
 class GaugeDensities(NamedTuple):
-    """L densities of gauges that may take the place of those of the model.
+    """L densities of gauges, each of which may replace a density of the model.
 
     Each is Student's, and the gauge shows (1 + gain) times the prediction.
 
@@ -47,7 +47,7 @@ class GaugeDensities(NamedTuple):
 
 
 class ExchangeFactors(NamedTuple):
-    """Numbers, the same at all pairs, for the ratios of L densities to those of the model.
+    """Factors of the ratios between L densities and those of the model, the same at all pairs.
 
     A density of Student is k^(-n / 2), where n is the number of degrees of freedom plus one. Its
     kernel is k = 1 + (innovation)^2 / (variance times scale squares), and that of the model is k_0
@@ -107,7 +107,7 @@ def reference_ratio(
     densities: GaugeDensities,
     number: int,
 ) -> float:
-    """Return the kernel of the model over that of another density at the reference pair."""
+    """Return the model's kernel over the kernel of another density, at the reference pair."""
     g = densities.gauge[number]
     residual = observation.residual[model.reference, g]
     prediction = observation.prediction[model.reference, g]
@@ -141,7 +141,7 @@ def log_exchanged_density(
     number: int,
     pair: int,
 ) -> float:
-    """Return the log of the ratio of density `number` to that of the model at a pair.
+    """Return the log ratio between density `number` and the model's at a pair.
 
     Logarithms are taken from the start, so that nothing overflows.
     """
@@ -179,7 +179,7 @@ def binary_digits(exponents: Float) -> Single:
 def exchange_factors(
     observation: StandardizedObservation, model: ModelLikelihood, densities: GaugeDensities
 ) -> ExchangeFactors:
-    """Return the numbers for the ratios of densities to those of the model at all pairs."""
+    """Return the factors of the density ratios that do not depend on the pair."""
     count = len(densities.gauge)
     inverse_model_squares = np.empty(count, np.float32)
     factor = np.empty(count, np.float32)
@@ -256,7 +256,7 @@ def exchange_densities(
     ratio: Single,
     work: ExchangeWork,
 ) -> None:
-    """Fill `ratio` with the ratios of L densities to those of the model at one pair.
+    """Fill `ratio` with L densities at one pair, each divided by the model's.
 
     Each is relative to the density whose logarithm `log_reference_density` returns. A ratio below
     exp(-41) is cut to this; one above exp(44) may be infinite or NaN.

@@ -105,7 +105,7 @@ class FaultFilter:
         )
 
     def _predictions_of_pairs(self, values: Float) -> Predictions:
-        """Return the predictions of all pairs, given those of the chosen draws (E', S, U, G)."""
+        """Return the predictions at all pairs from the chosen draws' values (E', S, U, G)."""
         draws, states, controls, sensors = values.shape
         shape = (controls, states, draws, sensors)
         shape_of_pairs = (controls, states * draws, sensors)
@@ -352,7 +352,7 @@ class FaultFilter:
         )
 
     def _mix_squares(self, state: WatchState, recoveries: Recoveries) -> None:
-        """Mix the sums of squares of ended and hidden faults into those of "recovered".
+        """Mix the sums of squares of ended and hidden faults into "recovered".
 
         Under a fault its own gauge has the sum of the fault, and each other gauge that of the
         model. These sums are averaged over the faults by their weights, and the average enters

@@ -116,7 +116,7 @@ class FreeGainStatistics(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """Beliefs and sums of squares of all hypotheses of B twins, with R = G K faults of gauges.
+    """The beliefs and sums of squares of B twins under all hypotheses; R = G K gauge faults.
 
     Attributes
     ----------
@@ -426,7 +426,7 @@ def _density_by_products(
     scale_squares: Float,
     density: Float,
 ) -> float:
-    """Fill `density` (n,) with that of the observation for sound gauges; return its log factor.
+    """Fill `density` (n,) for sound gauges, and return the log of a factor left out of it.
 
     Parameters
     ----------

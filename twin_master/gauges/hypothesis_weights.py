@@ -149,7 +149,7 @@ class HypothesisWeights:
         return newly_hidden
 
     def change_control(self, previous_control: int, control: int) -> Float:
-        """Divide the probability of each fault anew into a part that shows and one that is hidden.
+        """Divide each fault's probability anew into a showing and a hidden part.
 
         Their sum stays the same. The weights are changed in place.
 

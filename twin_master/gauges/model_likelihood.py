@@ -22,7 +22,7 @@ _NEGLIGIBLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
 
 
 class ModelLikelihood(NamedTuple):
-    """The density of an observation under the model, with which densities of faults are compared.
+    """The density of an observation under the model, to compare faults with.
 
     Attributes
     ----------

@@ -270,7 +270,7 @@ class NoticeWriter:
     def _free_gains_alarm(
         self, state: WatchState, twin: int, log_evidence: float, step: int
     ) -> Notice:
-        """Return the alarm that no state explains all gauges; it names those of largest gain."""
+        """Return the alarm that no state explains all gauges, naming those of largest gain."""
         statistics = state.free_gain_statistics
         gain_deviations = np.abs(statistics.sum_cx[twin]) / np.sqrt(1.0 + statistics.sum_cc[twin])
         named_gauges = _largest(gain_deviations, _LEAST_NAMED_DEVIATIONS)

@@ -275,7 +275,10 @@ def _by_draw(belief: NDArray[_Number], states: int) -> NDArray[_Number]:
 
 
 def _by_state(belief: NDArray[_Number]) -> NDArray[_Number]:
-    """Return a belief by draw and state (E, S, ...) as that of one twin: (1, S E, ...)."""
+    """Return one twin's belief by draw and state (E, S, ...) in the order of states.
+
+    The result has the shape (1, S E, ...).
+    """
     draws, states, *faults = belief.shape
     by_state = np.ascontiguousarray(belief.swapaxes(0, 1))
     return by_state.reshape(1, states * draws, *faults)

@@ -34,7 +34,7 @@ By Cantelli's inequality a quantile of probability p lies within sqrt((1 - p) / 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected values of G sensors and of the rewards; the leading axes are those of the beliefs.
+    """Expected values of G sensors and of the rewards, under beliefs along the leading axes.
 
     Attributes
     ----------
@@ -442,7 +442,7 @@ def stack_expectations(expectations: Iterable[Expectation]) -> Expectation:
 def _join_expectations(
     expectations: Iterable[Expectation], join: Callable[[list[Float]], Float]
 ) -> Expectation:
-    """Return one expectation whose arrays are joined from those of all parts."""
+    """Return one expectation by joining each array of several."""
     expectations = list(expectations)
     arrays = {
         field.name: join([getattr(expectation, field.name) for expectation in expectations])

@@ -264,7 +264,7 @@ class LearningFilter:
         return (Notice("hypothesis", f"{self._words.step.capitalize()} {step}: {finding}."),)
 
     def _weight_of_fractions(self, weight: Float) -> Float:
-        """Return the probability of each lost fraction (N,), given that of each hypothesis (K,)."""
+        """Return the probability of each lost fraction (N,) from the hypotheses' weights (K,)."""
         by_fraction = weight.reshape(len(self._transition_factors), len(self._lost_fractions), -1)
         return np.asarray(by_fraction.sum(axis=(0, 2)))
 
@@ -505,7 +505,7 @@ class LearningFilter:
 def _learnt_coefficients(
     name: str, units: Sequence[str], prior_deviation: Float, mean: Float, mean_square: Float
 ) -> dict[str, Learnt]:
-    """Return the posterior of a coefficient of each gauge, by `name[g]` with g from 1.
+    """Return each gauge's posterior of a coefficient, by `name[g]` with g from 1.
 
     Parameters
     ----------

@@ -237,7 +237,7 @@ def _library_record(grid: SamplingGrid) -> JsonObject:
 
 
 def _prepare_folder(out: Path, record: JsonObject, *, resume: bool, replace_existing: bool) -> Path:
-    """Return the folder for finished blocks: a new one, or that of an interrupted sampling.
+    """Return the folder for finished blocks, which may be left from an interrupted sampling.
 
     An interrupted sampling is continued only if `resume` is set and its record is the same.
     """

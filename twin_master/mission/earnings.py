@@ -19,7 +19,7 @@ from twin_master.scenario.schema import Scenario
 
 @dataclass(frozen=True)
 class Earnings:
-    """The earnings of flights in each of T steps; NaN in steps that were not flown.
+    """The earnings of flights in each of T steps; NaN where no step was flown.
 
     Attributes
     ----------

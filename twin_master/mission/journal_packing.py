@@ -47,7 +47,7 @@ def array_from_json(values: Iterable[float | None]) -> Float:
 
 
 def json_from_array(values: Float) -> list[float | None]:
-    """Return the numbers of an array as a JSON list, with null for what is not finite."""
+    """Return the numbers of an array as a JSON list, with null for NaN and infinities."""
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
@@ -82,7 +82,7 @@ def _pack_belief(belief: list[float]) -> object:
 
 
 def _unpack_belief(packed: Mapping[str, float] | str) -> list[float | None]:
-    """Return the probability of each state from what `_pack_belief` returned."""
+    """Return each state's probability from a belief that `_pack_belief` packed."""
     if isinstance(packed, str):
         return unpack_numbers(packed)
     belief: list[float | None] = [0.0] * int(packed[_STATE_COUNT])
@@ -106,7 +106,7 @@ def _pack_learnt(learnt: Mapping[str, Mapping[str, object]]) -> JsonObject:
 
 
 def _unpack_learnt(packed: JsonObject) -> JsonObject:
-    """Return the learnt quantities by name from what `_pack_learnt` returned."""
+    """Return the learnt quantities by name, as `_pack_learnt` packed them."""
     moments_of_quantities = (
         np.array(unpack_numbers(packed["figures"]), dtype=object).reshape(-1, 4).tolist()
     )
@@ -152,7 +152,7 @@ def _pack_intake(intake: JsonObject) -> JsonObject:
 
 
 def _unpack_intake(packed: JsonObject) -> JsonObject:
-    """Return the position in the stream of messages from what `_pack_intake` returned."""
+    """Return the position in the message stream, as `_pack_intake` packed it."""
     if packed["given"] and "*" not in packed["given"]:
         return packed  # of an earlier version
     statuses = [digit * int(count) for digit, count in _RUN_OF_STATUSES.findall(packed["given"])]

@@ -69,7 +69,7 @@ GivenEstimator = Estimator | Callable[[TwinBeforeFlight], Estimator] | str
 
 @dataclass(frozen=True)
 class TwinParts:
-    """The parts of a twin that a user gives instead of those of the scenario.
+    """Parts of a twin that a user gives to replace the scenario's.
 
     Attributes
     ----------
@@ -87,12 +87,12 @@ class TwinParts:
 
     @property
     def is_any_given(self) -> bool:
-        """Whether any part replaces that of the scenario."""
+        """Whether the user gives any part."""
         return self.policy is not None or self.replace_filter
 
     @property
     def replace_filter(self) -> bool:
-        """Whether the sensor model or the estimator replaces that of the scenario."""
+        """Whether the user gives a sensor model or an estimator."""
         return self.sensor_model is not None or self.estimator is not None
 
     def record(self) -> dict[str, str]:

@@ -195,7 +195,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
 
 @dataclass(frozen=True)
 class ComparedPolicy:
-    """The returns of a rule in simulated missions, or their differences to those of another rule.
+    """The returns of a rule in simulated missions, or their difference to another rule's.
 
     Attributes
     ----------
@@ -220,7 +220,7 @@ class ComparedPolicy:
         return float(1.96 * self.returns.std() / np.sqrt(len(self.returns)))
 
     def beyond(self, other_policy: "ComparedPolicy") -> "ComparedPolicy":
-        """Return by how much the returns exceed those of another rule, mission by mission."""
+        """Return the differences of the returns to another rule's, mission by mission."""
         return ComparedPolicy(
             f"{self.name} beyond {other_policy.name}", self.returns - other_policy.returns
         )

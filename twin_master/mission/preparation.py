@@ -392,7 +392,7 @@ class Knowledge:
 
     @cached_property
     def true_model(self) -> GraphicalModel:
-        """The model of true damage growth: that of the twin, or one with other probabilities."""
+        """The model of true damage growth: the twin's, or one with other probabilities."""
         probability = self.scenario.truth.probability
         if not probability:
             return self.model

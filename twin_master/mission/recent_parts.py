@@ -32,7 +32,7 @@ _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(",", ":
 
 
 def is_whole_step(step: int) -> bool:
-    """Return whether the journal's line of a step itself contains what was learnt.
+    """Return whether the journal's line of a step contains the learnt quantities.
 
     That is every `BLOCK_STEPS`-th step, and the steps of `_EARLY_STEPS`, as much is learnt at
     first.
@@ -179,6 +179,6 @@ class RecentPartsFile(RecentParts):
         return self._size if step // BLOCK_STEPS == self._block else 0
 
     def parts_of(self, line_hash: bytes) -> JsonObject:
-        """Return the parts of a line; those of the newest line are not read from the disk."""
+        """Return the parts of a line, without reading the disk for the newest one."""
         newest_hash, parts = self._newest
         return dict(parts) if line_hash == newest_hash else super().parts_of(line_hash)

@@ -174,7 +174,7 @@ class _BackwardScan:
         return True
 
     def _check_order(self, line: JournalLine, step: int) -> None:
-        """Refuse a journal line whose step is neither that of the next line nor the one before."""
+        """Refuse a line unless its step is that of the following line or the one before it."""
         later_step = self._later_step
         if later_step is None or later_step - step in (0, 1):
             return
@@ -292,7 +292,7 @@ def refilter(
 def spans_of_models(
     history: History, models: Sequence[BelievedModel]
 ) -> list[tuple[Knowledge, slice]]:
-    """Return the knowledge of each model in force, with the slice of steps filtered with it.
+    """Return each model in force with the slice of steps that were filtered with it.
 
     Parameters
     ----------

@@ -475,7 +475,7 @@ def _with_all_gauges(
 
 
 def _candidate_gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
-    """Return the gauges of a number of evenly placed rosettes, or those of a TOML file."""
+    """Return candidate gauges: evenly placed rosettes, given their number, or those of a file."""
     if candidates.isdecimal():
         rosettes = evenly_placed_rosettes(mesh, int(candidates))
         return tuple(gauge for rosette in rosettes for gauge in rosette.gauges())

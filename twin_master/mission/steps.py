@@ -192,7 +192,7 @@ class History:
 
     @property
     def readings(self) -> Float:
-        """The values after those of the sensors (T, I): of inspections, or a covariance."""
+        """The row's values after the sensors (T, I): readings of inspections, or a covariance."""
         return self.observation_rows[:, self.sensors :]
 
     @property

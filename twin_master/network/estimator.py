@@ -321,7 +321,7 @@ class ExactFilter:
         control_index: ArrayLike,
         step: int,
     ) -> tuple[Filtered, dict[int, ImpossibleObservation]]:
-        """Advance the beliefs of B twins to step t, and correct each by its own observation.
+        """Advance the beliefs of B twins to step t, and correct each by its observation.
 
         The belief of a twin does not depend on the other twins, not even in the last bit.
 

@@ -79,7 +79,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         return np.asarray(average)
 
     def _log_density_of_row(self, observation: Float, control_index: int) -> Float:
-        """Return the log density of one row in each of S states, for each of E draws: (S, E)."""
+        """Return the log density (S, E) of one row by state and draw."""
         row = np.array(observation, dtype=np.float64)
         count = self.sensor_count
         values = self.check_observation(row[:count])

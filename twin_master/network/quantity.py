@@ -56,7 +56,7 @@ class SortedValues(NamedTuple):
 def _fill_quantiles(
     weight: Float, sorted_values: SortedValues, levels: Float, result: Float
 ) -> None:
-    """Fill `result` with the quantiles of each of G sensors under each of B beliefs.
+    """Fill `result` with quantiles of G sensors under B beliefs.
 
     For each belief and sensor the probabilities of the sorted values are summed until each of P
     levels is reached.

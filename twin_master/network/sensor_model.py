@@ -208,7 +208,7 @@ class GaussianSensorModel(QuantityModel):
         return self._overrides("log_likelihood") and not self._overrides("log_likelihood_sequence")
 
     def _overrides(self, method: str) -> bool:
-        """Return whether a subclass has a method in the place of that of this class."""
+        """Return whether a subclass overrides a method."""
         return getattr(type(self), method) is not getattr(GaussianSensorModel, method)
 
     @property

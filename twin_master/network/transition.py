@@ -390,7 +390,7 @@ class TransitionModel:
 
 
 def _is_square(shape: tuple[int, ...]) -> bool:
-    """Return whether the shape of an array is that of a square matrix."""
+    """Return whether a shape is that of a square matrix."""
     return len(shape) == 2 and shape[0] == shape[1]
 
 

@@ -258,7 +258,7 @@ class Twin:
 
     @property
     def proposed_control(self) -> int:
-        """Index of the control for the next step: that of the last decision, or the first one."""
+        """Index of the control for the next step: the last decision, or the first control."""
         return self._proposed
 
     @property

@@ -302,7 +302,7 @@ def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
 
 
 def _with_article(title: str) -> str:
-    """Return a title of several words with an article, and a symbol as it is."""
+    """Return a title with its article; a symbol stays as it is."""
     return f"the {title}" if " " in title and not title.startswith("the ") else title
 
 

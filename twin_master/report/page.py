@@ -104,7 +104,7 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
 
 
 def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
-    """Yield the figures that are drawn from the data of a run, in the order of the page."""
+    """Draw the figures of a run in the order of the page, and yield them."""
     present_row = _present_row(run, now)
     last_row = run.step_count - 1
     figure = mission_figure(run, present_row)

@@ -138,7 +138,7 @@ def _short_unit(unit: str) -> str:
 
 
 def short_number(value: float) -> str:
-    """Return a number that fits beside an axis, such as 0.5, 1500 or 1e-4."""
+    """Return a number short enough for the tick of an axis, such as 0.5, 1500 or 1e-4."""
     text = f"{value:g}"
     if len(text.lstrip("-")) <= 4:
         return text

@@ -223,7 +223,7 @@ def _with_value(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 class _Monitor(NamedTuple):
-    """A quantity that a simulated asset reports in each step, beside its state and readings.
+    """A further quantity that a simulated asset reports in each step.
 
     Attributes
     ----------

@@ -88,7 +88,7 @@ class FileSection(Section):
         return self.model_copy(update=paths)
 
     def portable(self) -> "FileSection":
-        """Return the table with the paths of user files replaced by those of a run's copies."""
+        """Return the table with the paths of user files replaced by those of their copies."""
         copies = self.copies()
         return self.model_copy(update={key: copies[key] for key in self.user_files()})
 
@@ -111,7 +111,7 @@ class KindSection(FileSection):
 
     @property
     def is_known_to_differ(self) -> bool:
-        """Whether its model is known to differ from that of any other kind."""
+        """Whether its model certainly differs from every other kind's."""
         has_patch = getattr(self, "patch", None) is not None
         return self.has_unique_model or has_patch
 

@@ -134,7 +134,7 @@ class Scenario(ScenarioTables):
         return self.model_copy(update=tables)
 
     def portable(self) -> Self:
-        """Return the scenario with the paths of user files replaced by those of a run's copies."""
+        """Return the scenario with the paths of user files replaced by those of their copies."""
         tables = {name: table.portable() for name, table in self._file_tables().items()}
         return self.model_copy(update=tables)
 

@@ -148,7 +148,7 @@ class Section(toml_file.Section):
 
 
 def _add_keys_with_units(table: Table, units: Mapping[str, str]) -> None:
-    """Add to a table's schema, beside each key that may carry a unit, the key with its unit."""
+    """Add keys with units in their names to the JSON Schema of a table."""
     properties: Table = {}
     alternatives = []
     for key, key_schema in table["properties"].items():
@@ -174,7 +174,7 @@ def _relax_required_keys(table: Table, keys: set[str]) -> None:
 
 
 def _schema_in_unit(schema: JsonDocument, divisor: float) -> JsonDocument:
-    """Return the JSON Schema of a value in a unit, given that of the value in SI.
+    """Convert the JSON Schema of a value in SI to one of the value in a unit.
 
     Parameters
     ----------

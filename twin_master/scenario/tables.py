@@ -589,7 +589,7 @@ class Noticing(Section):
 
 
 def _none_for_false(value: object) -> object:
-    """Return None for `false`, and anything else as it is."""
+    """Return None for `false`; return anything else unchanged."""
     return None if value is False else value
 
 

@@ -284,7 +284,7 @@ def learnt_record(quantities: Sequence[LearntQuantity], sensor_units: Sequence[s
 
 
 def _by_moment(moments: Float) -> dict[str, Float]:
-    """Return the moments along the last axis of an array, each by its name in `MOMENTS`."""
+    """Return the moments on the last axis of an array by their names in `MOMENTS`."""
     return {name: moments[..., index] for index, name in enumerate(MOMENTS)}
 
 
@@ -321,7 +321,7 @@ class MissionResult:
 
     @cached_property
     def earned(self) -> Earnings:
-        """The earnings of the controls in each step, by the model that the twin believed in it."""
+        """The earnings in each step, by the model that the twin believed then."""
         flight = self.flight
         step_count = len(flight.steps)
         state = np.full((step_count, len(self.scenario.state)), np.nan)

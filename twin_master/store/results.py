@@ -157,7 +157,7 @@ def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:
 
 
 def _expected_in_flight(result: MissionResult, belief: Float, *, is_smoothed: bool) -> Expectation:
-    """Return the sensors and rewards expected in each step of a flight, by the model of that step.
+    """Return the expected sensors and rewards of each step, by the model believed then.
 
     Parameters
     ----------

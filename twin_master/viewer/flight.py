@@ -348,7 +348,7 @@ class Flight:
         return record
 
     def _learnt_in(self, file: BinaryIO, begin: int) -> JsonObject:
-        """Return what was learnt from the line that begins at a byte of the journal.
+        """Return the learnt quantities in the line that begins at a byte of the journal.
 
         The last result is kept, because successive steps ask for the same line.
         """
