@@ -160,19 +160,34 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     first_column = shown_columns[0] if shown_columns else 0
     if width < WIDE:
         cells = [_with_broken_words(row, first_column) for row in cells]
+    width_of_names = None
+    if shown_columns and width >= NARROWEST:
+        columns = [[headings[column], *(row[column] for row in cells)] for column in shown_columns]
+        width_of_names = _width_of_names(columns, width)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for column in shown_columns:
-        # Rich wraps the other columns if the first one must not be wrapped. The first column has
-        # room if the terminal is at least `NARROWEST` wide, and no line of the column takes more
-        # than half of the width.
-        lines_of_column = [line for row in cells for line in row[column].split("\n")]
-        longest_line = max(map(len, lines_of_column), default=0)
-        has_room = width >= NARROWEST and longest_line <= width // 2
-        no_wrap = column == first_column and has_room
-        table.add_column(headings[column], overflow="fold", no_wrap=no_wrap)
+        # Rich narrows only columns without a fixed width
+        fixed_width = width_of_names if column == first_column else None
+        table.add_column(headings[column], overflow="fold", width=fixed_width)
     for row in cells:
         table.add_row(*[row[column] for column in shown_columns])
     return table
+
+
+def _width_of_names(columns: Sequence[Sequence[str]], width: int) -> int | None:
+    """Return the width of the first column of a table; None if it is narrowed like the others.
+
+    Its names stay on one line if the longest takes at most half of the terminal. Otherwise they
+    get two fifths of it, if the words of the other columns stay whole in the rest.
+    """
+    names, *other_columns = columns
+    longest_name = max(len(line) for name in names for line in name.split("\n"))
+    if longest_name <= width // 2:
+        return longest_name
+    words = [[len(word) for cell in column for word in cell.split()] for column in other_columns]
+    needed = sum(1 + max(lengths, default=0) for lengths in words)
+    width_of_names = 2 * width // 5
+    return width_of_names if needed <= width - width_of_names else None
 
 
 def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:

@@ -337,9 +337,17 @@ def _outcome_record(outcome: "RunOutcome") -> "JsonObject":
 
 
 def print_outcome(outcome: "RunOutcome") -> None:
-    """Print the figures of a run next to their reference values, and where the report is."""
+    """Print what the twin did, the figures of a run beside their references, and its files."""
     from twin_master.store.writing import printed_values
 
+    terminal.say(f"The twin {outcome.control}.", bold=True)
+    if outcome.origin.differ:
+        terminal.say(
+            f"Asset and twin's model differ: the asset was the {outcome.origin.asset}, and the "
+            f"twin believes the {outcome.origin.model}."
+        )
+    for notice in outcome.notices:
+        terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
     numbers_of_sources = _numbers_of_sources(outcome)
     rows = []
     texts = printed_values(outcome.figures)
@@ -351,14 +359,6 @@ def print_outcome(outcome: "RunOutcome") -> None:
         value = "none" if figure.value is None else f"{value} {figure.unit}".strip()
         rows.append([figure.title, value, reference])
     terminal.print_table(["result", "this run", "reference"], rows + _timing_rows(outcome))
-    terminal.say(f"The twin {outcome.control}.")
-    if outcome.origin.differ:
-        terminal.say(
-            f"Asset and twin's model differ: the asset was the {outcome.origin.asset}, and the "
-            f"twin believes the {outcome.origin.model}."
-        )
-    for notice in outcome.notices:
-        terminal.say(notice.replace(" DIR", f" {outcome.folder}"), fg="yellow")
     for source, source_number in numbers_of_sources.items():
         terminal.say(f"  ({source_number}) {source}")
     if outcome.report is not None:

@@ -370,6 +370,7 @@ def fly_and_print_fleet(
         Whether to print JSON.
     """
     from twin_master.fleet.comparison import figures_of_fleets
+    from twin_master.fleet.configuration import REPORT_NAME
     from twin_master.fleet.flight import fly_fleet
 
     folder = out if out is not None else Path("runs") / fleet.head.name
@@ -393,15 +394,16 @@ def fly_and_print_fleet(
             }
         )
     else:
+        _print_endings(outcome)
         print_figures(figures)
-        _print_outcome(outcome)
+        report_file = outcome.folder / REPORT_NAME
+        has_report = report_file.is_file()
+        terminal.say(f"Report: {report_file}" if has_report else f"Fleet: {outcome.folder}")
     return outcome
 
 
-def _print_outcome(outcome: "FleetOutcome") -> None:
-    """Print the number of twins, why flights failed or ended early, and the path of the report."""
-    from twin_master.fleet.configuration import REPORT_NAME
-
+def _print_endings(outcome: "FleetOutcome") -> None:
+    """Print the number of twins, and why flights failed or ended early."""
     flown_text = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s"
     if outcome.shards_kept:
         flown_text += f", {counted(outcome.shards_kept, 'shard')} there before"
@@ -415,9 +417,6 @@ def _print_outcome(outcome: "FleetOutcome") -> None:
     if len(reasons) > MOST_ENDINGS:
         file = outcome.folder / "fleet.json"
         terminal.say(f"  and {len(reasons) - MOST_ENDINGS} more, in {file}")
-    report = outcome.folder / REPORT_NAME
-    has_report = report.is_file()
-    terminal.say(f"Report: {report}" if has_report else f"Fleet: {outcome.folder}")
 
 
 def _write_report(folder: Path) -> None:

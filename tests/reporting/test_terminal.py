@@ -160,3 +160,14 @@ def test_a_stage_that_reports_nothing_shows_its_last_detail_again(monkeypatch):
     assert (first, last[: len("Searching: done")]) == ("Searching ...", "Searching: done")
     assert repeated == with_detail
     assert len(repeated) >= 2
+
+
+def test_long_names_of_rows_fold_in_two_fifths_of_a_terminal_and_are_not_crushed():
+    name = "rms error of the estimated stiffness loss of region 1"
+    rows = [(name, "4.16 percentage points", "3.8 percentage points (2)")]
+    lines = print_table(("result", "this run", "reference"), rows, 80)
+    assert [line[1:33].rstrip() for line in lines if "loss" in line or "rms" in line] == [
+        "rms error of the estimated",
+        "stiffness loss of region 1",
+    ]
+    assert max(map(len, lines)) <= 80
