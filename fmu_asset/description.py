@@ -175,15 +175,7 @@ def _c_number(value: float | None, absent: str) -> str:
 
 
 def _xml_value(value: float | None, kind: str) -> str | None:
-    """Return the value of a variable as XML writes it.
-
-    Parameters
-    ----------
-    value : float or None
-        The number, or None for a missing attribute.
-    kind : str
-        The type of the variable: Boolean, Real, or one of whole numbers.
-    """
+    """Return a value as text for an XML attribute, by the type of its variable; None stays None."""
     if value is None:
         return None
     if kind == "Boolean":

@@ -94,7 +94,9 @@ def print_calibration(
         file = None if written_file is None else str(written_file)
         terminal.print_json({"calibration": file} | _calibration_record(result))
         return
-    _print_posterior(result)
+    from calibration.result.text import printed_calibration
+
+    terminal.show(printed_calibration(result))
     if written_file is None:
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
@@ -103,13 +105,6 @@ def print_calibration(
     terminal.say(f"Calibration: {written_file}")
     if report:
         terminal.say(f"Report: {written_file.with_name(REPORT_NAME)}")
-
-
-def _print_posterior(result: "Calibration") -> None:
-    """Print priors, posteriors and correlations of the parameters of a calibration."""
-    from calibration.result.text import printed_calibration
-
-    terminal.show(printed_calibration(result))
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from discrepancy.model_choice import ModelChoice
     from discrepancy.report.figures import ReportInput
     from discrepancy.self_calibration import SelfCalibration
-    from discrepancy.system.interface import Model
     from discrepancy.verdict_so_far import SearchInProgress
     from discrepancy.workflow import Investigation
 
@@ -360,6 +359,7 @@ def check(
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.judgement.separability import compute_separability
     from discrepancy.model_choice import choose_model
+    from discrepancy.report.printed import check_lines
     from discrepancy.workflow import check_and_prepare
 
     catalogue = load_catalogue(effects or ())
@@ -377,27 +377,11 @@ def check(
             _check_record(prepared_campaign, chosen_model.name, faults, separability)
         )
     else:
-        _print_check(prepared_campaign, chosen_model, catalogue, faults, separability)
+        terminal.show(check_lines(prepared_campaign, chosen_model, catalogue, faults, separability))
     if separability is None:
         raise terminal.error_exit(
             "Correct the faults first: conclusions from these data would be wrong."
         )
-
-
-def _print_check(
-    data: "Campaign",
-    model: "Model",
-    catalogue: "Sequence[Effect]",
-    faults: "Sequence[DataFault]",
-    separability: "Separability | None",
-) -> None:
-    """Print the faults of a campaign's data, and what the campaign can decide.
-
-    The latter is None if a fault is fatal.
-    """
-    from discrepancy.report.printed import check_lines
-
-    terminal.show(check_lines(data, model, catalogue, faults, separability))
 
 
 def _check_record(

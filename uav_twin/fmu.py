@@ -413,7 +413,8 @@ def export(
 
     checked_target(out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError)
     _refuse_what_is_no_system(what)
-    if _is_design(what):
+    is_design = what == "uav_wing" or "planform" in _table_of_file(what)
+    if is_design:
         design = None if what == "uav_wing" else Path(what)
         path = export_design(design, out, kind=kind or "python", replace_file=replace)
     else:
@@ -443,11 +444,6 @@ def _refuse_what_is_no_system(what: str) -> None:
             f"{what} is a structure, and {takes}: write a scenario with `[asset]`, `kind = "
             f'"structure"` and `structure = "{what}"`, and export that scenario.'
         )
-
-
-def _is_design(what: str) -> bool:
-    """Return whether an argument is the shipped design or a TOML file with a table `planform`."""
-    return what == "uav_wing" or "planform" in _table_of_file(what)
 
 
 def _table_of_file(path: str) -> Mapping[str, object]:

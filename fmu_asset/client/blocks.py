@@ -95,7 +95,7 @@ def _selected_port_input(fmu: BoundFmu, quantity: PortQuantity) -> _SelectedInpu
     variables = [selection.variable for selection in selections]
     if len({(variable.unit, variable.kind) for variable in variables}) > 1:
         raise BindingError(
-            f"The variables of {fmu.place_in_binding(quantity.label)} have different units or "
+            f"The variables of {fmu.location_in_binding(quantity.label)} have different units or "
             "types in the FMU; make one port of each."
         )
     entry = InputBinding(variable=names[0], unit=quantity.vector.units[0])

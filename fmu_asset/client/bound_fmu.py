@@ -258,7 +258,7 @@ class BoundFmu:
         self.description = description
         self.binding = binding
 
-    def place_in_binding(self, label: str) -> str:
+    def location_in_binding(self, label: str) -> str:
         """Return a text for messages: a place in the binding, its name and its file."""
         return f"{label} of the binding {self.binding.title}"
 
@@ -270,7 +270,7 @@ class BoundFmu:
         BindingError
             If there is no such variable, or it is of another causality or type.
         """
-        return find_variable(self.description, name, self.place_in_binding(label), causality)
+        return find_variable(self.description, name, self.location_in_binding(label), causality)
 
     def variable_or_array(self, name: str) -> VariableInfo | None:
         """Return the variable of a name such as `p`, or the array `p` for `p[3]`."""
@@ -294,7 +294,7 @@ class BoundFmu:
         variable: VariableInfo,
         positions: Sequence[int] = (),
     ) -> BoundInput:
-        """Return an input of the binding, which checks and converts values for the FMU.
+        """Return an input of the binding, resolved against a variable of the FMU.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class BoundFmu:
         )
         if stated_low > high or stated_high < low:
             raise BindingError(
-                f"The range of {self.place_in_binding(label)} lies outside that of "
+                f"The range of {self.location_in_binding(label)} lies outside that of "
                 f"{variable.name!r}, {low:g} to {high:g}{variable.in_unit}; correct minimum or "
                 "maximum."
             )
@@ -351,7 +351,7 @@ class BoundFmu:
             If there is none.
         """
         definitions = self.description.units_of(variable)
-        return conversion(unit, variable, definitions, where=self.place_in_binding(label))
+        return conversion(unit, variable, definitions, where=self.location_in_binding(label))
 
     # ------------------------------------------------------------------ ports
 
@@ -396,7 +396,7 @@ class BoundFmu:
         if force_is_output in is_output_of_quantity.values():
             side = "outputs" if force_is_output else "inputs"
             raise BindingError(
-                f"In {self.place_in_binding(f'port.{port_name}')}, force and motion are both "
+                f"In {self.location_in_binding(f'port.{port_name}')}, force and motion are both "
                 f"{side} of the FMU; at a port one is given for the other."
             )
         return quantities
@@ -406,7 +406,7 @@ class BoundFmu:
 
         Raise an error if their number differs from that of the force, or if they are mixed.
         """
-        location = self.place_in_binding(label)
+        location = self.location_in_binding(label)
         count = len(vector.variables)
         if count != force_count:
             raise BindingError(

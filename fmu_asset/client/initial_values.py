@@ -81,7 +81,13 @@ class InitialValueTable:
         """
         texts: InitialValues = []
         inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]] = []
-        for name, value in {**self._values_of_binding(), **parameters}.items():
+        values: dict[str, npt.ArrayLike] = {
+            name: entry.value
+            for name, entry in self._fmu.binding.parameter.items()
+            if entry.value is not None
+        }
+        values |= parameters
+        for name, value in values.items():
             text_parameter = self._text_parameter(name)
             if text_parameter is None:
                 inputs_and_values.append((self._parameter(name), value))
@@ -92,11 +98,6 @@ class InitialValueTable:
         for name, value in (health or {}).items():
             inputs_and_values.append((self.health[name], value))
         return [*self._numbers(inputs_and_values), *texts]
-
-    def _values_of_binding(self) -> dict[str, float | str]:
-        """Return the parameters that have a value in the binding."""
-        entries = self._fmu.binding.parameter.items()
-        return {name: entry.value for name, entry in entries if entry.value is not None}
 
     def _numbers(
         self, inputs_and_values: list[tuple[BoundInput, npt.ArrayLike]]

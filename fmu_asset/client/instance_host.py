@@ -203,7 +203,7 @@ class InstanceHost:
     # ------------------------------------------------------------------ starts
 
     def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
-        """Start the simulation from the initial state; a lost instance is replaced.
+        """Start the simulation; a lost instance is replaced, and any other one reset.
 
         Parameters
         ----------
@@ -256,7 +256,7 @@ class InstanceHost:
     # ------------------------------------------------------------------ steps
 
     def step(self) -> None:
-        """Make the step in the request; repeat it if the last restart did not work."""
+        """Make the step that the request describes; repeat it if the last restart did not work."""
         assert self.instance is not None
         self.instance.step()
         if self._is_at_start:

@@ -177,7 +177,7 @@ class FmuStateSpace:
         return np.asarray((self.output_matrix[output] @ shapes) * participation)
 
     def most_flexible_mode(self, output: int, force: int) -> VibratingMode | None:
-        """Return the mode with the largest part in an output's static displacement under a force.
+        """Return the vibrating mode that contributes most to a static displacement under a force.
 
         Returns
         -------

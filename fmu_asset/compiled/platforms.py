@@ -62,7 +62,8 @@ def targets_by_folder(
         require_one_of(platform, get_args(Platform), "platforms")
     if not platforms:
         raise FmuBuildError(
-            f"A platform is expected, but none was given: name one of {_platform_list()}."
+            "A platform is expected, but none was given: name one of "
+            f"{comma_list(get_args(Platform))}."
         )
     folders: dict[str, tuple[Target, ...]] = {}
     for target in get_args(Target):
@@ -104,8 +105,3 @@ def host_binary_name(identifier: str, fmi: FmiVersion) -> str:
     """Return the name in the archive of the library for this host."""
     folder = HOST_TARGET if fmi == 3 else _FMI_2_FOLDERS[HOST_TARGET]
     return binary_name(folder, HOST_TARGET, identifier)
-
-
-def _platform_list() -> str:
-    """Return the names of all platforms as a list for a message."""
-    return comma_list(get_args(Platform))

@@ -288,7 +288,7 @@ class CoupledFmus(Host):
         self._at_different_times = False
 
     def step(self) -> None:
-        """Make the step in the request."""
+        """Make the step of the system that the request describes."""
         if self._at_different_times:
             raise FmuStateError(
                 "A step or a restoration failed, and the FMUs no longer stand at the same time; "

@@ -236,7 +236,7 @@ class FmuInstance(Instance):
             raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._last_messages())
 
     def step(self) -> None:
-        """Make the step in the request."""
+        """Make the communication step that the request describes."""
         if self.lost:
             raise FmuWorkerError(_LOST)
         if self._end_time is not None:

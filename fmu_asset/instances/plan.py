@@ -411,7 +411,7 @@ class Instance(Protocol):
         """
 
     def step(self) -> None:
-        """Make the step in the request; its outputs are then in the reply.
+        """Make the step that the request describes; its outputs are then in the reply.
 
         Raises
         ------

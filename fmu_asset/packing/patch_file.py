@@ -104,7 +104,7 @@ class PatchFile:
         return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
     def for_gauges(self, gauge_count: int, patch_label: str = "The patch") -> PatchFile:
-        """Return the patch with the names of FMU outputs instead of those of channels.
+        """Return the patch with the FMU's output in place of each channel.
 
         Parameters
         ----------

@@ -164,7 +164,10 @@ def build_fmu(
         table += effect_rows(effects, len(table), start)
         patch_members = _patched_members(model, effects, options.get("arrays"))
     check_start_values(table)
-    description = f"{_model_description(model)} {options.get('note', '')}".strip()
+    description = _STRUCTURE_DESCRIPTION.format(model.name)
+    if is_wing(model):
+        description = _WING_DESCRIPTION
+    description = f"{description} {options.get('note', '')}".strip()
     declaration = Declaration(stem_of(model), description, table)
     # files of the archive
     if kind == "python":
@@ -188,11 +191,6 @@ def _requested_start_values(model: ReducedModel, options: FmuOptions) -> dict[st
     for name, value in (options.get("start") or {}).items():
         values[name] = float(value)
     return values
-
-
-def _model_description(model: ReducedModel) -> str:
-    """Return the sentence that describes the wing or structure in the model description."""
-    return _WING_DESCRIPTION if is_wing(model) else _STRUCTURE_DESCRIPTION.format(model.name)
 
 
 def _python_structure_members(

@@ -164,7 +164,7 @@ class WorkerInstance(Instance):
         self._call("initialise", start_time, parameters, with_inputs)
 
     def step(self) -> None:
-        """Make the step in the request, and fill the reply."""
+        """Make the communication step that the request describes, and fill the reply."""
         self._ask(Question.STEP, "step", self._request)
         header = self._wait_for_answer(len(self._reply))
         if header.length != len(self._reply):

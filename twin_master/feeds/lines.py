@@ -57,7 +57,8 @@ def rotated_files(path: Path) -> list[Path]:
         elif _NUMBER_SUFFIX.fullmatch(suffix):
             numbers.append(suffix)
     dates.sort()
-    numbers.sort(key=_number_of_suffix, reverse=True)  # the largest number is the oldest
+    # the largest number is the oldest
+    numbers.sort(key=lambda suffix: int(suffix.removeprefix(".")), reverse=True)
     stamped = []
     for file in path.parent.glob(f"{escape(path.stem)}.*{escape(path.suffix)}"):
         stamp = file.name.removeprefix(path.stem).removesuffix(path.suffix)
@@ -65,11 +66,6 @@ def rotated_files(path: Path) -> list[Path]:
             stamped.append(file)
     stamped.sort()
     return stamped + [path.with_name(path.name + suffix) for suffix in dates + numbers]
-
-
-def _number_of_suffix(suffix: str) -> int:
-    """Return the number in a suffix such as `.12`."""
-    return int(suffix.removeprefix("."))
 
 
 def first_line(path: Path) -> bytes:

@@ -505,14 +505,10 @@ def _growth(
     def log_likelihood(axes: Axes) -> Float:
         """Return the log likelihood of the twins on a grid of log odds."""
         nonlocal explained_count
-        total = evidence.grid_sum(_probabilities(axes), prior)
+        probabilities = tuple(logistic(axis) for axis in axes)
+        total = evidence.grid_sum(probabilities, prior)
         explained_count = total.explained
         return total.log_likelihood
 
     grid = likelihood_grid(log_likelihood, len(family.names), first_axes)
     return _Growth(grid, explained_count)
-
-
-def _probabilities(axes: Axes) -> Axes:
-    """Return the probabilities for axes of log odds."""
-    return tuple(logistic(axis) for axis in axes)
