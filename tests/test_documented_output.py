@@ -9,7 +9,7 @@ import pytest
 from benchmarks.pictures.picture import PRINTED_NUMBER, agrees
 from tests import command_line
 from tests.conftest import REFERENCE
-from twin_master.fleet.comparison import COUNTS_OF_FLEETS, PRINTED_FIGURES_OF_FLEETS
+from twin_master.fleet.comparison import COUNTS_OF_FLEETS, PRINTED_STATISTICS_OF_FLEETS
 from twin_master.scenario.schema import SUMMARY_TITLES
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -63,7 +63,7 @@ ROW = re.compile(r" ?(\S(?:.*?\S)?)  +\S")
 def named_rows() -> re.Pattern[str]:
     """Return what the rows of the tables of `run` and `fleet run` are called, with any names in fields."""
     titles = [title for group in SUMMARY_TITLES.values() for title, _unit in group.values()]
-    titles += [figure.title for figure in PRINTED_FIGURES_OF_FLEETS.values()]
+    titles += [statistic.title for statistic in PRINTED_STATISTICS_OF_FLEETS.values()]
     titles += COUNTS_OF_FLEETS
     pieces = [re.split(r"\{\w+\}", title) for title in titles]
     return re.compile("|".join(".+".join(map(re.escape, piece)) for piece in pieces))

@@ -9,7 +9,7 @@ from reporting import terminal
 from reporting.command_options import JsonOption
 
 if TYPE_CHECKING:
-    from twin_master.fleet.comparison import Figures
+    from twin_master.fleet.comparison import Statistics
 
 
 def compare(
@@ -51,10 +51,10 @@ def compare(
         print_figures(figures)
 
 
-def print_figures(figures: "Figures") -> None:
+def print_figures(figures: "Statistics") -> None:
     """Print a table of results with a column for each group."""
-    from twin_master.fleet.comparison import figure_rows
+    from twin_master.fleet.comparison import statistic_rows
 
-    rows = figure_rows(figures)
+    rows = statistic_rows(figures)
     if rows:
         terminal.print_table(["result", *figures], rows)

@@ -369,7 +369,7 @@ def fly_and_print_fleet(
     json : bool
         Whether to print JSON.
     """
-    from twin_master.fleet.comparison import figures_of_fleets
+    from twin_master.fleet.comparison import statistics_of_fleets
     from twin_master.fleet.configuration import REPORT_NAME
     from twin_master.fleet.flight import fly_fleet
 
@@ -381,7 +381,7 @@ def fly_and_print_fleet(
         )
     if report:
         _write_report(outcome.folder)
-    figures = figures_of_fleets([outcome.folder])
+    figures = statistics_of_fleets([outcome.folder])
     if json:
         terminal.print_json(
             {

@@ -24,10 +24,10 @@ from twin_master.scenario.section import printed_state
 if TYPE_CHECKING:
     import xarray as xr
 
-Figure = Estimated | int | str
-"""A figure of a group: an estimate, a count, or a name."""
-Figures = dict[str, dict[str, Figure]]
-"""The figures of each group, by the name of the group and of the figure."""
+Statistic = Estimated | int | str
+"""A statistic of a group: an estimate, a count, or a name."""
+Statistics = dict[str, dict[str, Statistic]]
+"""The statistics of each group, by the name of the group and of the statistic."""
 
 
 def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
@@ -37,7 +37,7 @@ def outcomes_of_group(group: "xr.DataTree") -> Outcomes:
     )
 
 
-def earned_figures(group: "xr.DataTree") -> dict[str, Figure]:
+def earned_statistics(group: "xr.DataTree") -> dict[str, Statistic]:
     """Return what the flights of a group earned, by title; empty for stores without rewards.
 
     The values are means over the flights with their standard errors. Failed flights are left out.
@@ -85,36 +85,36 @@ def earned_figures(group: "xr.DataTree") -> dict[str, Figure]:
     return {key: moments_of_key.mean for key, moments_of_key in moments.items()}
 
 
-def group_figures(group: "xr.DataTree") -> dict[str, Figure]:
-    """Return counts of a group's twins, and the figures of their outcomes, by title.
+def group_statistics(group: "xr.DataTree") -> dict[str, Statistic]:
+    """Return counts of a group's twins, and the statistics of their outcomes, by title.
 
-    The figures are means over the twins with their standard errors; a group without a flown twin
-    has counts alone. Figures that need the true state are left out for real assets.
+    The statistics are means over the twins with their standard errors; a group without a flown twin
+    has counts alone. Statistics that need the true state are left out for real assets.
     """
-    figures, flown_count = _counts_of_twins(group)
+    statistics, flown_count = _counts_of_twins(group)
     if not flown_count:
-        return figures
-    figures |= earned_figures(group)
+        return statistics
+    statistics |= earned_statistics(group)
     outcomes = outcomes_of_group(group)
     is_truth_known = not np.isnan(outcomes.bias[0].value)  # NaN for real assets
     if is_truth_known:
         if not np.isnan(outcomes.prompt_fallbacks.value):
             steps = f"{group.attrs['step_name']}s"
-            figures[f"fallback within {WITHIN} {steps}, of those called for"] = (
+            statistics[f"fallback within {WITHIN} {steps}, of those called for"] = (
                 outcomes.prompt_fallbacks
             )
         if not np.isnan(outcomes.early_fallbacks.value):
-            figures["early fallback"] = outcomes.early_fallbacks
+            statistics["early fallback"] = outcomes.early_fallbacks
         state_unit = unit_of_states(group)
         for name, rms, bias in zip(
             stored_values(group, "filtered/region"), outcomes.rms, outcomes.bias, strict=True
         ):
-            figures[f"filtered rms error of {name}"] = replace(rms, unit=state_unit)
-            figures[f"bias of {name}"] = replace(bias, unit=state_unit)
-    figures["log evidence of a step"] = outcomes.log_evidence
+            statistics[f"filtered rms error of {name}"] = replace(rms, unit=state_unit)
+            statistics[f"bias of {name}"] = replace(bias, unit=state_unit)
+    statistics["log evidence of a step"] = outcomes.log_evidence
     if is_truth_known:
-        figures["true state in the 90 % set"] = outcomes.credible_coverage
-    return figures
+        statistics["true state in the 90 % set"] = outcomes.credible_coverage
+    return statistics
 
 
 class NamedGroup(NamedTuple):
@@ -166,18 +166,18 @@ def groups_of_fleets(folders: Sequence[Path]) -> list[NamedGroup]:
     return named_groups
 
 
-def figures_of_fleets(folders: Sequence[Path]) -> Figures:
-    """Return the figures of each group by name; of several folders, the name has the folder.
+def statistics_of_fleets(folders: Sequence[Path]) -> Statistics:
+    """Return the statistics of each group by name; of several folders, the name has the folder.
 
     Raises
     ------
     RunFolderError, FleetError
         If a folder does not hold a fleet, or if its store cannot be read.
     """
-    return {named.name: group_figures(named.group) for named in groups_of_fleets(folders)}
+    return {named.name: group_statistics(named.group) for named in groups_of_fleets(folders)}
 
 
-def compare_fleets(folders: Sequence[Path]) -> Figures:
+def compare_fleets(folders: Sequence[Path]) -> Statistics:
     """Return the results of each group, beside what was promised and what the first group earned.
 
     Groups are compared seed by seed, because flights of one seed meet the same damage and noise
@@ -190,36 +190,36 @@ def compare_fleets(folders: Sequence[Path]) -> Figures:
     """
     named_groups = groups_of_fleets(folders)
     first = named_groups[0]
-    figures: Figures = {}
+    statistics: Statistics = {}
     for named in named_groups:
-        figures[named.name] = {"policy": named.policy} | group_figures(named.group)
-        if RETURN not in figures[named.name]:
+        statistics[named.name] = {"policy": named.policy} | group_statistics(named.group)
+        if RETURN not in statistics[named.name]:
             continue
         if len(named.record["scenarios"]) == 1:
             promised = promised_return(knowledge_of_scenario(named.folder, named.record, 0))
-            figures[named.name] = _with_figure_after(
-                figures[named.name],
+            statistics[named.name] = _with_statistic_after(
+                statistics[named.name],
                 RETURN,
                 RETURN_PROMISED,
                 Estimated(promised.mean, promised.half_width / NORMAL_95),
             )
-        if named is not first and RETURN in figures[first.name]:
+        if named is not first and RETURN in statistics[first.name]:
             difference = _difference_of_returns(named.group, first.group)
-            figures[named.name] = _with_figure_after(
-                figures[named.name], RETURN, f"{RETURN_BEYOND}{first.name}", difference
+            statistics[named.name] = _with_statistic_after(
+                statistics[named.name], RETURN, f"{RETURN_BEYOND}{first.name}", difference
             )
-    return figures
+    return statistics
 
 
-def _with_figure_after(
-    figures: dict[str, Figure], previous_key: str, key: str, figure: Figure
-) -> dict[str, Figure]:
-    """Return figures with a further one after that of another key."""
-    ordered: dict[str, Figure] = {}
-    for known_key, known_figure in figures.items():
-        ordered[known_key] = known_figure
+def _with_statistic_after(
+    statistics: dict[str, Statistic], previous_key: str, key: str, statistic: Statistic
+) -> dict[str, Statistic]:
+    """Return statistics with a further one after that of another key."""
+    ordered: dict[str, Statistic] = {}
+    for known_key, known_statistic in statistics.items():
+        ordered[known_key] = known_statistic
         if known_key == previous_key:
-            ordered[key] = figure
+            ordered[key] = statistic
     return ordered
 
 
@@ -263,7 +263,7 @@ def unit_of_states(group: "xr.DataTree") -> str:
     return "" if ", " in unit else unit
 
 
-def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Figure], int]:
+def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Statistic], int]:
     """Return the numbers of twins that flew, failed, ended early or gave notices, by title.
 
     The number of twins that have outcomes is returned, too.
@@ -276,22 +276,22 @@ def _counts_of_twins(group: "xr.DataTree") -> tuple[dict[str, Figure], int]:
         status_counts += np.bincount(status, minlength=len(status_counts))
         alarmed += int(np.sum(notice_counts(group, "alarm", rows) > 0))
         left_gauge_out += int(np.sum(notice_counts(group, "gauge_left_out", rows) > 0))
-    figures: dict[str, Figure] = {
+    statistics: dict[str, Statistic] = {
         "twins": int(status_counts.sum()),
         "flown": int(status_counts[FLOWN]),
         "failed in flight": int(status_counts[FAILED]),
     }
     if status_counts[ENDED]:
-        figures["ended early"] = int(status_counts[ENDED])
+        statistics["ended early"] = int(status_counts[ENDED])
     if group.attrs.get("gives_notice"):
-        figures["raised an alarm"] = alarmed
+        statistics["raised an alarm"] = alarmed
     if left_gauge_out:
-        figures["left a gauge out"] = left_gauge_out
-    return figures, int(status_counts[FLOWN] + status_counts[ENDED])
+        statistics["left a gauge out"] = left_gauge_out
+    return statistics, int(status_counts[FLOWN] + status_counts[ENDED])
 
 
-class _PrintedFigure(NamedTuple):
-    """How a figure of a group is printed.
+class _PrintedStatistic(NamedTuple):
+    """How a statistic of a group is printed.
 
     Attributes
     ----------
@@ -319,36 +319,36 @@ RETURN_PROMISED = "return promised"
 """The key of the return that the twin's own model expects."""
 RETURN_BEYOND = "return beyond "
 """The beginning of the key of a difference of returns, before the name of the other group."""
-PRINTED_FIGURES_OF_FLEETS = {
-    RETURN_PROMISED: _PrintedFigure("return that the twin's model promises", interval=True),
-    RETURN_BEYOND: _PrintedFigure("return beyond that of {of}, seed by seed", interval=True),
-    RETURN: _PrintedFigure("return: rewards of a flight, discounted", interval=True),
-    "reward of a step": _PrintedFigure("reward of a step", interval=True),
-    "steps with ": _PrintedFigure("steps flown with {of}", 100.0, "%"),
-    "steps beyond the limit": _PrintedFigure(
+PRINTED_STATISTICS_OF_FLEETS = {
+    RETURN_PROMISED: _PrintedStatistic("return that the twin's model promises", interval=True),
+    RETURN_BEYOND: _PrintedStatistic("return beyond that of {of}, seed by seed", interval=True),
+    RETURN: _PrintedStatistic("return: rewards of a flight, discounted", interval=True),
+    "reward of a step": _PrintedStatistic("reward of a step", interval=True),
+    "steps with ": _PrintedStatistic("steps flown with {of}", 100.0, "%"),
+    "steps beyond the limit": _PrintedStatistic(
         "steps with a harder control than the best one of the state", 100.0, "%"
     ),
-    "needless steps": _PrintedFigure(
+    "needless steps": _PrintedStatistic(
         "steps with a gentler control than the best one of the state", 100.0, "%"
     ),
-    "steps beyond a health limit": _PrintedFigure("steps beyond a health limit", 100.0, "%"),
-    "changes of control": _PrintedFigure("changes of control in a flight"),
-    f"fallback within {WITHIN} ": _PrintedFigure(
+    "steps beyond a health limit": _PrintedStatistic("steps beyond a health limit", 100.0, "%"),
+    "changes of control": _PrintedStatistic("changes of control in a flight"),
+    f"fallback within {WITHIN} ": _PrintedStatistic(
         f"assets whose control changed within {WITHIN} steps of the damage that called for it",
         100.0,
         "%",
     ),
-    "early fallback": _PrintedFigure(
+    "early fallback": _PrintedStatistic(
         "assets whose control changed before the damage called for it", 100.0, "%"
     ),
-    "filtered rms error of ": _PrintedFigure("rms error of the estimated {of}"),
-    "bias of ": _PrintedFigure("mean error of the estimated {of}"),
-    "log evidence of a step": _PrintedFigure("log evidence of a step", unit="nat"),
-    "true state in the 90 % set": _PrintedFigure(
+    "filtered rms error of ": _PrintedStatistic("rms error of the estimated {of}"),
+    "bias of ": _PrintedStatistic("mean error of the estimated {of}"),
+    "log evidence of a step": _PrintedStatistic("log evidence of a step", unit="nat"),
+    "true state in the 90 % set": _PrintedStatistic(
         "steps in which the set of states with a probability of 90 % has the true one", 100.0, "%"
     ),
 }
-"""How figures are printed, by the beginning of their keys; others are counts of assets."""
+"""How statistics are printed, by the beginning of their keys; others are counts of assets."""
 COUNTS_OF_FLEETS = (
     "twins",
     "flown",
@@ -360,42 +360,45 @@ COUNTS_OF_FLEETS = (
 """Titles of the counts of assets, which are their keys."""
 
 
-def figure_rows(groups: Mapping[str, Mapping[str, Figure]]) -> list[list[str]]:
-    """Return the figures of groups as rows of a table: a title, and a cell for each group."""
+def statistic_rows(groups: Mapping[str, Mapping[str, Statistic]]) -> list[list[str]]:
+    """Return the statistics of groups as rows of a table: a title, and a cell for each group."""
     keys: list[str] = []
-    for figures in groups.values():
+    for statistics in groups.values():
         position = 0
-        for key in figures:
+        for key in statistics:
             if key not in keys:
-                keys.insert(position, key)  # after the figure that stands before it
+                keys.insert(position, key)  # after the statistic that stands before it
             position = keys.index(key) + 1
     rows = []
     for key in keys:
-        printed_figure = _PrintedFigure(key)
-        for beginning, description in PRINTED_FIGURES_OF_FLEETS.items():
+        printed_statistic = _PrintedStatistic(key)
+        for beginning, description in PRINTED_STATISTICS_OF_FLEETS.items():
             if key.startswith(beginning):
-                printed_figure = description._replace(
+                printed_statistic = description._replace(
                     title=description.title.format(of=key.removeprefix(beginning))
                 )
                 break
-        cells = [_figure_text(figures.get(key), printed_figure) for figures in groups.values()]
-        rows.append([printed_figure.title, *cells])
+        cells = [
+            _statistic_text(statistics.get(key), printed_statistic)
+            for statistics in groups.values()
+        ]
+        rows.append([printed_statistic.title, *cells])
     return rows
 
 
-def _figure_text(figure: Figure | None, printed_figure: _PrintedFigure) -> str:
-    """Return a figure with its standard error and unit as text; empty if there is none."""
-    if figure is None:
+def _statistic_text(statistic: Statistic | None, printed_statistic: _PrintedStatistic) -> str:
+    """Return a statistic with its standard error and unit as text; empty if there is none."""
+    if statistic is None:
         return ""
-    if isinstance(figure, int | str):
-        return str(figure)
-    scale = printed_figure.scale
-    unit = printed_figure.unit
-    if figure.unit:
-        scale, unit = printed_state(figure.unit, "percentage points")
-    value = scale * figure.value
-    error = scale * figure.error
-    if printed_figure.interval and np.isfinite(error):
+    if isinstance(statistic, int | str):
+        return str(statistic)
+    scale = printed_statistic.scale
+    unit = printed_statistic.unit
+    if statistic.unit:
+        scale, unit = printed_state(statistic.unit, "percentage points")
+    value = scale * statistic.value
+    error = scale * statistic.error
+    if printed_statistic.interval and np.isfinite(error):
         error = max(error, abs(value) * _LEAST_PRINTED_ERROR)
         low, high = value - NORMAL_95 * error, value + NORMAL_95 * error
         return f"{rounded(value, error)} ({between(low, high, error)})"

@@ -28,7 +28,7 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.feeds.feed_choice import file_feed
 from twin_master.fleet.checks import check_fleet, flies_model, source_of
-from twin_master.fleet.comparison import figure_rows, group_figures
+from twin_master.fleet.comparison import group_statistics, statistic_rows
 from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.learning.evidence import reason_transitions_are_fixed
@@ -94,9 +94,9 @@ class FleetOutcome:
     def _repr_html_(self) -> str:
         """Return how the twins of each group fared, for a notebook."""
         groups = open_groups(self.folder)
-        figures = {name: group_figures(group) for name, group in groups.items()}
+        statistics = {name: group_statistics(group) for name, group in groups.items()}
         title = f"Fleet of {self.twins} twins in {self.folder}"
-        return html_table(title, ("result", *figures), figure_rows(figures))
+        return html_table(title, ("result", *statistics), statistic_rows(statistics))
 
     def plot(self, axes: Axes | Sequence[Axes] | None = None) -> list[Axes]:
         """Draw the believed states of all twins over the steps, with the median of the truth.

@@ -30,7 +30,7 @@ from twin_master.errors import (
     RunFolderError,
 )
 from twin_master.fleet import flight
-from twin_master.fleet.comparison import earned_figures, group_figures
+from twin_master.fleet.comparison import earned_statistics, group_statistics
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.learning.learn import learn_fleet
 from twin_master.fleet.members import Member
@@ -96,10 +96,10 @@ def former_group(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> xr.Da
 def test_a_store_of_an_earlier_version_is_read_with_one_sentence(former_group, present_group):
     """It has no rewards."""
     assert former_group.equals(present_group.drop_nodes("earned"))
-    present_figures = group_figures(present_group)
-    former_figures = group_figures(former_group)
+    present_figures = group_statistics(present_group)
+    former_figures = group_statistics(former_group)
     assert former_figures == {key: present_figures[key] for key in former_figures}
-    assert set(present_figures) - set(former_figures) == set(earned_figures(present_group))
+    assert set(present_figures) - set(former_figures) == set(earned_statistics(present_group))
 
 
 def test_variables_of_a_store_of_an_earlier_version_have_their_present_attributes(
@@ -168,7 +168,7 @@ def test_a_variable_of_a_fleet_is_described_as_that_of_a_run(present_group, sing
 
 
 def test_figures_of_a_fleet_are_those_of_its_store(present_group):
-    figures = group_figures(present_group)
+    figures = group_statistics(present_group)
     outcomes = Outcomes.from_store(present_group)
     assert figures["log evidence of a step"] == outcomes.log_evidence
     assert figures["filtered rms error of z2"] == replace(outcomes.rms[1], unit="1")

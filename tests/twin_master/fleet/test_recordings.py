@@ -18,7 +18,7 @@ from tests.twin_master.fleet.recordings import (
     write_fleet,
 )
 from tests.twin_master.runs import journal
-from twin_master.fleet.comparison import group_figures
+from twin_master.fleet.comparison import group_statistics
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.page.report import write_fleet_report
 from twin_master.fleet.plan import load_fleet
@@ -104,7 +104,7 @@ def test_recordings_are_flown_as_a_fleet(flown_recordings):
 
 def test_figures_of_flown_recordings_count_alarms(flown_recordings):
     flown = flown_recordings
-    figures = group_figures(flown.group)
+    figures = group_statistics(flown.group)
     assert flown.group["notice/count"].values[1, NOTICES.index("gauge_left_out")] >= 1
     assert (figures["flown"], figures["raised an alarm"]) == (3, flown.alarmed)
     assert "early fallback" not in figures

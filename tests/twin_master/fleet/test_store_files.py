@@ -13,7 +13,7 @@ from reporting.files import TEMPORARY_SUFFIX
 from tests.twin_master.runs import written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
-from twin_master.fleet.comparison import group_figures
+from twin_master.fleet.comparison import group_statistics
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learning.learn import learn_fleet
@@ -231,7 +231,7 @@ def test_files_of_a_store_elsewhere_are_those_of_a_store_in_the_folder(far, whol
 
 
 def test_report_figures_and_lessons_are_made_of_a_store_elsewhere(far, whole):
-    figures, expected = (group_figures(open_groups(folder)["growing_damage"]) for folder in (far, whole))
+    figures, expected = (group_statistics(open_groups(folder)["growing_damage"]) for folder in (far, whole))
     lessons, expected_lessons = (learn_fleet(folder)["groups"] for folder in (far, whole))
     assert figures == expected
     assert lessons == expected_lessons

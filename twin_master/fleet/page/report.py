@@ -18,7 +18,7 @@ from reporting.json_file import JsonObject, JsonRecord
 from reporting.page import Page, PageColumn, Words, number_column
 from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError
-from twin_master.fleet.comparison import figure_rows, group_figures, returns_of_group
+from twin_master.fleet.comparison import group_statistics, returns_of_group, statistic_rows
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of
 from twin_master.fleet.learning.lessons import LESSONS_NAME, lesson_rows
@@ -135,9 +135,12 @@ def _add_flown_fleet(
     returns = {name: returns_of_group(group) for name, group in groups.items()}
     if any(len(values) for values in returns.values()):
         page.add_report_figure(WORDS.figure("returns", returns_figure(returns)))
-    figures = {name: group_figures(group) for name, group in groups.items()}
+    statistics = {name: group_statistics(group) for name, group in groups.items()}
     WORDS.add_table(
-        page, "fared", figure_rows(figures), more=[number_column(group) for group in figures]
+        page,
+        "fared",
+        statistic_rows(statistics),
+        more=[number_column(group) for group in statistics],
     )
     _add_lessons(page, folder)
 
