@@ -178,16 +178,28 @@ def _width_of_names(columns: Sequence[Sequence[str]], width: int) -> int | None:
     """Return the width of the first column of a table; None if it is narrowed like the others.
 
     Its names stay on one line if the longest takes at most half of the terminal. Otherwise they
-    get two fifths of it, if the words of the other columns stay whole in the rest.
+    get what the other columns leave, or two fifths of the terminal if that is more and the words of
+    the other columns stay whole in the rest.
     """
     names, *other_columns = columns
-    longest_name = max(len(line) for name in names for line in name.split("\n"))
+    longest_name = _longest(names)
     if longest_name <= width // 2:
         return longest_name
-    words = [[len(word) for cell in column for word in cell.split()] for column in other_columns]
-    needed = sum(1 + max(lengths, default=0) for lengths in words)
-    width_of_names = 2 * width // 5
-    return width_of_names if needed <= width - width_of_names else None
+    inner_width = width - 2  # without the edges of the table
+    room_beside_lines = inner_width - sum(2 + _longest(column) for column in other_columns)
+    two_fifths = 2 * width // 5
+    if room_beside_lines >= two_fifths:
+        return min(longest_name, room_beside_lines)
+    words = [[word for cell in column for word in cell.split()] for column in other_columns]
+    room_beside_words = inner_width - sum(
+        2 + _longest(words_of_column) for words_of_column in words
+    )
+    return two_fifths if room_beside_words >= two_fifths else None
+
+
+def _longest(texts: Iterable[str]) -> int:
+    """Return the number of characters of the longest line of some texts."""
+    return max((len(line) for text in texts for line in text.split("\n")), default=0)
 
 
 def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:
