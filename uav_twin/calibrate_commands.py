@@ -54,7 +54,7 @@ def calibrate_campaign(
     json: JsonOption = False,
     no_report: NoReportOption = False,
 ) -> None:
-    """Posterior of the parameters of any model, an FMU or a structure too, from a campaign.
+    """Estimate the parameters of any model, an FMU or a structure too, from a campaign.
 
     Example: `uav-twin calibrate campaign measured --model single_mass_rig --out calibrated`
     """
@@ -266,7 +266,7 @@ def calibrate_ringdown(
         ),
     ] = None,
 ) -> None:
-    """Natural frequencies and damping ratios of two modes from ring-down records.
+    """Estimate natural frequencies and damping ratios of two modes from ring-downs.
 
     Example: `uav-twin calibrate ringdown --data laboratory/step3 --out ringdown`
     """

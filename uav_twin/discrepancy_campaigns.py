@@ -35,7 +35,7 @@ def effects(
     ] = None,
     add: EffectFilesOption = None,
 ) -> None:
-    """List the effects that can be named.
+    """List the effects that a verdict can name.
 
     Example: `uav-twin discrepancy effects --show coulomb_friction`
     """

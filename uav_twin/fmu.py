@@ -54,7 +54,7 @@ def bind(
     step_size: StepSizeOption = None,
     replace: ReplaceOption = False,
 ) -> None:
-    """Draft a binding for an FMU: which variable is which role, in which unit.
+    """Draft a binding for an FMU: the role and the unit of each variable.
 
     Example: `uav-twin fmu bind pump.fmu --out pump.toml`
     """
@@ -111,7 +111,7 @@ def check(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check an FMU in every way we know; exit code 1 if anything is wrong with it.
+    """Check the file, units and behaviour of an FMU; exit code 1 if a problem is found.
 
     Example: `uav-twin fmu check pump.fmu --binding pump.toml`
     """
@@ -312,7 +312,7 @@ def info(
     ] = True,
     json: JsonOption = False,
 ) -> None:
-    """Say what an FMU is: version, capabilities, variables with units and ranges.
+    """Print version, capabilities and variables of an FMU, with units and ranges.
 
     Example: `uav-twin fmu info pump.fmu --no-variables`
     """
@@ -403,10 +403,10 @@ def export(
     ] = None,
     replace: ReplaceOption = False,
 ) -> None:
-    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs.
+    """Write the system of a scenario, or the wing of a design, as an SSP 1.0 file.
 
     Example: `uav-twin ssp export level_turns --out level_turns.ssp`
-    """  # noqa: E501
+    """
     from fmu_asset.packing.contents import checked_target
     from twin_master.assets.system_export import export_design, export_scenario
     from twin_master.scenario.reading import load_scenario
@@ -457,10 +457,10 @@ def _table_of_file(path: str) -> Mapping[str, object]:
 
 
 def check_system(file: SspArgument, *, json: JsonOption = False) -> None:
-    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong.
+    """Check archive, schemas, FMUs and connections of an SSP file; exit code 1 for a problem.
 
     Example: `uav-twin ssp check level_turns.ssp`
-    """  # noqa: E501
+    """
     from fmu_asset.ssp.check import check_ssp
 
     result = check_ssp(file)

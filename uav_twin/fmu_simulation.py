@@ -83,7 +83,7 @@ def simulate(
     step_timeout: StepTimeoutOption = None,
     replace: ReplaceOption = False,
 ) -> None:
-    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories.
+    """Simulate the default experiment of an FMU, or input histories by --binding and --inputs.
 
     Example: `uav-twin fmu simulate pump.fmu --stop-time 10 --set speed=120 --out pump.csv`
     """
@@ -225,10 +225,10 @@ def simulate_system(
     in_process: InProcessOption = False,
     replace: ReplaceOption = False,
 ) -> None:
-    """Simulate the system of an SSP file from its start; all outputs of the system and its components.
+    """Simulate the system of an SSP file, and record all outputs of it and its components.
 
     Example: `uav-twin ssp simulate level_turns.ssp --stop-time 10 --out history.csv`
-    """  # noqa: E501
+    """
     from fmu_asset.client.experiment import default_experiment, run_experiment
     from fmu_asset.coupling.asset import CoupledAsset
     from fmu_asset.coupling.system import system_description
@@ -461,10 +461,10 @@ def sample(
     ] = False,
     replace: ReplaceOption = False,
 ) -> None:
-    """Ask an FMU for its observation at every draw, state and control; write an observation library.
+    """Sample an FMU at every draw, state and control, and write an observation library.
 
     Example: `uav-twin library sample pump_wear --out pump_wear.nc`
-    """  # noqa: E501
+    """
     from twin_master.assets.resolution import Overrides
     from twin_master.library.grid import grid_of_fmu, grid_of_scenario
     from twin_master.library.sampling import blocks_folder, sample_library

@@ -136,7 +136,7 @@ def verify(
     memory_limit: MemoryLimitOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Solve the loads and the modes by CalculiX on the same mesh, and compare.
+    """Compare loads and modes with those of CalculiX on the same mesh.
 
     Example: `uav-twin structure verify bracket --out calculix`
     """
@@ -257,7 +257,7 @@ def reduce(
     memory_limit: MemoryLimitOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Make the reduced model of a structure, keep it in the cache, and measure its errors.
+    """Reduce the model of a structure, store it in the cache, and measure its errors.
 
     Example: `uav-twin structure reduce bracket --states 10`
     """

@@ -76,7 +76,7 @@ def from_deck(
     ] = 1e-5,
     json: JsonOption = False,
 ) -> None:
-    """Make a structure of a deck by running CalculiX, and compare it with CalculiX' own results.
+    """Convert a CalculiX deck to a structure, and compare it with CalculiX' own results.
 
     Example: `uav-twin structure from-deck wing_box.inp --region SKIN --output TIP`
     """

@@ -33,13 +33,13 @@ def suspects(
     ] = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Say which faults the gauges of a structure file would tell apart, before anything is measured.
+    """Print which faults the planned gauges of a structure could tell apart.
 
-    Compared are yielding supports, masses, losses of stiffness, loads beside their places or
-    turned, turned gauges and wrong gains, under static loads alone, and with releases, too.
+    The faults are yielding supports, masses, losses of stiffness, displaced or turned loads, turned
+    gauges and wrong gains, first under static loads alone and then with releases, too.
 
     Example: `uav-twin structure suspects arm.toml --strain-noise 2`
-    """  # noqa: E501
+    """
     from discrepancy.campaign.records import Quantity
     from discrepancy.catalogue.library import library
     from discrepancy.planned_measurement import Precision, plans_of

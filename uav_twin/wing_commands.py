@@ -36,7 +36,7 @@ def wing(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what the wing weighs, how it vibrates and how stiff its tip is.
+    """Print the mass, the modes and the tip stiffness of the wing.
 
     Example: `uav-twin wing --vtu wing.vtu`
     """
