@@ -90,8 +90,8 @@ class MeasuredLength:
     def posterior(self) -> GaussianPrior:
         """Prior times the Gaussian likelihood of the measurement [m].
 
-        The precisions add, and the mean is weighted by them: 1/s² = 1/s_0² + 1/s_r²,
-        m = s² (designed / s_0² + measured / s_r²).
+        The precisions add, and the mean is weighted by them: 1/s² = 1/s_0² + 1/s_r², m = s²
+        (designed / s_0² + measured / s_r²).
         """
         prior_precision = self.prior.deviation**-2
         reading_precision = self.reading.deviation**-2

@@ -69,8 +69,7 @@ def compiled(
 
     The machine code is kept in the folder `NUMBA_CACHE_DIR`, else beside the function's file, else
     in the cache folder, under a hash of the sources. If none is writable, the function is compiled
-    anew
-    in every process.
+    anew in every process.
 
     Parameters
     ----------
@@ -271,8 +270,7 @@ def _choose_when_compiled(
     """Let compiled functions call `choice(number, ...)`, which calls `functions[number]`.
 
     The choice is generated as source text with one line for each number: a chain of functions would
-    be
-    compiled link by link.
+    be compiled link by link.
     """
     namespace: dict[str, object] = {}
     for number, function in enumerate(functions):

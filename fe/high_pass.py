@@ -164,8 +164,7 @@ def _confluent(order: float, second: int, u: FloatArray) -> FloatArray:
     """Return the confluent hypergeometric function 1F1(order; second; -u) for u (N,) >= 0.
 
     For large u its asymptotic series is used, Abramowitz and Stegun 1964, 13.5.1: SciPy's function
-    is
-    infinite from about u = 1418 on.
+    is infinite from about u = 1418 on.
     """
     exact = hyp1f1(order, second, -np.minimum(u, _ASYMPTOTIC_FROM))
     large_u = np.maximum(u, _ASYMPTOTIC_FROM)

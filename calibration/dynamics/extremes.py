@@ -1,9 +1,8 @@
 """Fit two modes to the extremes of a record that was read off a plot.
 
 In a column of pixels, the middle of the ink is not quite the average of the signal, while its
-lowest
-and highest points are the extremes of the signal within the column, except for the width of the
-line. A fit to these two retains more of a fast mode that dies away within a few columns.
+lowest and highest points are the extremes of the signal within the column, except for the width of
+the line. A fit to these two retains more of a fast mode that dies away within a few columns.
 """
 
 import math
@@ -76,10 +75,8 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
     """Fit one trial to the extremes of its record, starting from its previous fit.
 
     In each column of pixels the record has the lowest and the highest ink. The model signal is
-    evaluated
-    at several times in a column; its extremes, extended by half the thickness of the line, are
-    fitted to
-    the ink.
+    evaluated at several times in a column; its extremes, extended by half the thickness of the
+    line, are fitted to the ink.
     """
     record = fit.record
     if record.lowest is None or record.highest is None:

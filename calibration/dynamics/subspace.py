@@ -64,8 +64,7 @@ class IdentifiedPoles(NamedTuple):
         """Return the modal values (1 + A,) of a pole.
 
         They are the natural frequency [Hz], the damping ratio [1], and the real part of the shape
-        at the
-        accelerometers after the first, divided by that at the first [1].
+        at the accelerometers after the first, divided by that at the first [1].
         """
         # s = -zeta omega +- i omega sqrt(1 - zeta^2) with |s| = omega
         s = self.pole[number]
@@ -141,8 +140,7 @@ class Subspace:
         """Return the modal form of the system with some correlations.
 
         The basis (L C, n) projects the Hankel matrix on n states: their product is the
-        observability
-        matrix.
+        observability matrix.
         """
         channels = correlation.shape[1]
         observability = _hankel(correlation) @ basis

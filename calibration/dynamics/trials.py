@@ -197,8 +197,7 @@ def _prominent_peaks(record: RingDownRecord, decay: float) -> list[float]:
 
     The record is multiplied by exp(-decay t). A second mode that has died away after a tenth of the
     record is lost in the noise of the rest and in the skirts of the first; the factor reduces both
-    and
-    moves no frequency.
+    and moves no frequency.
     """
     time_from_start = record.time - record.time[0]
     decay_factor = np.exp(-decay * time_from_start)

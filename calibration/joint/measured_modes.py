@@ -174,10 +174,8 @@ def _term_of_slope(logarithm: Float, value: Float) -> float:
     """Return the systematic change of a modal value with the amplitude.
 
     A line is fitted to the values (N,) over the centred logarithm (N,) of the amplitude. The result
-    is
-    the change of the line over one standard deviation of the logarithm, reduced by its standard
-    error
-    (see `_beyond_chance`).
+    is the change of the line over one standard deviation of the logarithm, reduced by its standard
+    error (see `_beyond_chance`).
     """
     deviation = float(logarithm.std())
     slope = float(logarithm @ value / (logarithm @ logarithm))

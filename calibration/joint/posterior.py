@@ -182,8 +182,7 @@ class _WhitenedPosterior:
         """Draw `size` points from Student's t, and weight them by the posterior.
 
         `mean` (P,) and `covariance` (P, P) are the mean and the shape matrix of the proposal, in
-        whitened
-        coordinates.
+        whitened coordinates.
         """
         proposal = multivariate_t(mean, covariance, _DEGREES_OF_FREEDOM)
         points = proposal.rvs(size, generator).reshape(size, -1)

@@ -121,8 +121,7 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
     """Check that a new calibration may be written to a folder, before its work begins.
 
     A file that is not a calibration may be replaced. `wing` says whether the new calibration is
-    that of
-    a wing from its laboratory.
+    that of a wing from its laboratory.
 
     Raises
     ------
@@ -249,8 +248,7 @@ def tailoring(calibration: Calibration) -> Tailoring:
 
     The FMU starts at the posterior means of e, masses and damping. Its description contains the
     name of the wing and the standard deviations. Its file `RESOURCE_NAME` contains all quantities
-    with
-    intervals and correlations. Equal calibrations give equal bytes.
+    with intervals and correlations. Equal calibrations give equal bytes.
     """
     record_text = json.dumps(
         plain_record(calibration), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False

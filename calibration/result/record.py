@@ -344,8 +344,7 @@ class Calibration:
 
         Each difference is divided by the half-width of the 95 % interval of the reading, as in the
         error reward of Kapteyn et al. 2021. With `prior`, the model has the prior means instead of
-        the
-        posterior means.
+        the posterior means.
         """
         errors = []
         for reading in self.readings:
@@ -374,8 +373,7 @@ class Calibration:
         """Return the conditional means of all other parameters, given values of one quantity.
 
         They follow by linear regression on the samples, which is exact for a Gaussian posterior,
-        and are
-        limited to the range of the samples.
+        and are limited to the range of the samples.
 
         Parameters
         ----------

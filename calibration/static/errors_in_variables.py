@@ -218,8 +218,7 @@ def _first_grid_limits(
     """Return a wide range of e that contains the prior and the estimate of each pair.
 
     A pair estimates the stiffness by load over displacement, within six standard deviations. The
-    lower
-    limit keeps the stiffness k(e) positive.
+    lower limit keeps the stiffness k(e) positive.
     """
     stiffness = data.load / data.displacement
     relative_deviation = (

@@ -119,8 +119,7 @@ class ScalarPosterior:
         """Return samples (count,), one from each of `count` strata of equal probability, shuffled.
 
         Their mean has far less variance than that of independent draws. Equal seeds give equal
-        samples, bit
-        for bit.
+        samples, bit for bit.
         """
         generator = np.random.default_rng(child_seed(seed, 0))
         return self.quantile(stratified(generator, count))

@@ -281,8 +281,7 @@ class CellMesh:
         ----------
         row : (p,) array of int
             The row of the result to which each of p strains is added; all rows from 0 to the
-            largest
-            one occur.
+            largest one occur.
         weight : (p,) array
             The weight of each strain in the sum.
         cells : (p,) array of int

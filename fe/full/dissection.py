@@ -51,8 +51,7 @@ def best_cuts(part: IntArray, weight: FloatArray, edges: IntArray) -> Cuts:
     """Find for each part of a graph the cheapest cut into two halves.
 
     A part is cut at a value of one coordinate of its vertices. The values that are tried leave
-    fixed
-    fractions of its weight on either side.
+    fixed fractions of its weight on either side.
 
     Parameters
     ----------
@@ -103,9 +102,8 @@ def _cut_costs(
     """Return the cost (parts,) of a cut of each part, infinite if its halves are too uneven.
 
     The cost is the weight of the separator, increased if the halves are uneven. `on_cut` and
-    `is_above`
-    (n,) say whether a vertex is on the cut, and on which side of it; `total` is the weight of each
-    part.
+    `is_above` (n,) say whether a vertex is on the cut, and on which side of it; `total` is the
+    weight of each part.
     """
     in_upper_half = is_above & ~on_cut
     separator_weight = np.bincount(part, weights=weight * on_cut)

@@ -263,8 +263,7 @@ def _assembled_pivot_rows(
     """Return the rows (p, p + b) of a front's pivots, from the diagonal to the right.
 
     The rows of the matrix (n, n) are in the order of elimination; `columns` (nnz,) are the
-    positions of
-    its columns, and `row_in_front` (n,) the indices of positions in the front.
+    positions of its columns, and `row_in_front` (n,) the indices of positions in the front.
     """
     pivots = front.end - front.start
     pivot_rows = np.zeros((pivots, pivots + len(front.boundary)))

@@ -82,10 +82,8 @@ def _groups_of_equal_rows(matrix: sparse.csr_array) -> tuple[IntArray, IntArray]
     """Group the unknowns that are coupled to the same unknowns.
 
     Returns the first unknown of each group, and the group (n,) of each unknown. Rows are compared
-    by the
-    sum of random 64-bit keys of their columns. If two different rows ever had the same sum, the
-    order
-    of elimination would still be valid, only less efficient.
+    by the sum of random 64-bit keys of their columns. If two different rows ever had the same sum,
+    the order of elimination would still be valid, only less efficient.
     """
     random_numbers = np.random.default_rng(1973)
     column_keys = random_numbers.integers(2**63, size=matrix.shape[0], dtype=np.int64)

@@ -258,9 +258,8 @@ class StaticReduction:
 
         A residual of the reduced model is the load minus the stiffness times the displacement. All
         residuals lie in the span of the loads and of the images of the basis under the stiffness
-        terms;
-        the factors are coordinates in an orthonormal basis of this span. The reduced model uses the
-        combinations `directions` (N, K) of the basis vectors.
+        terms; the factors are coordinates in an orthonormal basis of this span. The reduced model
+        uses the combinations `directions` (N, K) of the basis vectors.
         """
         # Images of the K basis vectors under each term of the stiffness
         images = self.residual_stiffness @ directions

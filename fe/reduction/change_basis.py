@@ -382,8 +382,7 @@ class _Columns:
         """Return the case of a support that yields.
 
         `number` counts the support motions; `gain` is the largest relative gain of compliance under
-        a load
-        or in a mode.
+        a load or in a mode.
         """
         motion = self.structure.support_motions[number]
         reference = self.held_terms.reference
@@ -454,8 +453,8 @@ class _Columns:
         """Return the largest relative error of a model under one change, at both ends of its range.
 
         Static outputs are compared with those of the full model, at the midpoints of all input
-        ranges. The
-        error of a frequency is its change by one step of inverse iteration with the full model.
+        ranges. The error of a frequency is its change by one step of inverse iteration with the
+        full model.
         """
         return max(
             case_error(case, model, self.terms, self.held_terms, self._shapes(case.structure))

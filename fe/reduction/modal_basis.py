@@ -154,10 +154,8 @@ def _davidson_corrections(
     The M modes of each state are computed in the working basis. A mode phi computed in this way has
     the residual r = (K - omega^2 M) phi. Davidson's method adds X^-1 r to the basis, where X
     approximates K; here X is the stiffness of a reference state, which is factorised once. The
-    vectors
-    are returned in whitened coordinates, as X^-1/2 r, in which their Euclidean norm is the energy
-    norm
-    of X^-1 r.
+    vectors are returned in whitened coordinates, as X^-1/2 r, in which their Euclidean norm is the
+    energy norm of X^-1 r.
 
     Returns
     -------

@@ -269,8 +269,7 @@ def changeable_model(file: Path | str, progress: Progress | None = None) -> Chan
 
     It has a force and a displacement at each port of the file, see
     `AffineStructure.with_port_forces`, and the columns for changes of the structure. Its
-    `design_hash`
-    is that of the model without ports.
+    `design_hash` is that of the model without ports.
 
     Raises
     ------

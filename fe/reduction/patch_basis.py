@@ -276,8 +276,7 @@ def _kept_directions(arrays: PatchArrays) -> FloatArray:
     """Return the directions (N, n) of the working basis that are kept.
 
     They are found by proper orthogonal decomposition: the eigenvectors with the largest eigenvalues
-    of
-    the weighted sum of the outer products of all snapshots, in random patched states.
+    of the weighted sum of the outer products of all snapshots, in random patched states.
     """
     wing = PatchedWing(arrays)
     loads = _weighted_loads(wing)

@@ -234,14 +234,11 @@ class ReductionTerms:
         """Return the anchors: groups of states in which dual solutions are computed.
 
         The error bound of an output needs the output's dual solution. In any state it is
-        approximated by a
-        combination of the dual solutions in the states of one anchor.
+        approximated by a combination of the dual solutions in the states of one anchor.
 
         With few regions, the range of each loss is halved. Each of the 2^K combinations of halves
-        has an
-        anchor of one state, in the middle of these halves. With many regions there is a single
-        anchor,
-        whose states are the corners of the box of all parameters and losses.
+        has an anchor of one state, in the middle of these halves. With many regions there is a
+        single anchor, whose states are the corners of the box of all parameters and losses.
 
         Returns
         -------
@@ -331,8 +328,7 @@ class ReductionTerms:
 
         In whitened coordinates, an output l responds to a load f by l . f, which is at most |l| |f|
         (Cauchy and Schwarz). A load to which no output of a group responds is compared with the
-        responses
-        to all loads, see `UNSEEN_FRACTION`.
+        responses to all loads, see `UNSEEN_FRACTION`.
 
         Parameters
         ----------

@@ -115,11 +115,9 @@ class StoredArrays:
 
     A subclass declares the fields. An array is declared with the lengths of its axes,
     `Annotated[FloatArray, "loads", 2]`. A number is the length itself; a name stands for one length
-    in
-    all arrays of the record, given by `_axis_lengths` or else by the first array with that axis. A
-    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple
-    holds
-    names.
+    in all arrays of the record, given by `_axis_lengths` or else by the first array with that axis.
+    A number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple
+    holds names.
 
     Class attributes
     ----------------

@@ -20,8 +20,8 @@ def lowest_modes(
     """Compute the lowest undamped modes of dense matrices.
 
     The problem is solved as M x = K x / omega^2. In a basis of modes the stiffness is well
-    conditioned
-    and the mass is not; the low modes then belong to the largest eigenvalues, which are accurate.
+    conditioned and the mass is not; the low modes then belong to the largest eigenvalues, which are
+    accurate.
 
     Parameters
     ----------

@@ -204,8 +204,7 @@ class ModalSystem:
         -------
         q, v : (N, M) array
             The motion; None close to critical damping, where such a sum is inaccurate and time
-            steps
-            are needed.
+            steps are needed.
         """
         if self._free_modes is None:
             return None

@@ -63,8 +63,7 @@ def static_solution(
     """Compute the forces of laws in static equilibrium at successive load levels.
 
     The displacement of the structure is then that of the linear structure under the loads minus
-    that
-    under these forces.
+    that under these forces.
 
     Parameters
     ----------
@@ -141,10 +140,8 @@ def integrate_motion(
     """Integrate the motion of a system with laws over prepared time steps.
 
     Where a law begins or ends to act, a new section of the motion begins. The modes keep their
-    state,
-    and so do laws that continue to act. A law that begins to act is loaded from zero to the
-    position of
-    its port. A sample at the boundary of two sections belongs to the later one.
+    state, and so do laws that continue to act. A law that begins to act is loaded from zero to the
+    position of its port. A sample at the boundary of two sections belongs to the later one.
 
     Parameters
     ----------

@@ -230,8 +230,7 @@ def update_position_laws(
     """Solve the positions of ports at boundary `k`, and give the second half of impulses there.
 
     This concerns laws of position, and laws of speed at ports with residual flexibility. The state
-    is
-    changed in place.
+    is changed in place.
 
     Parameters
     ----------

@@ -296,10 +296,8 @@ class ModelPatch:
         """Return the part of the patch that acts in the trial with a name.
 
         A primitive keeps only its windows in this trial, and is left out if it has windows in other
-        trials
-        only. It is returned without windows, as it acts always, if it has none or if one of them
-        spans the
-        whole trial.
+        trials only. It is returned without windows, as it acts always, if it has none or if one of
+        them spans the whole trial.
         """
         if not self.has_windows:
             return self
@@ -414,8 +412,7 @@ def _checked_values(
     """Convert the values of a row to their types.
 
     Raises `InvalidPatchError` if a value is missing, superfluous or of another type; the message
-    begins
-    with `where`.
+    begins with `where`.
     """
     checked: dict[str, Any] = {}
     for name, value in row.items():

@@ -195,8 +195,7 @@ class PatchedWing(WingRows):
         """Return the fraction of its stiffness that each damage region keeps.
 
         Losses of the state and of the patch multiply. Raises `InvalidPatchError` if the wing does
-        not have
-        a region of the patch.
+        not have a region of the patch.
         """
         regions = self.arrays.regions
         remaining = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]

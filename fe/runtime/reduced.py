@@ -30,10 +30,8 @@ class ReducedStructure:
     """A reduced structure with fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
 
     The first Nm coordinates belong to the modal basis, the others to the static basis. The
-    structure
-    moves in the modal basis; the static basis represents displacements that the modes leave out,
-    and
-    is solved on its own.
+    structure moves in the modal basis; the static basis represents displacements that the modes
+    leave out, and is solved on its own.
 
     Parameters
     ----------
@@ -208,9 +206,8 @@ class ReducedModel(ReducedArrays):
         """Return the columns (2, k) of the two factors of each of k terms, see `_products`.
 
         `factors` (k, 2) count names of two kinds from one, and are zero for none; `first` and
-        `second` are
-        the numbers of columns before those of each kind. A factor of zero gets column 0, which is
-        one.
+        `second` are the numbers of columns before those of each kind. A factor of zero gets column
+        0, which is one.
         """
         return np.where(factors > 0, factors + np.array((first, second)), 0).T
 
@@ -381,8 +378,7 @@ class ReducedModel(ReducedArrays):
         """Return the lowest undamped modes, Kapteyn et al. 2021, eq. (16).
 
         Each tracked shape, such as the first flapwise bending, is assigned to the mode with the
-        largest
-        modal assurance criterion.
+        largest modal assurance criterion.
 
         Parameters
         ----------

@@ -286,10 +286,8 @@ class SensorLag(Sensor):
         """Delay readings (N, C) and their rates by `lag`.
 
         Outside the record, the readings are extrapolated linearly. Before the first sample the rate
-        is zero
-        if the structure was at rest at the beginning (`record.settled`), else the rate at the first
-        sample;
-        after the last sample it is the rate at the last one.
+        is zero if the structure was at rest at the beginning (`record.settled`), else the rate at
+        the first sample; after the last sample it is the rate at the last one.
         """
         # only forced and driven trials have a recorded input that a reading can lag behind; a
         # single sample has no interval to interpolate in

@@ -175,8 +175,7 @@ def _rotate_gauges(
     """Turn strain gauges in the plane of the skin; readings and rates (N, C) change in place.
 
     The strain in a direction at the angle a is eps cos^2 a + eps_t sin^2 a + gamma sin a cos a. If
-    the
-    transverse or shear strains are missing, `InvalidPatchError` is raised.
+    the transverse or shear strains are missing, `InvalidPatchError` is raised.
     """
     angles = np.zeros(len(record.channels))
     for sensor in sensors:

@@ -42,9 +42,8 @@ def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin 
 
     Overlapping losses multiply: (1 - loss_1) (1 - loss_2). Pieces of a strip bend in series, so
     that the strip keeps the weighted harmonic mean of their fractions. The weight is the square of
-    the
-    distance from the tip: the moment of a tip force is proportional to the distance, and so is the
-    displacement of the tip by a curvature.
+    the distance from the tip: the moment of a tip force is proportional to the distance, and so is
+    the displacement of the tip by a curvature.
 
     Parameters
     ----------

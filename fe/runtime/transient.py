@@ -147,8 +147,7 @@ class ModalIntegrator:
         """Return the forces (J,) of the laws at rest, and their new memory (J, 5 + E).
 
         `linear_positions` and `start` (J,) are the positions of the ports without internal forces,
-        now and
-        before; `compliance` (J, J) are the positions under unit forces.
+        now and before; `compliance` (J, J) are the positions under unit forces.
         """
         from .motion import static_solution
 
@@ -254,8 +253,7 @@ class ModalIntegrator:
         """Return the state after a time step under constant loads.
 
         Without laws the step is exact for the kept modes. If the loads differ from those of the
-        state, they
-        jump at the beginning of the step.
+        state, they jump at the beginning of the step.
 
         Parameters
         ----------
@@ -352,8 +350,7 @@ class ModalIntegrator:
         """Return gauges [1], displacements [m] and accelerations [m/s^2] (O + A,) in a state.
 
         Accelerations are those of the kept modes, because the others have no inertia. A state
-        without
-        motion has no accelerations: the result is (O,).
+        without motion has no accelerations: the result is (O,).
         """
         if not state.moves:
             return np.asarray(self.structure.output_rows @ self.displacement(state))
@@ -385,12 +382,9 @@ class ModalIntegrator:
         """Project a state of another integrator on the modes of this one, after a change of health.
 
         Displacement and velocity of the structure stay what they were: they are projected on the
-        new modes
-        with the new mass matrix, exactly in reduced coordinates. What the new modes cannot
-        represent
-        follows the load without delay, as always. The memory of laws is kept if their kinds and
-        ports are
-        the same; other laws start unloaded.
+        new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
+        cannot represent follows the load without delay, as always. The memory of laws is kept if
+        their kinds and ports are the same; other laws start unloaded.
 
         Parameters
         ----------

@@ -89,10 +89,9 @@ class WingRows:
         """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
 
         The stations are the ends and the middles of the cells along the span; a value is
-        interpolated by a
-        parabola in each cell. Beyond the tip, up to `OVERHANG` of the span, it is extrapolated
-        linearly, as
-        on a rigid arm. Raises `InvalidPatchError` if `y` lies off the wing.
+        interpolated by a parabola in each cell. Beyond the tip, up to `OVERHANG` of the span, it is
+        extrapolated linearly, as on a rigid arm. Raises `InvalidPatchError` if `y` lies off the
+        wing.
         """
         stations = self.arrays.stations
         if not 0.0 <= y <= (1.0 + OVERHANG) * self.span:

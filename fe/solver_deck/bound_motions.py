@@ -129,11 +129,10 @@ def _mean_rotation(
 ) -> WeightedRows | None:
     """Return the weights of the mean rotation of a node's section, up to their common sign.
 
-    With the weights c and the eliminated row e, the motion of e is (rotation - sum of the other
-    c_i u_i) / c_e. The row of the rotation in the new stiffness is therefore K_ee / c_e^2 on the
+    With the weights c and the eliminated row e, the motion of e is (rotation - sum of the other c_i
+    u_i) / c_e. The row of the rotation in the new stiffness is therefore K_ee / c_e^2 on the
     diagonal, and (K_ei - K_ee c_i / c_e) / c_e beside it, which is solved for c. The result is None
-    if
-    the moment makes no new unknown.
+    if the moment makes no new unknown.
     """
     node, direction = dof
     loaded = jobs.matrices("moment", blocks, step_lines=("*CLOAD", f"{node},{direction},1."))
@@ -190,8 +189,7 @@ def _with_signs(
     """Return the weights with the sign with which CalculiX moves the nodes under a moment.
 
     Torsion of a straight beam moves no node of the deck. The sign then follows from the positions
-    of
-    the expanded nodes in the section, which the rotations about the two other axes show.
+    of the expanded nodes in the section, which the rotations about the two other axes show.
     """
     if not rotations:
         return {}

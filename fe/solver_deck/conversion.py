@@ -355,10 +355,8 @@ def _gravity_forces(
     """Return the nodal forces (n,) of each load that has an acceleration.
 
     The rows of held nodes are missing in the mass matrix, but their mass also loads the adjacent
-    nodes.
-    For this reason the mass matrix of the structure without supports is multiplied by the
-    acceleration,
-    and the rows of both are matched by name.
+    nodes. For this reason the mass matrix of the structure without supports is multiplied by the
+    acceleration, and the rows of both are matched by name.
     """
     accelerations = {
         load.name: load.acceleration for load in loads if load.acceleration is not None

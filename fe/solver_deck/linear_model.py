@@ -298,12 +298,12 @@ def _unloaded_blocks(
 
 
 def _preload_steps(steps: list[list[KeywordBlock]]) -> list[list[KeywordBlock]]:
-    """Return the static steps before the first with PERTURBATION."""
+    """Return the static steps before the first with PERTURBATION, without their output."""
     for number, step in enumerate(steps):
         if "PERTURBATION" in step[0].parameters:
             earlier = steps[:number]
             static = [step for step in earlier if any(b.keyword == "STATIC" for b in step)]
-            return [_without_output(step) for step in static]
+            return [[block for block in step if block.keyword not in _OUTPUT] for step in static]
     return []
 
 
@@ -315,11 +315,6 @@ def _steps_after(
         return steps
     first = next(n for n, step in enumerate(steps) if "PERTURBATION" in step[0].parameters)
     return steps[first:]
-
-
-def _without_output(step: list[KeywordBlock]) -> list[KeywordBlock]:
-    """Return the blocks of a step without those that print results."""
-    return [block for block in step if block.keyword not in _OUTPUT]
 
 
 def _refuse_other_models(path: Path, blocks: list[KeywordBlock]) -> None:

@@ -175,9 +175,8 @@ def _nodal_forces(
     """Yield the nodes of a face with the force (3,) that the pressure exerts on each.
 
     A shell is treated as the first face of a solid, whose other nodes do not matter. Pressure on
-    the
-    bottom acts along the normal of the shell. Pressure on a solid acts against the outward normal,
-    which for the first face is the same direction.
+    the bottom acts along the normal of the shell. Pressure on a solid acts against the outward
+    normal, which for the first face is the same direction.
     """
     kind = loaded.kind
     face = loaded.face

@@ -216,8 +216,7 @@ def _coordinate_system(block: KeywordBlock) -> CoordinateSystem:
     """Return the coordinate system that a *SYSTEM defines for the nodes below it.
 
     It gives the origin, a point on x, and a point in the plane of x and y. Without the last point,
-    z
-    stays and x is turned about it; with the origin alone, the axes stay.
+    z stays and x is turned about it; with the origin alone, the axes stay.
     """
     numbers: list[float] = []
     for where, values in block.data:

@@ -219,8 +219,7 @@ class AffineStructure:
         """Return the value of a load's control with which the load is examined alone.
 
         This is the nominal value. It is one where the nominal value is zero, since there would be
-        no
-        load, and for a constant load.
+        no load, and for a constant load.
         """
         nominal_value = self._nominal_control(load)
         return 1.0 if nominal_value == 0.0 else nominal_value
@@ -257,8 +256,7 @@ class AffineStructure:
         ----------
         values : mapping of str to float
             Parameters, losses, free masses and controls by name. All others have their nominal
-            values,
-            and the losses are zero.
+            values, and the losses are zero.
         """
         values_by_kind = self.split_values(values)
         total_load: FloatArray = np.zeros(self.unknowns)
@@ -339,8 +337,7 @@ def _values_with_changes(
 
     Terms of the stiffness or mass matrix are multiplied by the value that they name; a term that
     names none has the name None. Raises `InvalidStateError` for a changed value that is not among
-    the
-    nominal ones; the message calls it by `kind`, "parameter" or "free mass".
+    the nominal ones; the message calls it by `kind`, "parameter" or "free mass".
     """
     changes = dict(changed_values or {})
     unknown_names = set(changes) - set(nominal_values)

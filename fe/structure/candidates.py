@@ -89,9 +89,8 @@ def mass_places(structure: AffineStructure) -> list[MassCandidate]:
     """List the locations where a mass may be added or missing.
 
     For a mesh these are its named sets of nodes, whose mean displacement the mass follows, and
-    points
-    of a grid. For matrices they are the nodes that the structure file names. Locations that the
-    supports hold are left out.
+    points of a grid. For matrices they are the nodes that the structure file names. Locations that
+    the supports hold are left out.
     """
     if isinstance(structure, Structure):
         candidates = list(places_of_mesh(structure.mesh))
@@ -150,8 +149,7 @@ def _spread_points(
     """Choose up to `count` points (P, 3) by farthest-point sampling; return their indices.
 
     No two chosen points are nearer to each other than `least_distance`. Preferred points come
-    first,
-    up to half of the count; without any, the first is the point farthest from the mean.
+    first, up to half of the count; without any, the first is the point farthest from the mean.
     """
     chosen: list[int] = []
     distance = np.full(len(points), np.inf)
@@ -174,9 +172,9 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
     """List the patches of a mesh that may have lost stiffness, outside its damage regions.
 
     These are its small named sets of cells and, on all other cells, the Voronoi cells of a coarse
-    grid.
-    Gauges are grid points where possible: a loss below a gauge changes its strain most, which would
-    not show if the gauge were at the edge of its patch. A structure from matrices has no patches.
+    grid. Gauges are grid points where possible: a loss below a gauge changes its strain most, which
+    would not show if the gauge were at the edge of its patch. A structure from matrices has no
+    patches.
     """
     if not isinstance(structure, Structure):
         return []
@@ -339,8 +337,7 @@ def gauge_shifts(structure: AffineStructure) -> list[GaugeShift]:
     """Return the derivatives of the strain at each gauge with respect to its position.
 
     They are those of a parabola through three positions. Where the gauge would reach over an edge
-    on
-    one side, they are those of the line through the other two; where on both, there are none.
+    on one side, they are those of the line through the other two; where on both, there are none.
     """
     if not isinstance(structure, Structure):
         return []

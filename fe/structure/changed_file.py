@@ -94,8 +94,7 @@ def _soften_support(tables: Tables, mesh: StructureMesh, primitive: SupportCompl
     """Release one motion of a support and give it a spring.
 
     The support becomes a rigid set about its centre if it is none yet. The compliance is added to
-    that
-    of a spring that is there already.
+    that of a spring that is there already.
     """
     rows = [row for row in tables["support"] if row["set"] == primitive.support]
     if len(rows) != 1:

@@ -93,8 +93,7 @@ class Deck:
         """Ignore a keyword that the mesh does not need.
 
         Raises `MeshError` for a keyword without which the mesh would be another one. A keyword that
-        is not
-        known is ignored with a remark.
+        is not known is ignored with a remark.
         """
         assert self.words is not None
         if word in self.words.refused:

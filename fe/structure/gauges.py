@@ -122,8 +122,7 @@ def gauge_axes(mesh: StructureMesh, gauge: Gauge, where: str) -> tuple[FloatArra
     """Return tangential unit vectors (3,) along a gauge and across it.
 
     The second is the outward normal of the surface times the first. `where` is the name of the
-    gauge,
-    for error messages.
+    gauge, for error messages.
 
     Raises
     ------
@@ -147,8 +146,8 @@ def _averaging_points(
     """Return the points of the surface over which a gauge averages.
 
     `point` is the middle of the gauge [m]; `direction` and `normal` are unit vectors along it and
-    out
-    of the surface. Raises `InvalidDesignError` if the gauge reaches over the edge of the surface.
+    out of the surface. Raises `InvalidDesignError` if the gauge reaches over the edge of the
+    surface.
     """
     length = mesh.unit * gauge.length
     width = mesh.unit * gauge.width
@@ -205,8 +204,7 @@ def evenly_placed_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
     """Return up to `count` rosettes, distributed evenly over the faces of the surface.
 
     Their positions are the faces nearest to the centres of k-means clusters; there are fewer
-    rosettes
-    if several would lie on one face. They are named `spread_1`, `spread_2` and so on.
+    rosettes if several would lie on one face. They are named `spread_1`, `spread_2` and so on.
     """
     from scipy.cluster.vq import kmeans2, vq
 

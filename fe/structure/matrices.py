@@ -69,8 +69,7 @@ def assemble_matrices(
     yielding : bool
         Whether the motions that the supports hold are added as the last unknowns. The nodes of a
         support then shift together, and each turns by the same angle: matrix files have no
-        positions
-        of nodes, which a common rotation would need.
+        positions of nodes, which a common rotation would need.
 
     Raises
     ------
@@ -272,8 +271,7 @@ def _stiffness_terms(
     """Yield a stiffness term for each part of the design, then one for the remaining stiffness.
 
     The terms add up to the whole stiffness (R, R). Raises `MeshError` if a part is zero or
-    indefinite,
-    or all parts together are stiffer than the whole.
+    indefinite, or all parts together are stiffer than the whole.
     """
     nominal_values = {parameter.name: parameter.nominal for parameter in design.parameter}
     remainder = whole_stiffness
@@ -306,8 +304,7 @@ def _part_matrix(
     """Return the stiffness (R, R) of a part.
 
     It is read from the part's own file, or follows from the matrix of the whole structure in which
-    the
-    modulus of the part is multiplied by a factor.
+    the modulus of the part is multiplied by a factor.
     """
     if part.changed is not None and part.times is not None:
         # whole - changed = (1 - factor) * part

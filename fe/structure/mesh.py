@@ -189,8 +189,7 @@ class StructureMesh(CellMesh):
         """Return the surface faces of a set.
 
         These are the faces of a set of faces, or those whose corners all lie in a set of nodes.
-        `where`
-        is the key of the design that names the set, for the error message.
+        `where` is the key of the design that names the set, for the error message.
 
         Raises
         ------

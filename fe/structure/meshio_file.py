@@ -125,8 +125,7 @@ def _add_sets(
     """Add the sets of the nodes, or of one block of elements.
 
     `kind` is "NSET" or "ELSET"; `numbers` (n,) are the numbers of the nodes or elements in the
-    deck;
-    `block` is the index in the lists of `arrays`.
+    deck; `block` is the index in the lists of `arrays`.
     """
     named_sets: list[tuple[str, IntArray]] = []
     for name, members in arrays.sets.items():
@@ -198,9 +197,8 @@ def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
     """Return for each block of a mesh from Gmsh which elements are not part of the structure.
 
     Gmsh also writes elements without a physical group, as group 0, if its option Mesh.SaveAll is
-    set.
-    They are construction geometry if other elements of their dimension have a group. If no solid
-    element has one, the groups name faces only, and all solid elements are the structure.
+    set. They are construction geometry if other elements of their dimension have a group. If no
+    solid element has one, the groups name faces only, and all solid elements are the structure.
     """
     groups = mesh.cell_data.get("gmsh:physical")
     if groups is None:

@@ -107,8 +107,7 @@ class _GridPoints:
     """The grid points of a deck, and the coordinate systems that they are given in.
 
     Systems may be defined by grid points, and these in other systems. So both are resolved only
-    after
-    the whole deck was read.
+    after the whole deck was read.
 
     Attributes
     ----------
@@ -301,8 +300,7 @@ def _replicated(line: _Line, lines_above: list[_Line]) -> list[_Line]:
     """Write out a line of which a field or the head is `=`, which repeats the line above.
 
     A field `=` has the value of the line above; at `==` this and all further fields have; `*(i)`
-    adds i
-    to it. A line `=n` repeats the increments of the line above n times.
+    adds i to it. A line `=n` repeats the increments of the line above n times.
     """
     count_text = line.head.lstrip("=").strip("()")
     if not lines_above or (count_text and len(lines_above) < 2):

@@ -314,8 +314,7 @@ class StructureDesign(DesignSection):
             The table whose rows have these names.
         tied, untied : str
             The verbs of the messages on a row that refers to an unknown name, and on a name to
-            which no
-            row refers.
+            which no row refers.
         """
         known_names = [row.name for row in getattr(self, named_table)]
         place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}

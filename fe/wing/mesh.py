@@ -209,10 +209,9 @@ def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: flo
     """Return moments (ny + 1, nx + 1) [m^2] of the gap between the airfoil and straight edges.
 
     The moment of a mesh line is the integral over the chord of the gap times the linear shape
-    function
-    (hat) of the line, by Gauss-Legendre quadrature in each cell. `behind` (nx + 1, ny + 1) is the
-    distance of each line from the leading edge at each station [m], `chord` (ny + 1,) the chord
-    [m].
+    function (hat) of the line, by Gauss-Legendre quadrature in each cell. `behind` (nx + 1, ny + 1)
+    is the distance of each line from the leading edge at each station [m], `chord` (ny + 1,) the
+    chord [m].
     """
     width = np.diff(behind, axis=0)
     height_on_lines = _half_thickness(behind, chord, thickness_ratio)

@@ -57,8 +57,7 @@ def _filled(
     """Return the required lines, optional ones that have room, and lines between them.
 
     `chords` (k,) are the chords at which lines are compared [m], and `size` is the largest cell at
-    the
-    first of them [m]. Raises `MeshError` if required lines nearly coincide or cross.
+    the first of them [m]. Raises `MeshError` if required lines nearly coincide or cross.
     """
     lines = _distinct_lines(required, chords)
     for line, room in optional:

@@ -1,12 +1,10 @@
 """Laws of speed: F = k |x|^a |v - l|^p sgn(v - l), on both sides of the level l or above it.
 
 If only the law acts, the speed s of its port obeys s' = -strength |s - l|^p sgn(s - l). The
-strength
-is w k |x|^a, where w is the port's inverse mass: its speed after a unit impulse. The functions
-below
-solve this in closed form. A law may also be a table of forces over speeds with linear
-interpolation, which has a closed solution, too. NumPy and relative imports only: this file is
-copied into the FMU.
+strength is w k |x|^a, where w is the port's inverse mass: its speed after a unit impulse. The
+functions below solve this in closed form. A law may also be a table of forces over speeds with
+linear interpolation, which has a closed solution, too. NumPy and relative imports only: this file
+is copied into the FMU.
 """
 
 from typing import Annotated, ClassVar
@@ -30,8 +28,7 @@ def force_of_mean_speed(
     """Return the force of a law of speed at `x`, and its derivative by `x`.
 
     The speed is the mean speed since the last position, (x - last position) / duration. Dry
-    friction
-    returns its largest force, with the sign for a forward motion.
+    friction returns its largest force, with the sign for a forward motion.
     """
     exponent = law[EXPONENT]
     if law[ONE_SIDED] == TABLE:
@@ -169,8 +166,7 @@ def speed_after_table(law: FloatArray, speed: float, strength: float, duration: 
     """Return the speed of a port on which only the force of a table has acted.
 
     Along each linear piece of the table the speed is an exponential function of time. Where the
-    force
-    is zero, the speed stays.
+    force is zero, the speed stays.
 
     Parameters
     ----------
