@@ -457,7 +457,7 @@ def _table_of_file(path: str) -> Mapping[str, object]:
 
 
 def check_system(file: SspArgument, *, json: JsonOption = False) -> None:
-    """Check archive, schemas, FMUs and connections of an SSP file; exit code 1 for a problem.
+    """Check an SSP file by schemas, FMUs, connections and one step; exit code 1 for a problem.
 
     Example: `uav-twin ssp check level_turns.ssp`
     """

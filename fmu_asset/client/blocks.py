@@ -19,9 +19,9 @@ from reporting.arrays import Float
 
 from .binding import INPUT_ROLES, Binding
 from .bound_fmu import (
+    BindingFaults,
     BlockLayout,
     BoundFmu,
-    Misfits,
     PortQuantity,
     VariableElements,
     start_values,
@@ -68,7 +68,7 @@ class _SelectedInput(NamedTuple):
 
 
 def _selected_inputs(
-    fmu: BoundFmu, ports: Sequence[PortQuantity], misfits: Misfits
+    fmu: BoundFmu, ports: Sequence[PortQuantity], faults: BindingFaults
 ) -> list[_SelectedInput]:
     """Return all inputs and port inputs that are sent at every step."""
     inputs = []
@@ -77,13 +77,13 @@ def _selected_inputs(
             if role == "health" and fmu.is_set_at_start(entry.variable):
                 continue
             label = f"{role}.{name}"
-            with misfits.at(label):
+            with faults.collect(label):
                 selection = fmu.find(entry.variable, label, "input")
                 bound_input = fmu.bound_input(label, entry, selection.variable, selection.elements)
                 inputs.append(_SelectedInput(role, name, [selection], bound_input))
     for quantity in ports:
         if not quantity.is_read:
-            with misfits.at(quantity.label):
+            with faults.collect(quantity.label):
                 inputs.append(_selected_port_input(fmu, quantity))
     return inputs
 
@@ -436,28 +436,28 @@ def _bound_output(fmu: BoundFmu, name: str, variable: str, unit: str, label: str
     return _BoundOutput(name, selection, unit, fmu.unit_conversion(selection.variable, unit, label))
 
 
-def _observed_outputs(fmu: BoundFmu, misfits: Misfits) -> list[_BoundOutput]:
+def _observed_outputs(fmu: BoundFmu, faults: BindingFaults) -> list[_BoundOutput]:
     """Return the outputs of all observations, in the order of the binding."""
     outputs = []
     for key, vector in fmu.binding.observation.items():
         label = f"observation.{key}"
         for variable, unit in zip(vector.variables, vector.units, strict=True):
-            with misfits.at(label):
+            with faults.collect(label):
                 outputs.append(_bound_output(fmu, variable, variable, unit, label))
     return outputs
 
 
 def _extra_outputs(
-    fmu: BoundFmu, ports: Sequence[PortQuantity], misfits: Misfits
+    fmu: BoundFmu, ports: Sequence[PortQuantity], faults: BindingFaults
 ) -> list[_BoundOutput]:
     """Return the further outputs: monitors, recorded variables and outputs of ports."""
     outputs = []
     for name, scalar in fmu.binding.monitor.items():
         label = f"monitor.{name}"
-        with misfits.at(label):
+        with faults.collect(label):
             outputs.append(_bound_output(fmu, name, scalar.variable, scalar.unit, label))
     for variable in fmu.binding.record.variables:
-        with misfits.at("record.variables"):
+        with faults.collect("record.variables"):
             outputs.append(_bound_output(fmu, variable, variable, "", "record.variables"))
     for quantity in ports:
         if not quantity.is_read:
@@ -466,7 +466,7 @@ def _extra_outputs(
         unit = quantity.vector.units[0]
         for number, variable in enumerate(variables, 1):
             name = f"{quantity.name}[{number}]" if len(variables) > 1 else quantity.name
-            with misfits.at(quantity.label):
+            with faults.collect(quantity.label):
                 outputs.append(_bound_output(fmu, name, variable, unit, quantity.label))
     return outputs
 
@@ -507,13 +507,13 @@ class Blocks:
         self.description = description
         self.binding = binding.with_arrays(elements)
         fmu = BoundFmu(description, self.binding)
-        misfits = Misfits(binding.title)
-        ports = fmu.port_quantities(misfits)
-        inputs = _selected_inputs(fmu, ports, misfits)
-        self.initial_values = InitialValueTable(fmu, misfits)
-        observed = _observed_outputs(fmu, misfits)
-        extras = _extra_outputs(fmu, ports, misfits)
-        misfits.refuse()
+        faults = BindingFaults(binding.title)
+        ports = fmu.port_quantities(faults)
+        inputs = _selected_inputs(fmu, ports, faults)
+        self.initial_values = InitialValueTable(fmu, faults)
+        observed = _observed_outputs(fmu, faults)
+        extras = _extra_outputs(fmu, ports, faults)
+        faults.raise_if_any()
         self.health_at_start = self.initial_values.health
         self.request = Request(fmu, inputs)
         self.reply = Reply(fmu, observed, extras)

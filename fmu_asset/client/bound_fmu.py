@@ -1,4 +1,4 @@
-"""An FMU with its binding: the variables that it names, their order in a block, and misfits."""
+"""An FMU with its binding: the variables that the binding names, and their order in a block."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -185,7 +185,7 @@ class BlockLayout:
         return positions
 
 
-class Misfits:
+class BindingFaults:
     """Collects the entries of a binding that do not fit an FMU, for one message.
 
     Parameters
@@ -202,14 +202,14 @@ class Misfits:
         return len(self._messages)
 
     @contextmanager
-    def at(self, label: str) -> Iterator[None]:
-        """Record the first `BindingError` at an entry of the binding, and go on."""
+    def collect(self, label: str) -> Iterator[None]:
+        """Record the first `BindingError` at an entry of the binding instead of raising it."""
         try:
             yield
         except BindingError as error:
             self._messages.setdefault(label, str(error))
 
-    def refuse(self) -> None:
+    def raise_if_any(self) -> None:
         """Raise a `BindingError` that names all recorded entries, if there are any."""
         messages = [*self._messages.values()]
         if not messages:
@@ -355,7 +355,7 @@ class BoundFmu:
 
     # ------------------------------------------------------------------ ports
 
-    def port_quantities(self, misfits: Misfits) -> list[PortQuantity]:
+    def port_quantities(self, faults: BindingFaults) -> list[PortQuantity]:
         """Return the quantities of all ports of the binding, and record what does not fit.
 
         A port does not fit if a variable is not in the FMU, if it mixes inputs and outputs, or if
@@ -364,13 +364,13 @@ class BoundFmu:
         """
         quantities = []
         for port_name, port in self.binding.port.items():
-            previous_misfits = len(misfits)
+            previous_fault_count = len(faults)
             for quantity, vector in port.quantities.items():
                 label = f"port.{port_name}.{quantity}"
-                with misfits.at(label):
+                with faults.collect(label):
                     self._check_port_variables(label, vector)
-            if len(misfits) == previous_misfits:
-                with misfits.at(f"port.{port_name}"):
+            if len(faults) == previous_fault_count:
+                with faults.collect(f"port.{port_name}"):
                     quantities += self._quantities_of_port(port_name, port)
         return quantities
 

@@ -9,7 +9,7 @@ from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.instances.plan import InitialValue, InitialValues
 from reporting.words import comma_list
 
-from .bound_fmu import BoundFmu, Misfits, start_values
+from .bound_fmu import BindingFaults, BoundFmu, start_values
 from .bound_input import BoundInput
 from .bound_variables import InputBinding
 from .values import InputsByRole
@@ -20,7 +20,7 @@ class InitialValueTable:
 
     Parameters
     ----------
-    misfits : Misfits
+    faults : BindingFaults
         Collects the entries that do not fit.
 
     Attributes
@@ -29,13 +29,13 @@ class InitialValueTable:
         Health that is a parameter or start value of the FMU, by the binding's names.
     """
 
-    def __init__(self, fmu: BoundFmu, misfits: Misfits) -> None:
+    def __init__(self, fmu: BoundFmu, faults: BindingFaults) -> None:
         self._fmu = fmu
         self.health: dict[str, BoundInput] = {}
         for name, entry in fmu.binding.health.items():
             if fmu.is_set_at_start(entry.variable):
                 label = f"health.{name}"
-                with misfits.at(label):
+                with faults.collect(label):
                     self.health[name] = fmu.start_input(label, entry)
         self._text_parameters: dict[str, VariableInfo] = {}
         self._parameters: dict[str, BoundInput] = {}
@@ -45,7 +45,7 @@ class InitialValueTable:
                 self._text_parameters[name] = variable
                 continue
             label = f"parameter.{name}"
-            with misfits.at(label):
+            with faults.collect(label):
                 self._parameters[name] = fmu.start_input(label, parameter)
 
     def split_inputs(

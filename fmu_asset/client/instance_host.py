@@ -203,7 +203,7 @@ class InstanceHost:
     # ------------------------------------------------------------------ starts
 
     def start(self, start: InstanceStart, *, renewed: bool = False) -> None:
-        """Start the simulation; a lost instance is replaced, and any other one reset.
+        """Start the simulation from the initial state; a lost instance is replaced.
 
         Parameters
         ----------

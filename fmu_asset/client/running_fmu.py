@@ -286,7 +286,7 @@ class RunningFmu:
                 self.host.restore(saved_state.body)
                 self.step_index = saved_state.index
             self.host.request.cast("B")[HEAD_BYTES:] = saved_state.inputs
-            saved_state.refuse_other_outputs(self.present_outputs(), self._blocks.reply.names)
+            saved_state.check_outputs(self.present_outputs(), self._blocks.reply.names)
         except FmuError as error:
             self.phase = "broken"
             # an `FmuStateError` gives this advice itself

@@ -155,7 +155,7 @@ class SavedState(PackedState):
             )
         )
 
-    def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
+    def check_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
         """Raise an error if a restored FMU gives other outputs than at the time of saving.
 
         Parameters
