@@ -430,14 +430,14 @@ def shown_records(library_file: Path) -> list[tuple[object, tuple[str, ...]]]:
     from discrepancy.files.verdict import StoredVerdict
     from discrepancy.verdict import Verdict, VerdictKind
     from discrepancy.workflow import Investigation
-    from twin_master.assets.asset_source import FlownAndBelieved
+    from twin_master.assets.asset_source import AssetAndModel
     from twin_master.store.writing import RunOutcome
 
     campaign, model = measured()
     verdict = Verdict(VerdictKind.NOTHING_MISSING, "Nothing.", 0.9, 0.0)
     wing = synthetic_calibration()
     knowledge = uav_twin.prepare_twin("level_turns", {"strain_library": library_file})
-    origin = FlownAndBelieved("an FMU", "a model", differ=False)
+    origin = AssetAndModel("an FMU", "a model", differ=False)
     control = "left 3g for 2g at step 31"
     flown = RunOutcome(Path("runs/mine"), None, (), {}, origin, "step", control, ("Gauge 4 is off.",))
     return [

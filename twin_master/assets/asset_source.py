@@ -187,7 +187,7 @@ def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> 
 
 
 @dataclass(frozen=True)
-class FlownAndBelieved:
+class AssetAndModel:
     """The asset that flies and the model that the twin believes, in words.
 
     Attributes
@@ -227,7 +227,7 @@ def calibration_sentence(
     roles = f"asset and belief are the {asset}"
     if asset != believed:
         roles = f"the asset is the {asset}, and the twin believes the {believed}"
-    # Without a believed design of its own, the twin believes what flies.
+    # Without a believed design of its own, the twin believes the asset's.
     believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
     if believed_hash is not None and believed_hash == record.get("design_hash"):
         comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
@@ -284,9 +284,9 @@ class AssetSource:
         return str(self.label)
 
     @property
-    def origin(self) -> FlownAndBelieved:
+    def origin(self) -> AssetAndModel:
         """The asset and the believed model in words; here they are the same."""
-        return FlownAndBelieved(self.description, self.description, self.differ)
+        return AssetAndModel(self.description, self.description, self.differ)
 
     def draw_summary(self) -> tuple[str, int]:
         """Return the origin of the parameter's draws, in words, and their number."""
@@ -413,7 +413,7 @@ class PairedSource(AssetSource):
     Parameters
     ----------
     asset : AssetSource
-        The source of what flies.
+        The source of the asset.
     model : AssetSource
         The source of parameter draws, predicted observations and field.
     differ : bool
@@ -426,12 +426,12 @@ class PairedSource(AssetSource):
         self.differ = differ
 
     @property
-    def origin(self) -> FlownAndBelieved:
+    def origin(self) -> AssetAndModel:
         """The asset of the one source, and the believed model of the other."""
         asset = self._asset.origin
         model = self._believed.origin
         differ = self.differ or asset.differ or model.differ
-        return FlownAndBelieved(asset.asset, model.model, differ)
+        return AssetAndModel(asset.asset, model.model, differ)
 
     def check(self) -> None:
         """Check both sources."""
@@ -502,7 +502,7 @@ class WatchedSource:
 
 
 def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
-    """Read the files that a run folder is to hold copies of.
+    """Read the files of which a run folder contains copies.
 
     Parameters
     ----------

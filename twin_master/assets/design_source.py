@@ -27,7 +27,7 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import WING_CALIBRATION, ParameterDraws, check_calibration
-from twin_master.assets.reduced_model import Advice, NamedStructure, ReducedModelSource
+from twin_master.assets.reduced_model import Advice, ReducedModelSource, StructureOfFile
 from twin_master.assets.structure_source import StructureFmuSource
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
@@ -106,7 +106,7 @@ class CalibrationBelief(DesignBelief):
     """The design that the calibration file holds."""
 
 
-class _Wing(NamedStructure):
+class _WingSource(StructureOfFile):
     """The common part of a wing's FMU and of its reduced model: design, patch and their checks.
 
     The design comes from a design file or a calibration file.
@@ -323,7 +323,7 @@ def _check_has_no_memory(effect: "PatchFileEffect", primitive: "Primitive") -> N
         )
 
 
-class WingFmuSource(_Wing, StructureFmuSource):
+class WingFmuSource(_WingSource, StructureFmuSource):
     """The FMU that is packed from a wing design, with hidden effects if there is a patch.
 
     The first reduction of a design takes about twenty seconds; after that it comes from the cache.
@@ -378,7 +378,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
 
-class DesignSource(_Wing, ReducedModelSource):
+class DesignSource(_WingSource, ReducedModelSource):
     """The reduced model of a wing design as the believed model, with the effects of a patch."""
 
     section: DesignBelief

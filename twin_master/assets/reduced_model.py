@@ -76,7 +76,7 @@ class ChosenValue(NamedTuple):
     value: float
 
 
-class NamedStructure(AssetSource):
+class StructureOfFile(AssetSource):
     """A structure from a file, with checks that it has everything that the scenario names."""
 
     section: Any  # each subclass has a section of its own
@@ -306,7 +306,7 @@ class NamedStructure(AssetSource):
                 yield ChosenValue(f"{name} that `truth.gains` give {when}", name, value)
 
 
-class ReducedModelSource(NamedStructure):
+class ReducedModelSource(StructureOfFile):
     """A reduced model that the twin believes, or that flies without an FMU.
 
     Parameters

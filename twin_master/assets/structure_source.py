@@ -16,7 +16,7 @@ from twin_master.assets.asset_source import (
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
 from twin_master.assets.recorded_structure import RecordedStructure
-from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
+from twin_master.assets.reduced_model import ReducedModelSource, StructureOfFile
 from twin_master.errors import MissionInputError
 from twin_master.scenario.kinds import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
@@ -91,7 +91,7 @@ class StructureBelief(StructureFiles, BeliefSection):
         return ReducedModelSource(scenario, section=self)
 
 
-class StructureFmuSource(NamedStructure, FmuSource):
+class StructureFmuSource(StructureOfFile, FmuSource):
     """The FMU that is packed from a structure."""
 
     # Both base classes define it: an FMU flies with the parameters of the true asset.

@@ -297,8 +297,8 @@ def _draw(states: _NextStates, uniform: Float) -> Index:
     return np.asarray(states.state_indices[position])
 
 
-class FlownTwins(Protocol):
-    """A twin, or several side by side, whose decisions a plant flies."""
+class DecidingTwins(Protocol):
+    """A twin, or several side by side, under whose decisions a plant flies."""
 
     @property
     def steps(self) -> int:
@@ -318,7 +318,7 @@ def sentence_of_ending_action(scenario: Scenario, control_index: int) -> str:
     return f"the twin decided on `{scenario.control_names[control_index]}`."
 
 
-class Plant(Source[FlownTwins]):
+class Plant(Source[DecidingTwins]):
     """The simulated assets of one mission or of B missions, with damage, noise and sensor faults.
 
     The assets of B missions fly side by side if they have no memory. Then the arrays of controls,
@@ -363,7 +363,7 @@ class Plant(Source[FlownTwins]):
         self.endings: dict[int, str] = {}
         self.failures: dict[int, str] = {}
 
-    def read(self, twin: FlownTwins) -> Reading | None:
+    def read(self, twin: DecidingTwins) -> Reading | None:
         """Fly the next step of all missions and return the observation; None when all have ended.
 
         A mission ends in three cases:

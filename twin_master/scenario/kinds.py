@@ -1,11 +1,10 @@
-"""Tables of a scenario that name files, and the two tables whose `kind` decides what they hold.
+"""Tables of a scenario that name files, and the two tables whose `kind` decides their other keys.
 
-What flies (`asset`) and what the twin believes (`belief`) are each one of several kinds. A kind is
-the value of `kind` in such a table, which selects the class that reads the table: a subclass of
-`AssetSection` or `BeliefSection` in a file whose name ends in `_source`, beside
-`assets/asset_source.py`. Its fields are the keys that a user writes; its method
-`source` makes of them what the mission needs. No other code names the kinds. An installed package
-adds a kind by an entry point for such a class.
+The asset that flies (`asset`) and the model that the twin believes (`belief`) are of several kinds.
+The value of `kind` in such a table selects the class that reads the table: a subclass of
+`AssetSection` or `BeliefSection` in a file of the folder `assets` whose name ends in `_source`. Its
+fields are the keys that a user writes, and its method `source` returns an `AssetSource`. No other
+code names the kinds. An installed package adds a kind by an entry point for such a class.
 """
 
 from abc import abstractmethod
@@ -31,7 +30,7 @@ WATCHED_KIND = "watched"
 """Kind of the asset of a scenario without `[asset]`."""
 KIND_PACKAGE = f"{__package__.rpartition('.')[0]}.{KIND_FOLDER.name}"
 CALIBRATED_DESIGN_NAME = "calibration"
-"""The name, in a scenario, of the wing design that a calibration file holds."""
+"""The name, in a scenario, of the wing design in a calibration file."""
 
 
 def _shipped_designs() -> dict[str, Path]:
@@ -51,7 +50,7 @@ class FileSection(Section):
         "script": asset_scripts,
         "structure": structure_files,
     }
-    """Function that returns the shipped files by name, by key."""
+    """For each key, the function that returns the shipped files by name."""
 
     copy_paths: ClassVar[Mapping[str, str]] = {}
     """For each key that names a file, the path of its copy inside a run folder."""

@@ -15,7 +15,7 @@ from reporting.json_file import JsonObject, read_json
 from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from reporting.notebook import html_table
 from reporting.words import brief, number, rounded
-from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.assets.asset_source import AssetAndModel
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.pictures import plot_belief
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
@@ -92,7 +92,7 @@ def store_flight(
     folder: Path,
     config: JsonObject,
     result: MissionResult,
-    origin: FlownAndBelieved,
+    origin: AssetAndModel,
     *,
     steps: int,
     figures: Sequence[SummaryGroup] = (),
@@ -106,7 +106,7 @@ def store_flight(
 
     Parameters
     ----------
-    origin : FlownAndBelieved
+    origin : AssetAndModel
         The asset and the believed model, in words.
     steps : int
         The number of steps that were flown or planned.
@@ -134,7 +134,7 @@ def store_flight(
 
 
 def _root_attributes(
-    config: JsonObject, result: MissionResult, origin: FlownAndBelieved
+    config: JsonObject, result: MissionResult, origin: AssetAndModel
 ) -> dict[str, object]:
     """Return the attributes of the root of `run.nc`.
 
@@ -160,7 +160,7 @@ def _root_attributes(
     }
 
 
-def _summary_heading(result: MissionResult, origin: FlownAndBelieved, steps: int) -> JsonObject:
+def _summary_heading(result: MissionResult, origin: AssetAndModel, steps: int) -> JsonObject:
     """Return the entries of the summary file before the results.
 
     They are the mission, its control changes, asset and believed model, learnt quantities, and
@@ -225,7 +225,7 @@ class RunOutcome:
         The summary.
     timing : dict
         The content of `timing.json`.
-    origin : FlownAndBelieved
+    origin : AssetAndModel
         What was flown and what the twin believed, in words.
     step_name : str
         What a step is called.
@@ -239,7 +239,7 @@ class RunOutcome:
     report: Path | None
     figures: tuple[SummaryEntry, ...]
     timing: JsonObject
-    origin: FlownAndBelieved
+    origin: AssetAndModel
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
@@ -282,7 +282,7 @@ def read_outcome(folder: Path) -> RunOutcome:
         report=report if report.is_file() else None,
         figures=tuple(SummaryEntry(**figure) for figure in summary["figures"]),
         timing=timing,
-        origin=FlownAndBelieved(
+        origin=AssetAndModel(
             str(summary["asset"]),
             str(summary["twin_model"]),
             bool(summary["asset_and_model_differ"]),

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import takewhile
 
 from reporting.json_file import JsonObject
-from twin_master.assets.asset_source import FlownAndBelieved
+from twin_master.assets.asset_source import AssetAndModel
 from twin_master.feeds.feed import JournalLine
 from twin_master.feeds.intake import Counts
 from twin_master.feeds.rejected import REJECTED_NAME
@@ -51,7 +51,7 @@ def store_watch(
             watch.folder,
             watch.config,
             result,
-            FlownAndBelieved(WATCHED_ASSET, watch.source.origin.model),
+            AssetAndModel(WATCHED_ASSET, watch.source.origin.model),
             steps=step_count,
             figures=_summary_figures(watch, counts, step_count),
             attributes=attributes,
