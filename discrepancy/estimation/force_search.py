@@ -42,8 +42,18 @@ linearised again."""
 LARGEST_LINEAR_ERROR = 0.1
 """Share of the missing force that may be there because trials are linear about other parameters.
 What is larger is not removed by another linearisation."""
+MOST_THINNED_SAMPLES = 3000
+"""Number of samples of all trials together to which records are thinned at first. It is enough to
+tell laws from each other, and records that are shorter are not thinned."""
+THINNED_AT_LEAST = 2.0
+"""Ratio of the number of samples to that number above which records are thinned at first."""
 WIDE_WINDOW = 0.1
 """Half width of the window of speeds where the model's own laws are linear along a first motion."""
+
+
+def _best(estimates: Iterable[Estimate]) -> Estimate:
+    """Return the estimate with the largest evidence."""
+    return max(estimates, key=lambda estimate: estimate.log_evidence)
 
 
 def can_estimate_forces(problem: Problem) -> bool:
@@ -69,10 +79,10 @@ class ForceSearch:
     Attributes
     ----------
     estimate_by_port : dict of str to Estimate
-        The missing force at each port alone, by the name of the port. It is estimated twice: first
-        along the motion of the model, which gives the initial states of the trials; then along the
-        motion that was estimated first, with the model's own laws and with the parameters linear
-        about their first estimates.
+        The missing force at each port alone, by the name of the port.
+    thinned : ForceSearch or None
+        The search in thinned records, from which that in all samples begins; None if the records
+        are short.
     ports : tuple of str
         The names of the ports.
     problem_with_laws : Problem
@@ -103,20 +113,59 @@ class ForceSearch:
         )
         low, high = self.problem.shared.bounds
         self.shared_priors = Priors(self.problem.shared.precision, low, high)
-        self.estimate_by_port: dict[str, Estimate] = {}
-        # first estimate, along the motion of the model at the prior means
+        self.thinned = self._in_thinned_records() if sample_limit is None else None
+        if self.thinned is None:
+            self.estimate_by_port = self._estimates_of_ports(start)
+        else:
+            self.estimate_by_port = self._estimates_of_ports_like(self.thinned)
+
+    def _in_thinned_records(self) -> "ForceSearch | None":
+        """Return the search in thinned records; None if the records are short, or uneven."""
+        sample_count = sum(len(self.problem.trials[k].trial.time) for k in self.trial_indices)
+        if sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
+            return None
+        thinned = ForceSearch(self.problem_with_laws, MOST_THINNED_SAMPLES)
+        is_thinned = any(trial.trial.stride > 1 for trial in thinned.best_port_estimate.trials)
+        return thinned if is_thinned else None
+
+    def _estimates_of_ports(self, start: Point) -> dict[str, Estimate]:
+        """Return the missing force at each port alone, by the name of the port.
+
+        It is estimated twice: first along the motion of the model, which gives the initial states
+        of the trials; then along the motion that was estimated first, with the model's own laws and
+        with the parameters linear about their first estimates.
+
+        Parameters
+        ----------
+        start : Point
+            The values of the unknowns about which the trials are linear at first.
+        """
         linearisation = plain_linearisation(self.trial_set.trials_about(start), self.shared_priors)
-        for port, name in enumerate(self.ports):
+        first_estimates = []
+        for port in range(len(self.ports)):
             processes = self.prior_processes((port,))
-            self.estimate_by_port[name] = estimate_of_processes(linearisation, processes, processes)
-        # second estimate, about the unknowns of the best port
-        trials_about_best = self.trial_set.trials_about(self._point_of(self._most_probable_port()))
-        for port, name in enumerate(self.ports):
-            self.estimate_by_port[name] = self._estimate_along_motion(
-                trials_about_best,
-                self.estimate_by_port[name].processes,
-                self.prior_processes((port,)),
+            first_estimates.append(estimate_of_processes(linearisation, processes, processes))
+        # about the unknowns of the best port
+        trials_about_best = self.trial_set.trials_about(self._point_of(_best(first_estimates)))
+        return {
+            name: self._estimate_along_motion(
+                trials_about_best, first_estimates[port].processes, self.prior_processes((port,))
             )
+            for port, name in enumerate(self.ports)
+        }
+
+    def _estimates_of_ports_like(self, thinned: "ForceSearch") -> dict[str, Estimate]:
+        """Return the missing force at each port alone, from the estimates in thinned records."""
+        trials = self.trial_set.trials_about(thinned._point_of(thinned.best_port_estimate))
+        return {
+            name: self._estimate_along_motion(
+                trials,
+                thinned.estimate_by_port[name].processes,
+                self.prior_processes((port,)),
+                skip_grid=True,
+            )
+            for port, name in enumerate(self.ports)
+        }
 
     @property
     def has_channel_for_each_port(self) -> bool:
@@ -129,14 +178,10 @@ class ForceSearch:
 
     # ---------------------------------------------------------------- where a force is missing
 
-    def _most_probable_port(self) -> Estimate:
-        """Return the missing force at one port that has the largest evidence."""
-        return max(self.estimate_by_port.values(), key=lambda at_port: at_port.log_evidence)
-
     @cached_property
     def best_port_estimate(self) -> Estimate:
         """The missing force at one port that has the largest evidence."""
-        return self._most_probable_port()
+        return _best(self.estimate_by_port.values())
 
     @cached_property
     def estimate_without_effects(self) -> Estimate:
@@ -151,6 +196,14 @@ class ForceSearch:
         )[:MOST_PORTS]
         if len(estimates_alone) == 1:
             return best_alone
+        if self.thinned is not None:
+            processes = self.thinned.estimate_without_effects.processes
+            return estimate_of_processes(
+                self._linearise_along(best_alone),
+                self.prior_processes(processes),
+                processes,
+                skip_grid=True,
+            )
         start_processes = dict(best_alone.processes)
         for at_port in estimates_alone[1:]:
             # alone, each port takes the whole gap: the further ports begin with a smaller force
@@ -191,6 +244,8 @@ class ForceSearch:
         trials: tuple[PortedTrial, ...],
         first_processes: Processes,
         prior_medians: dict[int, Process],
+        *,
+        skip_grid: bool = False,
     ) -> Estimate:
         """Return the most probable missing forces along the motion that first forces give.
 
@@ -202,12 +257,16 @@ class ForceSearch:
             The missing forces with which the motion is estimated first.
         prior_medians : dict of int to Process
             Their prior medians.
+        skip_grid : bool
+            Whether the first forces are nearly the most probable ones.
         """
         linearisation = plain_linearisation(trials, self.shared_priors)
         solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
         trajectories = tuple(trial.trajectory for trial in smoothed_trials)
         along_motion = self._linearise(trials, trajectories, solution.mean)
-        return estimate_of_processes(along_motion, prior_medians, first_processes)
+        return estimate_of_processes(
+            along_motion, prior_medians, first_processes, skip_grid=skip_grid
+        )
 
     def _linearise_along(self, estimate: Estimate) -> Linearisation:
         """Return the trials of an estimate without effects, linear along its motion."""

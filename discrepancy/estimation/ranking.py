@@ -32,11 +32,6 @@ BEAM_WIDTHS = (4, 2, 2)
 """Numbers of the rough estimates of each length that are estimated in full, the best first."""
 ESTIMATED_RANGE = 60.0
 """Difference to the best score above which no hypothesis is estimated in full [nat]."""
-MOST_SAMPLES_OF_FIRST_ROUND = 3000
-"""Number of samples of all trials together to which records are thinned in the first round. It is
-enough to tell laws from each other, and records that are shorter are not thinned."""
-THINNED_AT_LEAST = 2.0
-"""Ratio of the number of samples to that number above which there is a first round."""
 LEADING_RANGE = 12.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
 samples the difference is larger by about the factor of the thinning."""
@@ -69,7 +64,7 @@ def rank_by_missing_force(
     on_progress : callable
         The function that receives a line for the progress display, such as the estimate that runs.
     """
-    thinned_search = search_in_thinned_records(search)
+    thinned_search = search.thinned
     if thinned_search is None:
         return rank_hypotheses(search, effects, on_progress)
     ranked_estimates = rank_hypotheses(thinned_search, effects, on_progress)
@@ -80,22 +75,6 @@ def rank_by_missing_force(
         if estimate is not None:
             estimates.append(estimate)
     return sorted(estimates, key=lambda estimate: -search.score(estimate, len(effects)))
-
-
-def search_in_thinned_records(search: ForceSearch) -> ForceSearch | None:
-    """Return the search in thinned records, or None if the records are short.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search in all samples.
-    """
-    sample_count = sum(len(trial.trial.time) for trial in search.best_port_estimate.trials)
-    if sample_count < THINNED_AT_LEAST * MOST_SAMPLES_OF_FIRST_ROUND:
-        return None
-    thinned_search = ForceSearch(search.problem_with_laws, MOST_SAMPLES_OF_FIRST_ROUND)
-    is_thinned = any(trial.trial.stride > 1 for trial in thinned_search.best_port_estimate.trials)
-    return thinned_search if is_thinned else None
 
 
 def rank_hypotheses(

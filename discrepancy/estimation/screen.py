@@ -291,7 +291,10 @@ def _weigh_effects(
     with_columns = _with_columns(base, tried_effects)
     base_count = len(base.linearisation.priors)
     best_starts: dict[int, ScreenedStart] = {}
-    for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
+    factors = list(product(SCREENED_DEVIATIONS, SCREENED_TIMES))
+    if base.leaves_no_force:
+        factors = [(1.0, 1.0)]  # where hardly any force is missing, its size does not matter
+    for size_factor, time_factor in factors:
         processes = processes_within_range(
             scale_processes(base.processes, size_factor, time_factor),
             with_columns.correlation_time_range,

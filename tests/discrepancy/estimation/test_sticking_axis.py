@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.pushed_axis import DAMPING, FRICTION, MASS, axis_model, pushed_axis
 from discrepancy.campaign.records import FloatArray
-from discrepancy.estimation import ranking
+from discrepancy.estimation import force_search, ranking
 from discrepancy.estimation.estimate import Estimate
 from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.candidate import Candidate, EffectTerm
@@ -80,19 +80,28 @@ def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -
 
 
 @pytest.fixture
-def records_count_as_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ranking, "MOST_SAMPLES_OF_FIRST_ROUND", 400)
+def search_from_thinned(search: ForceSearch, monkeypatch: pytest.MonkeyPatch) -> ForceSearch:
+    monkeypatch.setattr(force_search, "MOST_THINNED_SAMPLES", 400)
+    return ForceSearch(search.problem_with_laws)
 
 
-@pytest.mark.usefixtures("records_count_as_long")
-def test_long_records_are_thinned_for_the_ranking(search: ForceSearch) -> None:
-    thinned = ranking.search_in_thinned_records(search)
+def test_long_records_are_thinned_at_first(search_from_thinned: ForceSearch) -> None:
+    thinned = search_from_thinned.thinned
     assert thinned is not None
     assert [trial.trial.stride for trial in thinned.estimate_without_effects.trials] == [3, 3]
 
 
-@pytest.mark.usefixtures("records_count_as_long")
-def test_effects_of_long_records_are_estimated_in_all_samples(search: ForceSearch) -> None:
+def test_a_search_that_begins_in_thinned_records_ends_near_the_same_missing_force(
+    search: ForceSearch, search_from_thinned: ForceSearch
+) -> None:
+    # both are linear about other parameters, whose influence is not linear while the axis sticks
+    assert search_from_thinned.force_deviation(0) == pytest.approx(search.force_deviation(0), rel=0.2)
+
+
+def test_effects_of_long_records_are_estimated_in_all_samples(
+    search_from_thinned: ForceSearch,
+) -> None:
+    search = search_from_thinned
     estimates = ranking.rank_by_missing_force(search, chosen("coulomb_friction"))
     assert estimates[0].candidate.identifiers == ("coulomb_friction",)
     for estimate in estimates:
