@@ -23,7 +23,7 @@ _IN_BRACKETS = re.compile(r"\[.*\]|\(.*\)", re.DOTALL)
 
 
 class HeadRows(NamedTuple):
-    """The names (C,) above the columns of a table, and their units, empty where not known."""
+    """The names (C,) and units (C,) of the columns of a table; a unit is empty if not known."""
 
     names: list[str]
     units: list[str]
@@ -32,9 +32,10 @@ class HeadRows(NamedTuple):
 def find_head_rows(rows: Rows, first_row: int) -> HeadRows:
     """Return the names and units of the columns, from the rows above the first numbers.
 
-    The row above the numbers holds the units if each of its cells is a unit, the format of a clock
-    or in brackets, and if there are as many names in the row above it, which holds the names then.
-    Otherwise there is no row of units. Files of Campbell's loggers have lines for both.
+    The row just above the numbers holds the units if each of its filled cells is a unit, a clock
+    format or a text in brackets, and if the row above it has at least as many filled cells, which
+    are then the names. Otherwise it holds the names, and there are no units. In files of Campbell's
+    loggers, names and units have fixed lines.
 
     Parameters
     ----------
@@ -49,37 +50,37 @@ def find_head_rows(rows: Rows, first_row: int) -> HeadRows:
         return _campbell_names_with_units(names, cells_of_lines.get(_CAMPBELL_UNITS_LINE, []))
     row_above = rows[first_row - 1][1]
     if first_row > 1:
-        row_over_names = rows[first_row - 3][1] if first_row > 2 else []
-        names = _names_of_merged_cells(rows[first_row - 2][1], row_over_names, row_above)
+        row_above_names = rows[first_row - 3][1] if first_row > 2 else []
+        names = _fill_names_of_merged_cells(rows[first_row - 2][1], row_above_names, row_above)
         has_names = sum(map(bool, names)) >= sum(map(bool, row_above))
         if has_names and _are_units(names, row_above):
             return _names_with_units(names, row_above)
     return _names_with_units(row_above, [])
 
 
-def _names_of_merged_cells(
-    names: Sequence[str], row_over_names: Sequence[str], units: Sequence[str]
+def _fill_names_of_merged_cells(
+    names: Sequence[str], row_above_names: Sequence[str], units: Sequence[str]
 ) -> list[str]:
-    """Return a row of names in which a cell that is merged with others names all their columns.
+    """Return a row of names in which each column with a unit but no name gets a name.
 
-    The text of a merged cell is in its first cell: above, or else to the left. A row with numbers,
-    or with less than two texts, is a title and stays as it is.
+    Such a column is part of a merged cell, whose text is stored in the cell above if it was merged
+    downwards, or else in the column to the left. A row is not filled, because it is no row of names
+    but a title, if its first cell is empty, or if it has a number or fewer than two texts.
     """
     texts = [cell for cell in names if cell]
     if len(texts) < 2 or not names[0] or any(map(is_value, texts)):
         return [*names]
-    spread_names: list[str] = []
-    cells = zip_longest(names, row_over_names, units, fillvalue="")
-    for name, name_above, unit in cells:
+    filled_names: list[str] = []
+    for name, name_above, unit in zip_longest(names, row_above_names, units, fillvalue=""):
         if unit and not name:
-            spread_names.append(name_above or spread_names[-1])
+            filled_names.append(name_above or filled_names[-1])
         else:
-            spread_names.append(name)
-    return spread_names
+            filled_names.append(name)
+    return filled_names
 
 
 def _are_units(names: Sequence[str], cells: Sequence[str]) -> bool:
-    """Return whether each filled cell of a row below names stands in the place of a unit."""
+    """Return whether each filled cell below names is a unit, a clock format or in brackets."""
     for name, cell in zip_longest(names, cells, fillvalue=""):
         is_unit = bool(unit_beside(name, cell)) or is_clock_format(cell)
         if cell and not is_unit and not _IN_BRACKETS.fullmatch(cell):
@@ -88,7 +89,7 @@ def _are_units(names: Sequence[str], cells: Sequence[str]) -> bool:
 
 
 def _names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
-    """Return names with the units in the cells below them; what is no unit is left out."""
+    """Return names with the units in the cells below them; a cell that is no unit is ignored."""
     units = []
     for name, cell in zip_longest(names, cells, fillvalue=""):
         units.append(unit_beside(name, cell))

@@ -138,20 +138,20 @@ class Sheet:
 
 
 def read_sheets(path: Path) -> list[Sheet]:
-    """Return the table of a file, or those of all sheets of a workbook for `FILE.xlsx#all`.
+    """Return the table of a file in a list; for `FILE.xlsx#all` a table for each of its sheets.
 
-    Sheets without a number, such as notes, are left out, which the remark of the first table says.
+    Sheets without a number, such as notes, are left out. The remark of the first table names them.
 
     Raises
     ------
     CampaignFileError
-        For the causes of `read_sheet`, or if no sheet has a number.
+        For the causes of `read_sheet`, or if `FILE.xlsx#all` has no sheet with a number.
     """
     file, sheet_name = _file_and_sheet(path)
     if sheet_name != ALL_SHEETS or _ending_by_content(file) not in EXCEL:
         return [read_sheet(path)]
     workbook = read_workbook(file)
-    if ALL_SHEETS in workbook:
+    if ALL_SHEETS in workbook:  # a sheet that has the name `all`
         return [_table_of_workbook(path.name, file, ALL_SHEETS, workbook)]
     sheets = []
     left_out = ""
@@ -198,7 +198,10 @@ def read_sheet(path: Path) -> Sheet:
 def _table_of_workbook(
     name: str, file: Path, title: str, workbook: Mapping[str, WorkbookSheet]
 ) -> Sheet:
-    """Return the table in a sheet of a workbook; refuse formulas without a stored value."""
+    """Return the table in a sheet of a workbook.
+
+    Raises `CampaignFileError` if the table has formulas without a stored value.
+    """
     rows, blank_cells = workbook[title]
     if blank_cells:
         refuse_formulas_among(blank_cells, file, title)
@@ -207,9 +210,10 @@ def _table_of_workbook(
 
 
 def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
-    """Return a table with empty cells for its fill values; its remark names all wild readings.
+    """Return a table with its fill values replaced by empty cells; its remark names all of them.
 
-    Numbers that can be read in two ways are not judged.
+    The remark also names other wild readings, which stay. A table whose numbers can be read in two
+    ways is returned as it is.
     """
     if sheet.decimal is None:
         return sheet
@@ -228,7 +232,10 @@ def _without_fill_values(sheet: Sheet, unit_of_place: str) -> Sheet:
 
 
 def _file_and_sheet(path: Path) -> tuple[Path, str]:
-    """Return the file and the sheet's name in `FILE#SHEET`; both names may hold a `#`."""
+    """Split `FILE#SHEET` at the last `#` that leaves the name of an existing file.
+
+    Both names may hold a `#`; without a sheet its name is empty.
+    """
     file, sheet_name = path, ""
     while not file.exists() and "#" in file.name:
         name, _, end = file.name.rpartition("#")
@@ -238,7 +245,7 @@ def _file_and_sheet(path: Path) -> tuple[Path, str]:
 
 
 def _ending_by_content(file: Path) -> str:
-    """Return the ending of a file; a workbook has that of its content, whatever its name says.
+    """Return the ending of a file's name; for a workbook the one that fits its content.
 
     Raises
     ------
@@ -263,7 +270,10 @@ def _ending_by_content(file: Path) -> str:
 def _sheet_of_rows(
     name: str, file: Path, rows: Rows, *, unit_of_place: str, separator: str
 ) -> Sheet:
-    """Return the table among the rows of a file.
+    """Return the table among the rows of a file, with the days of its dates first if unclear.
+
+    If some dates can be read with the month first as well, and its times then differ, the result
+    holds that second reading as `month_first`, and the first such date as `unclear_date`.
 
     Parameters
     ----------
@@ -281,22 +291,28 @@ def _sheet_of_rows(
     place = f"{name}, {unit_of_place}"
     layout = find_table(rows, name, place)
     lines = [line for line, _ in layout.body]
-    columns = []
+    printed_columns = []
     for index in range(len(layout.head)):
-        columns.append(tuple(_cell(row, index) for _, row in layout.body))
-    columns, remark = leave_out_lost_readings(columns, layout.head, lines, name, unit_of_place)
+        printed_columns.append(tuple(_cell(row, index) for _, row in layout.body))
+    columns, remark = leave_out_lost_readings(
+        printed_columns, layout.head, lines, name, unit_of_place
+    )
+    # columns such as the record number of a Campbell logger
     for index, (title, unit) in enumerate(zip(layout.head, layout.units, strict=True)):
         if unit in NO_READINGS:
             columns[index] = ("",) * len(lines)
             remark += f"; the column {title!r} {NO_READINGS[unit]} and is left out"
-    layout = layout._replace(remark=f"{remark}{layout.remark}")
-    sheets = [
-        _sheet_of_columns(name, file, layout, columns, unit_of_place, separator, date_order=order)
-        for order in possible_date_orders(columns)
-    ]
-    if all(sheet.columns == sheets[0].columns for sheet in sheets):
-        return sheets[0]  # differences of times are the same in both orders
-    day_first, month_first = sheets
+    layout_with_remark = layout._replace(remark=f"{remark}{layout.remark}")
+    # one reading of the dates, or two: the day first, then the month first
+    readings = []
+    for order in possible_date_orders(columns):
+        reading = _sheet_of_columns(
+            name, file, layout_with_remark, columns, unit_of_place, separator, date_order=order
+        )
+        readings.append(reading)
+    if all(reading.columns == readings[0].columns for reading in readings):
+        return readings[0]  # times count from the first row, and are the same in both readings
+    day_first, month_first = readings
     unclear_date = next(
         f"{cell!r} in {unit_of_place} {line}"
         for cells in columns

@@ -25,8 +25,9 @@ LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
 OUTLIER_DEVIATIONS = 5.0
 """Least residual of an outlier, in robust standard deviations and in those of the noise."""
-WRONG_END_DEVIATIONS = 8.0
-"""Least deviation of a wrong reading at the ends of a record, in standard deviations."""
+WRONG_END_RATIO = 8.0
+"""Least distance of a wrong reading at an end of a record from its neighbours' median, in standard
+deviations."""
 _WIDTHS_AND_DEGREES = (
     (3, 5),
     (4, 5),
@@ -43,8 +44,8 @@ _WIDTHS_AND_DEGREES = (
 """Half width (samples) and degree of the local polynomials that are tried."""
 _EDGE_SAMPLES = 3
 """Samples at either end that are not judged, and the least half width."""
-_ENDS = (slice(0, _EDGE_SAMPLES), slice(-_EDGE_SAMPLES, None))
-"""The first and the last samples of a record."""
+_END_SLICES = (slice(0, _EDGE_SAMPLES), slice(-_EDGE_SAMPLES, None))
+"""The slices of the first and of the last samples of a record."""
 _NEIGHBOURS = [0, 1, 3, 4]
 """Indices of the neighbours of the middle sample among five samples in a row."""
 _HALF_WINDOW = 25
@@ -274,19 +275,21 @@ def wrong_end_readings(
                 residual[rows, column], float(noise[column])
             )
             is_wrong[rows, column] = is_wrong_in_channel
-    for end in _ENDS:
-        channels_at_end = np.count_nonzero(is_wrong[end].any(axis=0))
-        if channels_at_end > 1:
-            is_wrong[end] = False
+    for end_slice in _END_SLICES:
+        channels_at_end = np.count_nonzero(is_wrong[end_slice].any(axis=0))
+        if channels_at_end > 1:  # a release, an impact or a late trigger
+            is_wrong[end_slice] = False
     return is_wrong
 
 
 def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     """Return which samples (N,) at the ends of one record are single wrong readings.
 
-    A sample is wrong if its residual is more than twice as large as that of its two neighbours on
-    either side, and differs from their median by more than `WRONG_END_DEVIATIONS` standard
-    deviations.
+    A sample is suspect if its residual is more than twice as large as those of its two neighbours
+    on either side, and differs from their median by more than `WRONG_END_RATIO` standard
+    deviations: those of the noise, or of such differences near this end, whichever are larger. It
+    is wrong if it is the only suspect sample of its end. Several are a release or an impact, and
+    none of them is wrong.
 
     Parameters
     ----------
@@ -295,21 +298,21 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
     noise : float
         The standard deviation of the noise; 0 if it is not known.
     """
+    # windows (N, 5) around each sample, and their (N, 4) neighbours, NaN beyond the record
     padded_residual = np.pad(residual, 2, constant_values=np.nan)
     neighbours = sliding_window_view(padded_residual, 5)[:, _NEIGHBOURS]
-    deviation = residual - np.nanmedian(neighbours, axis=1)
+    distance = np.abs(residual - np.nanmedian(neighbours, axis=1))
     exceeds_neighbours = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
-    # the scatter near each end, where the motion may be fastest
-    deviations_near_ends = (deviation[: 4 * _HALF_WINDOW], deviation[-4 * _HALF_WINDOW :])
+    # The scatter is taken near each end alone: in a decaying motion it differs between the ends.
+    distances_near_ends = (distance[: 4 * _HALF_WINDOW], distance[-4 * _HALF_WINDOW :])
     is_wrong = np.zeros(len(residual), dtype=bool)
-    for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
-        scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
-        scale = max(scatter, noise, LEAST_DIVISOR)
-        is_wrong_at_end = exceeds_neighbours[end] & (
-            np.abs(deviation[end]) > WRONG_END_DEVIATIONS * scale
-        )
-        if is_wrong_at_end.sum() == 1:
-            is_wrong[end] = is_wrong_at_end
+    for end_slice, distance_near_end in zip(_END_SLICES, distances_near_ends, strict=True):
+        scatter = NORMAL_OVER_MAD * float(np.median(distance_near_end))
+        standard_deviation = max(scatter, noise, LEAST_DIVISOR)
+        is_far = distance[end_slice] > WRONG_END_RATIO * standard_deviation
+        is_suspect = exceeds_neighbours[end_slice] & is_far
+        if is_suspect.sum() == 1:
+            is_wrong[end_slice] = is_suspect
     return is_wrong
 
 

@@ -86,7 +86,7 @@ def decide_on_remainder(
 def named_in_part_outcome(
     comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT, probability: float
 ) -> VerdictOutcome:
-    """Return the verdict that names the effects of a hypothesis in part.
+    """Return the verdict that names effects, and leaves a part of the gap unexplained.
 
     Parameters
     ----------
@@ -138,10 +138,12 @@ def named_in_part_outcome(
 
 
 def _shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT) -> str:
-    """Return the sentence on the shape parameters of a single law that the data determine.
+    """Return the sentence on the shape parameters of a law that the data determine.
 
-    It is empty if there are none, or if the law explains less with a free shape in the decisive
-    trials.
+    A parameter is determined if its standard deviation is below
+    `SEARCH.determined_shape_deviation`. The sentence is empty if there is none, if the hypothesis
+    has several laws, or if the law with a fitted shape explains less of the gap in the decisive
+    trials, by more than `SEARCH.least_added_share`.
     """
     if len(best_hypothesis.candidate.terms) != 1:
         return ""
@@ -169,34 +171,37 @@ def _shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: Hypoth
 def _unproved_addition_sentence(
     comparison: Comparison[HypothesisT], best_hypothesis: HypothesisT
 ) -> str:
-    """Return the sentence on a further law that may act too, but has too little evidence.
+    """Return the sentence on effects that may be missing besides those of the best hypothesis.
 
-    It is empty if there is none.
+    They are those that the best ranked larger hypothesis adds. It must have all effects of the best
+    hypothesis, by family and place, and more; all must act on the structure rather than on sensors;
+    its score must be less than `SEARCH.contender_range` lower; and it must explain more of the gap
+    by `SEARCH.negligible_share`. The sentence is empty if there is no such hypothesis.
     """
-    # the most probable set of laws that contains all families of the best hypothesis and more
-    families = family_place_pairs(best_hypothesis)
-    least_score = comparison.score(best_hypothesis) - SEARCH.contender_range
+    best_pairs = family_place_pairs(best_hypothesis)
+    score_floor = comparison.score(best_hypothesis) - SEARCH.contender_range
     larger_hypothesis = None
     for hypothesis in comparison.ranked_hypotheses:
-        has_more_laws = family_place_pairs(hypothesis) > families
-        only_laws = all(comparison.acts_on_structure(term) for term in hypothesis.candidate.terms)
-        if has_more_laws and only_laws and comparison.score(hypothesis) > least_score:
+        has_more_pairs = family_place_pairs(hypothesis) > best_pairs  # a proper superset
+        only_on_structure = all(
+            comparison.acts_on_structure(term) for term in hypothesis.candidate.terms
+        )
+        if has_more_pairs and only_on_structure and comparison.score(hypothesis) > score_floor:
             larger_hypothesis = hypothesis
             break
     if larger_hypothesis is None:
         return ""
-    # it must explain notably more of the gap
-    least_share = (
+    share_floor = (
         comparison.held_out_or_fitted_share(best_hypothesis).value + SEARCH.negligible_share
     )
-    if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
+    if comparison.held_out_or_fitted_share(larger_hypothesis).value < share_floor:
         return ""
     added_effects = []
     for effect in named_effects(comparison.problem, larger_hypothesis):
-        if (effect.family, effect.place) not in families:
+        if (effect.family, effect.place) not in best_pairs:
             added_effects.append(effect)
     return (
-        f" {capital(effects_text(added_effects))} may be missing, too, but this is not proved: it "
+        f" {capital(effects_text(added_effects))} may also be missing, but this is not proved: it "
         "gains less evidence than it costs."
     )
 

@@ -1,4 +1,4 @@
-"""The missing force that a verdict reports: its port, its size, and the variables that order it."""
+"""The missing force that a verdict reports: its port, its size, and the variables it depends on."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -24,13 +24,13 @@ ESTIMATION_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
 """Errors that mean that a missing force cannot be estimated. The verdict is then given without the
 force."""
 MOST_BINS = 24
-"""Largest number of bins of a variable in the test of whether it orders a force."""
+"""Largest number of bins of a variable in the test of whether a force depends on it."""
 LEAST_IN_BIN = 4
 """Least number of samples in a bin."""
 LEAST_ORDER = 0.3
-"""Least share of a force's variance that a variable explains if it orders the force."""
+"""Least share of a force's variance that a variable explains if the force depends on it."""
 TIED_SHARE = 0.05
-"""Difference of these shares up to which two variables order a force equally well."""
+"""Difference of these shares up to which two variables explain a force equally well."""
 LARGEST_SINGLE_SHARE = 0.6
 """Largest share by a single variable, over that by displacement and velocity together, if the force
 follows the two together. On simulated rigs it is at most 0.5 for impacts with loss, and at least
@@ -42,7 +42,7 @@ RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
 """Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
 
-# ---------------------------------------------------------------- variables that order a force
+# ---------------------------------------------------------------- variables a force depends on
 
 
 def explained_variance(variable: FloatArray, force: FloatArray) -> float:
@@ -113,31 +113,34 @@ def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
     return max(1.0 - variance_around / variance, 0.0)
 
 
-def ordering_variables(
+def explanatory_variables(
     force: FloatArray,
     position: FloatArray,
     speed: FloatArray,
     time: FloatArray,
-    further: Mapping[str, FloatArray],
+    other_variables: Mapping[str, FloatArray],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the variables that order a force: the force is nearly a function of such a variable.
+    """Return the variables that a force depends on: it is nearly a function of one of them alone.
+
+    Displacement, velocity, amplitude of the vibration and time are always tried.
 
     Parameters
     ----------
     force, position, speed, time : (N,) array
         The force, the motion of its port, and the time.
-    further : mapping of str to (N,) array
-        Recorded inputs, their rates and a relaxed displacement, by name. A force follows an input
-        if less of it acts than was recorded, the rate of an input if it acts later than recorded,
-        and a relaxed displacement if it has a memory.
+    other_variables : mapping of str to (N,) array
+        Recorded inputs, their rates and a relaxed displacement, by name. A missing force is a
+        function of an input if the input that acts is smaller or larger than the recorded one, of
+        an input's rate if the input acts later than recorded, and of a relaxed displacement if the
+        force depends on the history of the motion.
 
     Returns
     -------
     shares : dict of str to float
-        The share of the force's variance that each variable explains.
+        The share of the force's variance that each variable explains, 0 to 1.
     ordered_by : tuple of str
-        The variables whose share is at least `LEAST_ORDER`, and within `TIED_SHARE` of the largest
-        one.
+        The variables whose share is at least `LEAST_ORDER`, and at most `TIED_SHARE` below the
+        largest one. Empty if there is none.
     """
     # unit standard deviations, so that position and speed of a harmonic motion form a circle
     scaled_position = position / max(float(np.std(position)), LEAST_DIVISOR)
@@ -150,7 +153,7 @@ def ordering_variables(
         "amplitude": explained_variance(amplitude, np.abs(force)),
         "time": explained_variance(time, force),
     }
-    for name, values in further.items():
+    for name, values in other_variables.items():
         shares[name] = explained_variance(values, force)
     least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
     return shares, tuple(name for name, share in shares.items() if share >= least_share)
@@ -192,7 +195,7 @@ class TrialForce:
     position, speed : (N,) array
         The motion of the port [m or rad, and per s]; at a port of a state the speed is the state.
     variables : mapping of str to (N,) array
-        Further variables that the force may follow, see `ordering_variables` [SI].
+        Further variables that the force may follow, see `explanatory_variables` [SI].
     force, deviation : (N,) array
         The smoothed force, and its posterior standard deviation [N, N m or the port's flow].
     law : (N,) array or None
@@ -360,7 +363,7 @@ def _force_at_port(
     force = np.concatenate([trial_force.force for trial_force in trial_forces])
     position = np.concatenate([trial_force.position for trial_force in trial_forces])
     speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
-    shares, ordered_by = _variables_that_order(trial_forces)
+    shares, ordered_by = _explanatory_variables_of_trials(trial_forces)
     # the trial and the sample with the largest force
     trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
     sample_of_largest = int(np.abs(trial_force.force).argmax())
@@ -386,28 +389,28 @@ def _force_at_port(
     )
 
 
-def _variables_that_order(
+def _explanatory_variables_of_trials(
     trial_forces: Sequence[TrialForce],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return what `ordering_variables` returns for the force in all trials together.
+    """Return what `explanatory_variables` returns for the force in all trials together.
 
-    Displacement and velocity together are a further variable, if they explain clearly more than
-    each variable alone, as for an impact with loss or a law with memory.
+    If displacement and velocity together explain clearly more than any variable alone, as for an
+    impact with loss, `STATE` is the only variable that the force depends on.
     """
     # an input that was not recorded in a trial did not act there
     names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)
-    further = {
+    other_variables = {
         name: np.concatenate(
             [trial.variables.get(name, np.zeros_like(trial.force)) for trial in trial_forces]
         )
         for name in names
     }
-    shares, ordered_by = ordering_variables(
+    shares, ordered_by = explanatory_variables(
         force=np.concatenate([trial.force for trial in trial_forces]),
         position=np.concatenate([trial.position for trial in trial_forces]),
         speed=np.concatenate([trial.speed for trial in trial_forces]),
         time=np.concatenate([trial.time for trial in trial_forces]),
-        further=further,
+        other_variables=other_variables,
     )
     share_of_state = variance_explained_by_state(trial_forces)
     is_by_one_variable = max(shares.values()) > LARGEST_SINGLE_SHARE * share_of_state
@@ -417,12 +420,12 @@ def _variables_that_order(
 
 
 def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialForce]:
-    """Return the force in each trial with the relaxed displacement that orders it best.
+    """Add to each trial's variables the relaxed displacement that explains the force best.
 
-    It is added only if it orders the force better than all variables without memory, to which short
-    and long relaxation times come near.
+    It is added only if it explains more of the force than all variables without memory: with
+    a short or long relaxation time it is nearly one of these, velocity or displacement.
     """
-    shares, _ = _variables_that_order(trial_forces)
+    shares, _ = _explanatory_variables_of_trials(trial_forces)
     force = np.concatenate([trial.force for trial in trial_forces])
     interval = min(float(np.median(np.diff(trial.time))) for trial in trial_forces)
     share_of_relaxation = {}

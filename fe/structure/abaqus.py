@@ -28,19 +28,20 @@ In files of other programs these types mean what they say.
 """
 _HEADING_OF_MESHIO = "written by meshio"
 
-_HYBRID_OR_THERMAL_TYPE = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
-"""Hybrid elements (H) and those with a temperature (T), with the plain type as the group.
+_HYBRID_OR_THERMAL_TYPE = re.compile(r"(?P<plain_type>C3D(?:4|6|8|10|15|20|20R))[HT]")
+"""Hybrid elements (H) and those with a temperature (T).
 
 They have the stiffness of the plain type where the material is compressible.
 """
 
-_HYBRID = re.compile(r"(C3D\d+[A-Z]*)H")
-_VARIANT = re.compile(r"(C3D\d+)[A-Z]+")
-_OTHER_STIFFNESS = {
+_HYBRID_TYPE = re.compile(r"(?P<type_without_h>C3D\d+[A-Z]*)H")
+_VARIANT_TYPE = re.compile(r"(?P<plain_type>C3D\d+)[A-Z]+")
+_PROPERTY_OF_VARIANT = {
     "C3D8I": "enhanced by incompatible modes and softer in bending",
     "C3D8R": "integrated at one point and softer in bending",
     "C3D10M": "modified for contact",
 }
+"""How the elements of a variant differ from those of the plain type, as the end of "they are"."""
 
 
 class _ElementType(NamedTuple):
@@ -294,7 +295,7 @@ def _plain_type(name: str, where: str) -> str:
     Raises `MeshError` if elements of this type, such as C3D8I, cannot be read.
     """
     variant = _HYBRID_OR_THERMAL_TYPE.fullmatch(name)
-    plain_type = name if variant is None else variant[1]
+    plain_type = name if variant is None else variant["plain_type"]
     if plain_type not in _ELEMENT_TYPES:
         _refuse_type(name, where)  # never returns
     return plain_type
@@ -303,23 +304,30 @@ def _plain_type(name: str, where: str) -> str:
 def _refuse_type(name: str, where: str) -> NoReturn:
     """Raise the error for an element type that cannot be read.
 
-    For a variant of a known type, the message says how the variant differs.
+    For a variant of a plain type, such as C3D8R of C3D8, the message says how the two differ, and
+    what to write instead.
     """
-    readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
-    variant = _VARIANT.fullmatch(name)
-    if variant is None or variant[1] not in _ELEMENT_TYPES:
-        fail(where, f"elements of type {short_repr(name)} cannot be read; {readable} can.")
-    # A hybrid element differs from the plain type as that without H does.
-    hybrid = _HYBRID.fullmatch(name)
-    displacement_type = name if hybrid is None else hybrid[1]
-    stiffness = _OTHER_STIFFNESS.get(displacement_type, "other elements")
-    difference = f"they are {stiffness}, not {variant[1]}"
-    remedy = f"write {variant[1]} if that is meant"
-    if variant[1] == "C3D8":
+    readable_types = ", ".join(kind.calculix for kind in DECK_KINDS.values())
+    variant = _VARIANT_TYPE.fullmatch(name)
+    if variant is None or variant["plain_type"] not in _ELEMENT_TYPES:
+        fail(
+            where,
+            f"elements of type {short_repr(name)} cannot be read; the types {readable_types} can "
+            "be read.",
+        )
+    # H adds a pressure unknown, and leaves the difference of the type without it: C3D8RH is
+    # integrated at one point, as C3D8R is.
+    hybrid = _HYBRID_TYPE.fullmatch(name)
+    type_without_h = name if hybrid is None else hybrid["type_without_h"]
+    property_of_variant = _PROPERTY_OF_VARIANT.get(type_without_h, "other elements")
+    plain_type = variant["plain_type"]
+    remedy = f"write {plain_type} if that is meant"
+    if plain_type == "C3D8":
         remedy = f"mesh with second-order elements (C3D20, C3D20R or C3D10), or {remedy}"
     fail(
         where,
-        f"elements of type {name} cannot be read: {difference}; {remedy}. {readable} can be read.",
+        f"elements of type {name} cannot be read: they are {property_of_variant}, not "
+        f"{plain_type}; {remedy}. The types {readable_types} can be read.",
     )
 
 

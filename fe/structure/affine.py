@@ -178,21 +178,25 @@ class AffineStructure:
     def theta(
         self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
     ) -> FloatArray:
-        """Return the coefficients (T,) of the stiffness terms.
+        """Return the coefficients (T,) of the T stiffness terms, theta = p (1 - z).
+
+        The stiffness is the sum of the terms' matrices, each times its theta.
 
         Parameters
         ----------
         parameters : mapping of str to float, optional
-            Parameters that differ from their nominal values.
+            Parameters p that differ from their nominal values.
         stiffness_loss : mapping of str to float, or iterable of float
-            Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
+            Stiffness losses z of the regions [1], by name or in the order of `regions`; see
+            `fe.runtime.state.losses_of`.
         """
-        factors = _values_with_changes(self.parameters, parameters, "parameter")
+        parameter_values = _values_with_changes(self.parameters, parameters, "parameter")
         losses = losses_of(stiffness_loss, self.regions)
-        loss_of_region = {None: 0.0} | dict(zip(self.regions, losses, strict=True))
+        loss_of_region: dict[str | None, float] = dict(zip(self.regions, losses, strict=True))
+        loss_of_region[None] = 0.0  # terms outside the damage regions lose no stiffness
         return np.array(
             [
-                factors[term.parameter] * (1.0 - loss_of_region[term.region])
+                parameter_values[term.parameter] * (1.0 - loss_of_region[term.region])
                 for term in self.stiffness_terms
             ]
         )
@@ -212,8 +216,8 @@ class AffineStructure:
         masses : mapping of str to float, optional
             Free masses that differ from their nominal values [kg].
         """
-        factors = _values_with_changes(self.masses, masses, "free mass")
-        return affine_sum([*factors.values()], self.mass_terms)
+        mass_values = _values_with_changes(self.masses, masses, "free mass")
+        return affine_sum([*mass_values.values()], self.mass_terms)
 
     def control_value_alone(self, load: str) -> float:
         """Return the value of a load's control with which the load is examined alone.

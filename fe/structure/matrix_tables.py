@@ -250,20 +250,20 @@ def _dmig_table(path: Path, matrix_name: str) -> FloatArray:
     """Read a real square matrix from DMIG entries of the bulk data, as a table (N, 5)."""
     matrices: dict[str, _DmigMatrix] = {}
     for card in cards(path):
-        if card.word != "DMIG":
+        if card.keyword != "DMIG":
             continue
         name = card.fields[0].upper()
         is_head = name not in matrices
         if is_head:
-            matrices[name] = _DmigMatrix(form=card.whole(2), entries=[])
-            if card.whole(3) not in _REAL_TYPES:
+            matrices[name] = _DmigMatrix(form=card.integer(2), entries=[])
+            if card.integer(3) not in _REAL_TYPES:
                 fail(card.where, f"a real matrix is expected, but {name} is complex.")
             continue
-        column = (card.whole(1), max(card.whole(2), 1))
+        column = (card.integer(1), max(card.integer(2), 1))
         for first in range(4, len(card.fields), 4):
             if card.fields[first]:
-                row = (card.whole(first), max(card.whole(first + 1), 1))
-                (value,) = card.reals(first + 2, 1)
+                row = (card.integer(first), max(card.integer(first + 1), 1))
+                (value,) = card.floats(first + 2, 1)
                 matrices[name].entries.append((*row, *column, value))
     chosen_name = matrix_name.upper()
     if not chosen_name and len(matrices) == 1:

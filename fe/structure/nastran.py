@@ -43,32 +43,32 @@ class _Card(NamedTuple):
 
     Attributes
     ----------
-    word : str
-        Its keyword.
+    keyword : str
+        Such as `GRID`, in capital letters.
     where : str
         File and line of the entry.
     fields : list of str
         The fields after the keyword, with those of continuation lines.
     """
 
-    word: str
+    keyword: str
     where: str
     fields: list[str]
 
-    def whole(self, index: int, default: int = 0) -> int:
-        """Return a field as an integer, or the default if it is empty."""
+    def integer(self, index: int, default: int = 0) -> int:
+        """Return a field as an integer, or the default if it is empty or missing."""
         text = self.fields[index] if index < len(self.fields) else ""
         return whole(self.where, text) if text else default
 
-    def reals(self, first: int, count: int) -> list[float]:
-        """Return `count` fields as floats, empty ones as 0."""
+    def floats(self, first: int, count: int) -> list[float]:
+        """Return `count` fields from the index `first` on as floats, empty or missing ones as 0."""
         padded_fields = self.fields + [""] * (first + count)
         return [real(self.where, text) for text in padded_fields[first : first + count]]
 
     @property
     def is_by_grid_points(self) -> bool:
         """Whether the card defines a coordinate system by grid points, such as CORD1R."""
-        return self.word[4] == "1"
+        return self.keyword[4] == "1"
 
 
 def read_nastran(path: Path) -> Deck:
@@ -85,19 +85,19 @@ def read_nastran(path: Path) -> Deck:
     deck = Deck(path, words_of("nastran"))
     points = _GridPoints()
     for card in cards(path):
-        word = card.word
-        if word == "GRID":
+        keyword = card.keyword
+        if keyword == "GRID":
             points.add_grid(card)
-        elif word == "GRDSET":
-            points.default_system = card.whole(1)
-        elif _SYSTEM_WORDS.fullmatch(word):
+        elif keyword == "GRDSET":
+            points.default_system = card.integer(1)
+        elif _SYSTEM_WORDS.fullmatch(keyword):
             points.add_systems(card)
-        elif word in _CORNERS_OF_SOLIDS or word in _FLAT_WORDS:
+        elif keyword in _CORNERS_OF_SOLIDS or keyword in _FLAT_WORDS:
             _add_element(deck, card)
-        elif _SECTION_WORDS.fullmatch(word):
-            deck.sections[f"nastran:ref={card.whole(0)}"] = card.where
+        elif _SECTION_WORDS.fullmatch(keyword):
+            deck.sections[f"nastran:ref={card.integer(0)}"] = card.where
         else:
-            deck.pass_over(word, card.where)
+            deck.pass_over(keyword, card.where)
     for number, card in points.grids.items():
         deck.add_node(card.where, number, points.point(number, card.where).tolist())
     return deck
@@ -125,80 +125,87 @@ class _GridPoints:
 
     def add_grid(self, card: _Card) -> None:
         """Add the card of a grid point."""
-        number = card.whole(0)
+        number = card.integer(0)
         if self.grids.setdefault(number, card).fields != card.fields:
-            fail(card.where, f"the grid point {number} is there twice; delete one.")
+            fail(card.where, f"the grid point {number} is defined twice; delete one definition.")
 
     def add_systems(self, card: _Card) -> None:
         """Add the coordinate systems of a card; a card by grid points may hold two."""
-        holds_two = card.is_by_grid_points and card.whole(4) != 0
+        holds_two = card.is_by_grid_points and card.integer(4) != 0
         for first_field in (0, 4) if holds_two else (0,):
-            number = card.whole(first_field)
+            number = card.integer(first_field)
             self._system_cards[number] = card._replace(fields=card.fields[first_field:])
 
     def point(self, number: int, where: str, depth: int = 0) -> FloatArray:
         """Return the global coordinates (3,) of a grid point.
 
-        `where` is the file and line that name it, for the error message; `depth` counts the nested
-        coordinate systems.
+        `where` is the file and line that refer to it, for the error message; `depth` is the number
+        of coordinate systems that are being resolved.
         """
         if number not in self.grids:
-            fail(where, f"the grid point {number} is not there.")
+            fail(where, f"the grid point {number} is not defined.")
         card = self.grids[number]
-        system = self._system(card.whole(1, self.default_system), card.where, depth)
-        return system.to_space(card.reals(2, 3))
+        system = self._system(card.integer(1, self.default_system), card.where, depth)
+        return system.to_space(card.floats(2, 3))
 
     def _system(self, number: int, where: str, depth: int) -> CoordinateSystem:
-        """Return a coordinate system by its number; the parameters are as in `point`."""
+        """Return a coordinate system by its number; resolve it, and those it refers to, if new.
+
+        `where` is the file and line that refer to it, for the error message; `depth` is the number
+        of coordinate systems that are being resolved, by which a circular definition is recognised.
+        """
         if number in self._systems:
             return self._systems[number]
         if number not in self._system_cards:
-            fail(where, f"the coordinate system {number} is not there.")
+            fail(where, f"the coordinate system {number} is not defined.")
         if depth > _MOST_NESTED_SYSTEMS:
             fail(
                 where,
-                f"the coordinate system {number} rests on itself, or on too many others.",
+                f"the coordinate system {number} refers to itself, or to a chain of more than "
+                f"{_MOST_NESTED_SYSTEMS} others.",
             )
         card = self._system_cards[number]
-        # origin, a point on z, and one in the plane of x and z
+        # rows of `points`: the origin, a point on z, and one in the plane of x and z
         if card.is_by_grid_points:
             three_points = [
-                self.point(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)
+                self.point(card.integer(field), card.where, depth + 1) for field in (1, 2, 3)
             ]
             points = np.array(three_points)
         else:
-            reference = self._system(card.whole(1), card.where, depth + 1)
-            points = reference.to_space(np.reshape(card.reals(2, 9), (3, 3)))
+            reference = self._system(card.integer(1), card.where, depth + 1)
+            points = reference.to_space(np.reshape(card.floats(2, 9), (3, 3)))
+        # so the axes are found in the order z, x, y: x is the second, y the third, z the first
         axes = axes_by_points(card.where, points, order=(1, 2, 0))
-        kind = card.word[5]
+        kind = card.keyword[5]
         self._systems[number] = CoordinateSystem(points[0], axes, kind)
         return self._systems[number]
 
 
 def _add_element(deck: Deck, card: _Card) -> None:
     """Add an element, also to the set of its property."""
-    number = card.whole(0)
-    if card.word in _FLAT_WORDS:
-        meshio_name = _FLAT_WORDS[card.word]
+    number = card.integer(0)
+    if card.keyword in _FLAT_WORDS:
+        meshio_name = _FLAT_WORDS[card.keyword]
         node_count = FLAT[meshio_name].node_count
-        nodes = [card.whole(field) for field in range(2, 2 + node_count)]
+        nodes = [card.integer(field) for field in range(2, 2 + node_count)]
     else:
         meshio_name, nodes = _solid_element(card)
     deck.add_element(card.where, number, meshio_name, nodes)
-    deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
+    deck.members("ELSET", f"nastran:ref={card.integer(1, number)}").append(number)
 
 
 def _solid_element(card: _Card) -> tuple[str, list[int]]:
     """Return the meshio type of a solid element, and its nodes in meshio's order."""
-    fields = [card.whole(field) for field in range(2, len(card.fields))]
+    fields = [card.integer(field) for field in range(2, len(card.fields))]
     nodes = [node for node in fields if node]
-    corner_count = _CORNERS_OF_SOLIDS[card.word]
+    corner_count = _CORNERS_OF_SOLIDS[card.keyword]
     kinds = {kind.node_count: kind for kind in KINDS.values() if len(kind.corners) == corner_count}
     if len(nodes) not in kinds:
         counts = " or ".join(str(count) for count in kinds)
         fail(
             card.where,
-            f"{card.word} {card.whole(0)} must have {counts} nodes, but {len(nodes)} were given.",
+            f"{card.keyword} {card.integer(0)} must have {counts} nodes, but {len(nodes)} were "
+            "given.",
         )
     meshio_name = kinds[len(nodes)].file_type
     order = _ORDER_FOR_MESHIO.get(meshio_name, range(len(nodes)))

@@ -19,9 +19,9 @@ class FaceAreas(NamedTuple):
     Attributes
     ----------
     vectors : (nodes, 3) array
-        Integrals with the outward normal [m^2].
+        Integrals of each node's shape function times the outward unit normal [m^2].
     areas : (nodes,) array
-        Integrals alone [m^2]; their sum is the area.
+        Integrals of each node's shape function [m^2]; their sum is the area of the faces.
     """
 
     vectors: FloatArray
@@ -29,23 +29,27 @@ class FaceAreas(NamedTuple):
 
 
 def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
-    """Integrate each node's shape function over faces."""
+    """Integrate each node's shape function over faces, with and without the outward normal.
+
+    In the comments, F is the number of faces with the same local number, Q of integration points
+    on a face, A of nodes of a cell.
+    """
     kind = mesh.kind
     frames = kind.face_frames
     vectors = np.zeros((len(mesh.points), 3))
     areas = np.zeros(len(mesh.points))
-    for number in np.unique(surface.face).tolist():
-        has_number = surface.face == number
-        cells = surface.cell[has_number]
-        # shape functions at the integration points of the face
-        rule = kind.face_rule(number)
-        tangents = frames.tangents[number]
-        local_positions = frames.corner[number] + rule.points @ tangents
+    for local_face in np.unique(surface.face).tolist():
+        cells = surface.cell[surface.face == local_face]  # (F,)
+        # shape functions (Q, A) and gradients (Q, A, 3) at the integration points of the face
+        rule = kind.face_rule(local_face)
+        tangents = frames.tangents[local_face]  # (2, 3), in local coordinates of the cell
+        local_positions = frames.corner[local_face] + rule.points @ tangents
         values, gradients = kind.shape_functions(local_positions)
-        # the shape function of a node off the face is zero on it, up to rounding
-        off_face = np.setdiff1d(range(kind.node_count), kind.face_nodes[number])
+        # the shape function of a node off the face is zero on it; rounding is removed
+        off_face = np.setdiff1d(range(kind.node_count), kind.face_nodes[local_face])
         values[:, off_face] = 0.0
-        # normals in space, as long as the area of each integration point
+        # tangents in space (F, Q, 2, 3): sum over nodes a and local axes j of the node's position,
+        # the gradient of its shape function, and the local tangent
         tangents_in_space = np.einsum(
             "nai,qaj,tj->nqti",
             mesh.nodes[cells],
@@ -53,9 +57,10 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
             tangents,
             optimize=True,
         )
+        # area vectors (F, Q, 3) of the integration points: outward normals whose length is the area
         along_first, along_second = np.moveaxis(tangents_in_space, 2, 0)
         normals = np.cross(along_first, along_second) * rule.weights[:, None]
-        # their integrals with the shape functions
+        # integrals (F, A, 3) and (F, A)
         area_vectors = np.einsum("nqi,qa->nai", normals, values)
         node_areas = np.linalg.norm(normals, axis=2) @ values
         np.add.at(vectors, mesh.cells[cells], area_vectors)

@@ -170,27 +170,30 @@ class RunningFmu:
     def run(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
         """Make steps until all are made, an output is not finite, or the FMU ends.
 
-        If a step fails, the asset is left in the state after the last complete step.
+        The asset is left after the last complete step, also if the run fails or is interrupted.
+        An FMU that ends its simulation is not a failure: that error is returned, all others are
+        raised with step and time.
 
         Parameters
         ----------
         requests : (N, 2 + n_inputs) ndarray
-            The request of each step.
+            For each step the time, the step size, and the inputs.
         replies : (N, n_outputs) ndarray
-            Filled with the reply of each step.
+            Row k is filled with the outputs after step k, for the steps that are made.
 
         Returns
         -------
         FmuEndedError or None
-            How the FMU ended its simulation, if it did.
+            The error with which the FMU ended its simulation; None if it did not.
         """
-        previous_request = np.array(self.host.request)
-        steps_made = 0
+        request_before_run = np.array(self.host.request)
+        completed_steps = 0
 
         def count_and_show(count: int) -> None:
-            nonlocal steps_made
-            stage.advance(count - steps_made)
-            steps_made = count
+            """Note how many steps of this run are complete; `host.run` calls this as it goes."""
+            nonlocal completed_steps
+            stage.advance(count - completed_steps)
+            completed_steps = count
 
         failure: FmuError | None = None
         try:
@@ -198,11 +201,17 @@ class RunningFmu:
         except FmuError as error:
             failure = error
         finally:
-            self.step_index += steps_made
-            last_request = requests[steps_made - 1] if steps_made else previous_request
+            # Also on Ctrl-C. The host's request becomes that of the last complete step, because the
+            # next step and a saved state take the inputs in force from it.
+            self.step_index += completed_steps
+            last_request = requests[completed_steps - 1] if completed_steps else request_before_run
             self.host.request[:] = last_request.data
             if self.state_method == "replay":
-                self._record += [row[REQUEST_HEAD:].tobytes() for row in requests[:steps_made]]
+                # A state is restored by making all steps again: their inputs are recorded, but not
+                # time and step size, which follow from the index of the step.
+                for request in requests[:completed_steps]:
+                    self._record.append(request[REQUEST_HEAD:].tobytes())
+        # raised only now that the asset is in order
         if failure is not None and not isinstance(failure, FmuEndedError):
             self.raise_located(failure, f"step {self.step_index} from t = {self.time:g} s")
         return failure

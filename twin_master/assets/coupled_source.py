@@ -70,7 +70,7 @@ class ComponentSection(FileSection):
         return super()._is_shipped(key, name)
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: no FMU, or two."""
+        """Yield (has failed, message) for each rule on the FMU, of which exactly one is needed."""
         has_fmu = self.fmu is not None
         has_design = self.design is not None
         yield (
@@ -156,7 +156,7 @@ class CoupledSection(SeveralSection):
         return CoupledSource(scenario, self)
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names of components."""
+        """Yield (has failed, message) for each rule on names of components."""
         yield from super().checks()
         names = [component.name for component in self.component]
         yield repeated_name_check("component", names)

@@ -79,7 +79,7 @@ class FmuSection(AssetSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: parameters that are seeds."""
+        """Yield (has failed, message) for each rule on parameters that are seeds."""
         for name in self.seeds:
             yield (
                 name in self.parameters,

@@ -22,8 +22,8 @@ from twin_master.gauges.fault_kernels import (
 from twin_master.gauges.free_gains import update_free_gains
 from twin_master.gauges.gauge_faults import update_gauge_faults
 from twin_master.gauges.model_likelihood import (
+    drop_pairs_negligible_under_faults,
     model_likelihood,
-    pairs_of_faults,
     pairs_of_hypotheses,
 )
 
@@ -84,7 +84,7 @@ def correct_beliefs(
                 recovered_squares = priors.degrees_of_freedom + beliefs.recovered_squares[twin, g]
                 log_scale_ratio += np.log(model_squares[g] / recovered_squares)
         number_products(observation.degrees_after, observation.product)
-        fault_pairs = pairs_of_faults(beliefs, twin)
+        fault_pairs = drop_pairs_negligible_under_faults(beliefs, twin)
         considered_pairs = pairs_of_hypotheses(beliefs, twin, fault_pairs)
         standardize(predictions, observations, twin, precision, considered_pairs, observation)
 

@@ -18,7 +18,8 @@ from twin_master.gauges.fault_kernels import (
     log_density_of_sound_gauges,
 )
 
-_NEGLIGIBLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
+_NEGLIGIBLE_IN_SINGLE = np.float32(NEGLIGIBLE_UNDER_FAULT)
+"""The same in the precision of `Beliefs.gauge`, whose many entries are compared with it."""
 
 
 class ModelLikelihood(NamedTuple):
@@ -46,39 +47,46 @@ class ModelLikelihood(NamedTuple):
 
 
 @compiled
-def pairs_of_faults(beliefs: Beliefs, twin: int) -> Index:
-    """Return the indices (n,) of the pairs whose probability under some fault is not negligible.
+def drop_pairs_negligible_under_faults(beliefs: Beliefs, twin: int) -> Index:
+    """Zero a twin's beliefs in gauge faults where negligible; return the indices (n,) of the rest.
 
-    In all other pairs the beliefs of gauge faults become zero.
+    A pair of draw and state is negligible if its probability is below `NEGLIGIBLE_UNDER_FAULT`
+    under each fault of a gauge and under free gains. There `beliefs.gauge` and
+    `beliefs.gauge_is_nonzero` are changed in place.
     """
-    _, pairs, faults = beliefs.gauge.shape
-    considered_pairs = np.empty(pairs, np.int64)
+    _, pair_count, fault_count = beliefs.gauge.shape  # (B, N, R)
+    considered_pairs = np.empty(pair_count, np.int64)
     count = 0
-    for i in range(pairs):
-        believing_faults = np.int64(beliefs.free_gains[twin, i] >= NEGLIGIBLE_UNDER_FAULT)
+    probability_under_free_gains = beliefs.free_gains[twin]  # (N,)
+    for i in range(pair_count):
+        hypotheses_of_pair = np.int64(probability_under_free_gains[i] >= NEGLIGIBLE_UNDER_FAULT)
         if beliefs.gauge_is_nonzero[twin, i]:
-            for r in range(faults):
-                believing_faults += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE
-        if believing_faults > 0:
+            for r in range(fault_count):
+                hypotheses_of_pair += beliefs.gauge[twin, i, r] >= _NEGLIGIBLE_IN_SINGLE
+        if hypotheses_of_pair > 0:
             considered_pairs[count] = i
             count += 1
         elif beliefs.gauge_is_nonzero[twin, i]:
-            for r in range(faults):
+            for r in range(fault_count):
                 beliefs.gauge[twin, i, r] = 0.0
             beliefs.gauge_is_nonzero[twin, i] = False
     return considered_pairs[:count]
 
 
 @compiled
-def pairs_of_hypotheses(beliefs: Beliefs, twin: int, pairs_of_faults: Index) -> Index:
-    """Return the indices of the pairs that any hypothesis of a twin considers, in rising order."""
-    pairs = beliefs.model.shape[1]
-    is_considered = np.zeros(pairs, np.bool_)
-    for i in pairs_of_faults:
+def pairs_of_hypotheses(beliefs: Beliefs, twin: int, fault_pairs: Index) -> Index:
+    """Return the pairs that are not negligible under any hypothesis of a twin, in rising order.
+
+    Added to `fault_pairs` (n,) are those whose probability under the model, or after a fault has
+    ended, is at least `NEGLIGIBLE_UNDER_MODEL`.
+    """
+    pair_count = beliefs.model.shape[1]
+    is_considered = np.zeros(pair_count, np.bool_)
+    for i in fault_pairs:
         is_considered[i] = True
-    considered_pairs = np.empty(pairs, np.int64)
+    considered_pairs = np.empty(pair_count, np.int64)
     count = 0
-    for i in range(pairs):
+    for i in range(pair_count):
         largest = max(beliefs.model[twin, i], beliefs.recovered[twin, i])
         if is_considered[i] or largest >= NEGLIGIBLE_UNDER_MODEL:
             considered_pairs[count] = i

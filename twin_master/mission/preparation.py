@@ -251,7 +251,7 @@ class Knowledge:
 
     @cached_property
     def learning(self) -> LearningFilter | None:
-        """The learning filter, without the watch over the gauges; None if nothing is learnt.
+        """The learning filter, without the search for faulty gauges; None if nothing is learnt.
 
         Raises
         ------
@@ -282,27 +282,32 @@ class Knowledge:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The estimator of the belief: the given one, the learning filter, or the exact filter.
+        """The estimator of the belief: the user's own, else the learning or the exact filter.
 
-        If no estimator is given and the scenario asks for notices, the estimator also watches the
-        gauges.
+        If the scenario has a table `notice`, the learning or exact filter is wrapped in an
+        estimator that also looks for faulty gauges, and reports them as notices. An estimator of
+        the user's own is not wrapped.
 
         Raises
         ------
         InvalidModelError
-            If there are too many states to give notices, or for the reasons of `learning`.
+            If there are too many states to look for faulty gauges, if a transition factor makes a
+            probability larger than one, or if saturation is to be learnt of sensors whose noise is
+            not Gaussian.
         """
         if self.parts.estimator is not None:
+            # The user's function that makes the estimator is given this preparation, and may ask it
+            # for the scenario's estimator. With the user's own it would call itself without end.
             without_estimator = replace(self, parts=replace(self.parts, estimator=None))
             return self.parts.make_estimator(without_estimator)
         scenario = self.scenario
-        filter_of_belief: Estimator = self.learning or ExactFilter(
+        belief_filter: Estimator = self.learning or ExactFilter(
             self.model, self.sensor_model, scenario.mission.name
         )
         if scenario.notice is None:
-            return filter_of_belief
+            return belief_filter
         return WatchfulEstimator(
-            filter_of_belief,
+            belief_filter,
             self.sensor_model,
             self.draws.values,
             scenario.notice,

@@ -200,8 +200,9 @@ def transition_bytes(states: int, controls: int) -> float:
 def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
     """Return the non-zero transitions of several blocks as sparse rows (the CSR format).
 
-    A row belongs to a block, a control and a level, and lists the levels from which that level is
-    reached in a step.
+    There is a row for each block, control and next level, in this order. It lists the levels from
+    which the next level is reached in one step. The rows of all blocks are in the same arrays:
+    `first_row` has the first row of each block, and `start` the first entry of each row.
 
     Parameters
     ----------
@@ -210,28 +211,27 @@ def predecessor_lists(blocks: Sequence[Float]) -> PredecessorLists:
         differ from block to block.
     """
     level_counts = [block.shape[1] for block in blocks]
-    row_counts = []
-    entry_counts = []
-    predecessors = []
-    probabilities = []
+    rows_per_block = []
+    entries_per_row = []  # for each block (U L,)
+    predecessors_by_block = []  # for each block one per non-zero entry, as the probabilities
+    probabilities_by_block = []
     for block, level_count in zip(blocks, level_counts, strict=True):
-        # table (U L, L) of the block: row (control, next level), column level
+        # (U L, L): a row for each control and next level, a column for each level before
         table = block.transpose(0, 2, 1).reshape(-1, level_count)
-        row, level = np.nonzero(table)
-        row_counts.append(len(table))
-        entry_counts.append(np.count_nonzero(table, axis=1))
-        predecessors.append(level)
-        probabilities.append(table[row, level])
-    # The rows of all blocks stand one after the other, and so do the entries of all rows.
-    first_row = np.cumsum([0, *row_counts])[:-1]
-    first_entry = np.cumsum([0, *np.concatenate(entry_counts)])
-    predecessor = np.concatenate(predecessors)
-    probability = np.concatenate(probabilities)
+        row, predecessor_level = np.nonzero(table)
+        rows_per_block.append(len(table))
+        entries_per_row.append(np.count_nonzero(table, axis=1))
+        predecessors_by_block.append(predecessor_level)
+        probabilities_by_block.append(table[row, predecessor_level])
+    first_row = np.cumsum([0, *rows_per_block])[:-1]
+    start = np.cumsum([0, *np.concatenate(entries_per_row)])
+    predecessor = np.concatenate(predecessors_by_block)
+    probability = np.concatenate(probabilities_by_block)
     # Indices are unsigned, so that the compiled loops need not test for negative ones.
     return PredecessorLists(
         levels=np.array(level_counts, dtype=np.int64),
         first_row=first_row,
-        start=first_entry.astype(np.uint64),
+        start=start.astype(np.uint64),
         predecessor=predecessor.astype(np.uint64),
         probability=probability,
         log_probability=np.log(probability),

@@ -52,21 +52,26 @@ _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
 """Pattern of the former name `turns` of arrays in saved states, with or without a prefix."""
 
 
-def factor_tables(scenario: Scenario, leaving_factor: float = 1.0) -> dict[str, dict[str, Float]]:
-    """Return the transitions of each factor under each control, including repairs by actions.
-
-    The result has a table (levels, levels) by the name of the control and that of the factor.
+def factor_tables(
+    scenario: Scenario, leaving_multiplier: float = 1.0
+) -> dict[str, dict[str, Float]]:
+    """Return the transition table of each state factor under each control, with repairs by actions.
 
     Parameters
     ----------
-    leaving_factor : float
-        The factor by which all probabilities of leaving a level are multiplied.
+    leaving_multiplier : float
+        All probabilities of leaving a level are multiplied by this, but not those of a repair.
+
+    Returns
+    -------
+    dict of str to dict of str to (levels, levels) array
+        p(next level | level), by the name of the control, then that of the state factor.
     """
     tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
-    if leaving_factor != 1.0:
+    if leaving_multiplier != 1.0:
         for control_tables in tables.values():
             for name, table in control_tables.items():
-                control_tables[name] = leaving_table(table, leaving_factor)
+                control_tables[name] = leaving_table(table, leaving_multiplier)
     for action in scenario.action:
         action_tables = tables[action.name]
         for name in action.repairs:
@@ -75,7 +80,7 @@ def factor_tables(scenario: Scenario, leaving_factor: float = 1.0) -> dict[str, 
 
 
 def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
-    """Return the transitions of each factor under a control, as the scenario states them."""
+    """Return the table of each state factor under a control, as stated, without any repair."""
     transition = scenario.transition
     if transition.kind == "independent_tables":
         stated_tables = transition.tables[control]
@@ -87,25 +92,25 @@ def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
     return tables
 
 
-def build_graphical_model(scenario: Scenario, leaving_factor: float = 1.0) -> GraphicalModel:
-    """Return states, controls, prior and transitions of a scenario.
+def build_graphical_model(scenario: Scenario, leaving_multiplier: float = 1.0) -> GraphicalModel:
+    """Return the states, controls, prior and transitions of a scenario.
 
-    Kapteyn et al. 2021, eqs. (28)-(29): the factors of the state change independently given the
-    control, and are independent before the first observation.
+    It is assumed that the factors of the state change independently given the control, and are
+    independent before the first observation: Kapteyn et al. 2021, eqs. (28)-(29).
 
     Parameters
     ----------
-    leaving_factor : float
-        The factor by which all probabilities of leaving a level are multiplied.
+    leaving_multiplier : float
+        All probabilities of leaving a level are multiplied by this, but not those of a repair.
 
     Raises
     ------
     InvalidModelError
-        If the factor makes a probability larger than one.
+        If the multiplier makes a probability larger than one.
     """
     return GraphicalModel.from_tables(
         levels={factor.name: factor.levels for factor in scenario.state},
-        tables=factor_tables(scenario, leaving_factor),
+        tables=factor_tables(scenario, leaving_multiplier),
         prior={factor.name: factor.prior for factor in scenario.state},
     )
 

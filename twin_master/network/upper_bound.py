@@ -3,7 +3,10 @@
 A corner is the belief that is certain of a state. For each first control the best return is convex
 in the belief, and proportional to it if the row of probabilities is scaled. So if a row is a sum of
 beliefs, each times a weight, its return is at most the sum of their values times the weights (the
-sawtooth bound, Hauskrecht 2000).
+sawtooth bound, Hauskrecht 2000). Such a sum is here called a composition of the row.
+
+Shapes: J beliefs with a known bound, S states, U controls, K rows, at most P beliefs in a
+composition.
 """
 
 from dataclasses import dataclass
@@ -59,15 +62,15 @@ class Composition(NamedTuple):
         The upper bound of the return at each row.
     corner_bound : (K, U) array
         The bound by the corners alone, with each control first.
-    chosen : (K, U, P) array
-        The indices of the beliefs that are subtracted from each row, one after the other.
+    belief_index : (K, U, P) array
+        The indices of those beliefs among the J, for the bound with each control first.
     weight : (K, U, P) array
-        The weight of each in the row; zero for parts that are not used.
+        Their weights; zero where fewer than P beliefs are used.
     """
 
     bound: Float
     corner_bound: Float
-    chosen: Index
+    belief_index: Index
     weight: Float
 
 
@@ -100,7 +103,7 @@ def _compose_rows(
         The result, filled here; `weight` must be zero before the call.
     """
     start, state, probability = beliefs
-    bound, corner_bound, chosen, weight = composition
+    bound, corner_bound, belief_index, weight = composition
     for row in range(len(rows)):
         corner_bound[row] = corner @ rows[row]
         largest_bound = -np.inf
@@ -110,7 +113,7 @@ def _compose_rows(
             control_bound = corner_bound[row, control]
             remaining = rows[row].copy()
             remaining_mass = rows[row].sum()
-            for part in range(chosen.shape[2]):
+            for part in range(belief_index.shape[2]):
                 if control_bound <= largest_bound:
                     break
                 # The belief that lowers the bound most.
@@ -128,12 +131,12 @@ def _compose_rows(
                     if largest_weight * drop[j, control] < lowest:
                         lowest = largest_weight * drop[j, control]
                         lowest_weight = largest_weight
-                        chosen[row, control, part] = j
+                        belief_index[row, control, part] = j
                 if lowest_weight == 0.0:
                     break
                 # Subtract it from the row.
                 weight[row, control, part] = lowest_weight
-                j = chosen[row, control, part]
+                j = belief_index[row, control, part]
                 for i in range(start[j], start[j + 1]):
                     remainder = remaining[state[i]] - lowest_weight * probability[i]
                     remaining[state[i]] = max(remainder, 0.0)
@@ -152,11 +155,12 @@ class _NextRows:
     corner_bound : (N, U) array
         The bound of each next belief by the corners alone; updated in place.
     belief_and_control : (N, U, P) array
-        The parts of each next belief: flat indices of a belief and a control in (J, U).
+        The beliefs in the composition of each next belief under each control: flat indices into a
+        (J, U) array, of a belief and that control.
     weight : (N, U, P) array
         The weights of these beliefs.
-    certain_probability : (N, C) array
-        The probability of each of the C states whose corner is one of the beliefs.
+    corner_probability : (N, C) array
+        The probability, in each next belief, of the C states whose corner is one of the J beliefs.
     first_row : (J U,) array
         The index of the first next belief of each belief under each control.
     """
@@ -164,7 +168,7 @@ class _NextRows:
     corner_bound: Float
     belief_and_control: Index
     weight: Float
-    certain_probability: Float
+    corner_probability: Float
     first_row: Index
 
 
@@ -208,13 +212,13 @@ class UpperBound:
         self._order = np.argsort(self._drop, axis=0)
 
     def _compose(self, rows: Float) -> Composition:
-        """Return rows (K, S) as sums of beliefs and corners, with the bounds that follow."""
+        """Write rows (K, S) as sums of beliefs and corners, and return the resulting bounds."""
         rows = np.ascontiguousarray(rows)
         shape = (len(rows), len(self._corner))
         composition = Composition(
             bound=np.empty(len(rows)),
             corner_bound=np.empty(shape),
-            chosen=np.zeros((*shape, _MOST_PARTS), dtype=np.int64),
+            belief_index=np.zeros((*shape, _MOST_PARTS), dtype=np.int64),
             weight=np.zeros((*shape, _MOST_PARTS)),
         )
         _compose_rows(
@@ -302,31 +306,33 @@ class UpperBound:
                 corner_value = self._value[corner_beliefs].T
                 lowering = np.minimum(corner_value - self._corner[:, corner_states], 0.0)
                 self._corner[:, corner_states] += lowering
-                next_rows.corner_bound[:] += next_rows.certain_probability @ lowering.T
+                next_rows.corner_bound[:] += next_rows.corner_probability @ lowering.T
                 self._update_drop()
 
     def _compose_next_rows(self, corner_states: Index) -> _NextRows:
-        """Return the compositions of all next beliefs of all beliefs.
+        """Compose every belief that can follow any of the J beliefs, under any control.
 
         Parameters
         ----------
         corner_states : (C,) array
-            The states whose corners are among the beliefs.
+            The states whose corners are among the J beliefs.
         """
-        controls = len(self._corner)
+        control_count = len(self._corner)
         compositions = []
-        certain_probabilities = []
+        corner_probabilities = []
         for belief in self._beliefs:
-            for control in range(controls):
-                rows = self._problem.next_beliefs(belief, control)
+            for control in range(control_count):
+                rows = self._problem.next_beliefs(belief, control)  # (observations, S)
                 compositions.append(self._compose(rows))
-                certain_probabilities.append(rows[:, corner_states])
+                corner_probabilities.append(rows[:, corner_states])
         row_counts = [len(composition.bound) for composition in compositions]
-        chosen_beliefs = np.concatenate([composition.chosen for composition in compositions])
+        belief_index = np.concatenate([composition.belief_index for composition in compositions])
+        # (N, U, P): the flat index in (J, U) of belief j under control u is j U + u.
+        belief_and_control = belief_index * control_count + np.arange(control_count)[:, None]
         return _NextRows(
-            corner_bound=np.concatenate([part.corner_bound for part in compositions]),
-            belief_and_control=chosen_beliefs * controls + np.arange(controls)[:, None],
+            corner_bound=np.concatenate([composition.corner_bound for composition in compositions]),
+            belief_and_control=belief_and_control,
             weight=np.concatenate([composition.weight for composition in compositions]),
-            certain_probability=np.concatenate(certain_probabilities),
+            corner_probability=np.concatenate(corner_probabilities),
             first_row=np.cumsum([0, *row_counts[:-1]]),
         )

@@ -147,7 +147,7 @@ class ScenarioTables(Section):
         return tuple(all_readings)
 
     def _control_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: states and controls."""
+        """Yield (has failed, message) for each rule on states and controls."""
         controls = self.control_names
         yield repeated_name_check("state", self.state_names)
         yield repeated_name_check("control", controls)
@@ -199,7 +199,7 @@ class ScenarioTables(Section):
         return len(messages) > 1, "; ".join(messages)
 
     def _action_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names and costs of actions."""
+        """Yield (has failed, message) for each rule on names and costs of actions."""
         controls = self.control_names
         # `with_controls_of_actions` added the controls of the actions at the end.
         controls_of_file = controls[: -len(self.action)] if self.action else controls
@@ -223,7 +223,7 @@ class ScenarioTables(Section):
                 yield unknown_name_check(state, self.state_names, key, "state")
 
     def _growth_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: random growth and repairs."""
+        """Yield (has failed, message) for each rule on random growth and repairs."""
         truth = self.truth
         is_random = truth.kind == "random_growth"
         if truth.probability:
@@ -245,7 +245,7 @@ class ScenarioTables(Section):
             )
 
     def _truth_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: origin of the true state."""
+        """Yield (has failed, message) for each rule on the origin of the true state."""
         truth = self.truth
         if truth.kind == "asset":
             yield (
@@ -262,7 +262,7 @@ class ScenarioTables(Section):
             yield unknown_name_check(gain.state, self.state_names, "truth.gains.state", "state")
 
     def _reward_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault of the sensors that rewards name."""
+        """Yield (has failed, message) for each rule on the sensors that rewards name."""
         rewards = self.rewards
         sensor_count = self.observation.count
         limited_count = sensor_count
@@ -279,7 +279,7 @@ class ScenarioTables(Section):
         yield value_count_check("rewards.error_scale", rewards.error_scale, sensor_count)
 
     def _sensor_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault of values stated by sensor."""
+        """Yield (has failed, message) for each rule on values stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
             yield value_count_check(
@@ -335,7 +335,7 @@ class ScenarioTables(Section):
         return is_absurd, message
 
     def _mode_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: observation of modes."""
+        """Yield (has failed, message) for each rule on the observation of modes."""
         modes = self.observation.modes
         record = self.truth.record
         if modes is None:

@@ -49,7 +49,7 @@ class StateFactor(Section):
     """Probability of each level before the first observation [1]."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: levels and prior."""
+        """Yield (has failed, message) for each rule on levels and prior."""
         does_not_increase = any(second <= first for first, second in pairwise(self.levels))
         listed = ", ".join(str(level) for level in self.levels)
         yield (
@@ -129,7 +129,7 @@ class Calibration(FileSection):
         return 1 if self.source == "fixed" else self.draws
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: keys of the source."""
+        """Yield (has failed, message) for each rule on the keys that each source needs."""
         has_file = bool(self.file)
         yield (
             self.source == "file" and not has_file,

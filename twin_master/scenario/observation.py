@@ -58,7 +58,7 @@ class ModesSection(Section):
     changes between records and the error of the model [Hz for frequencies and 1 for the others]."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: bands, numbers and features."""
+        """Yield (has failed, message) for each rule on bands, numbers and features."""
         has_empty_band = any(high <= low for low, high in self.bands)
         yield (
             has_empty_band,
@@ -261,7 +261,7 @@ class ObservationSection(Section):
         return 1.0, self.sensor_units
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: numbers of values."""
+        """Yield (has failed, message) for each rule on numbers of values."""
         for key in ("unit", "standard_deviation", "titles"):
             value = getattr(self, key)
             # Without titles the tuple is empty, which is allowed and not a wrong number of titles.

@@ -168,7 +168,7 @@ class Scenario(ScenarioTables):
         return self.model_dump(mode="json")
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: tables that do not fit."""
+        """Yield (has failed, message) for each rule on tables that must fit together."""
         yield from self._control_checks()
         yield from self._action_checks()
         yield from self._growth_checks()
@@ -179,7 +179,7 @@ class Scenario(ScenarioTables):
         yield from self._mode_checks()
 
     def _reference_checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names of references."""
+        """Yield (has failed, message) for each rule on names of references."""
         names = [entry.figure for entry in self.reference]
         for name in names:
             yield unknown_name_check(

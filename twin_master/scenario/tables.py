@@ -90,7 +90,7 @@ class Transition(Section):
     def checks_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names and tables.
+        """Yield (has failed, message) for each rule on names and tables.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class Transition(Section):
     def _probability_checks(
         self, controls: tuple[str, ...], states: tuple[str, ...]
     ) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names of probabilities."""
+        """Yield (has failed, message) for each rule on names of probabilities."""
         key = "transition.probability"
         yield incomplete_table_check(self.probability, controls, key, "control")
         for control, probability in self.probability.items():
@@ -122,7 +122,7 @@ class Transition(Section):
     def _table_checks(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: names and rows of tables."""
+        """Yield (has failed, message) for each rule on names and rows of tables."""
         yield incomplete_table_check(self.tables, controls, "transition.tables", "control")
         for control, tables in self.tables.items():
             key = f"transition.tables.{control}"
@@ -169,7 +169,7 @@ class Span(Section):
     later steps."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: an early end."""
+        """Yield (has failed, message) for each rule on an early end."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
             ends_early,
@@ -207,7 +207,7 @@ class SensorFault(Span):
     """Growth of the drift in each step [unit of the sensors]."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: span and rate."""
+        """Yield (has failed, message) for each rule on span and rate."""
         yield from super().checks()
         needs_rate = self.kind == "drift"
         has_rate = self.rate is not None
@@ -251,7 +251,7 @@ class TruthSection(Section):
     """How the record of each step is made, if modes are observed."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: keys of another kind."""
+        """Yield (has failed, message) for each rule on keys that belong to another kind."""
         is_inside_asset = self.kind == "asset"
         has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
         if self.record is not None:
@@ -317,7 +317,7 @@ class Action(Section):
     """Whether the mission ends with that step."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: readings and effect."""
+        """Yield (has failed, message) for each rule on readings and effect."""
         inspects = bool(self.inspects)
         has_deviation = self.standard_deviation is not None
         yield (
@@ -417,7 +417,7 @@ class Planner(Section):
         return validate(Planner, keys, f"the policy {name!r}", ScenarioError, what="a policy")
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: keys of another policy."""
+        """Yield (has failed, message) for each rule on keys that belong to another policy."""
         yield (
             self.limit_probability is not None and self.policy != "belief",
             "`planner.limit_probability` needs `planner.policy` `belief`",
@@ -509,7 +509,7 @@ class Learning(Section):
     not learnt [1]."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield (is present, message) of each possible fault: transition factors."""
+        """Yield (has failed, message) for each rule on transition factors."""
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)

@@ -256,11 +256,15 @@ class _DraftedPart(NamedTuple):
 
 
 def drafted_part(name: str, mesh_file: Path | None) -> _DraftedPart:
-    """Draft the part of a mesh, by default the shipped bracket, with a force of usual size."""
+    """Guess support, load and gauges of the part in a mesh file, by default the shipped bracket.
+
+    The force at the tip is such that the largest strain of a gauge is about `_USUAL_STRAIN`.
+    """
     if mesh_file is None:
         mesh_file = structure_files()["bracket"].with_suffix(".inp")
     unit = _unit_of(mesh_file)
     draft = draft_part(read_mesh(mesh_file, UNITS[unit], unit))
+    # The strain of a force of 1 N: a structure can only be assembled from files in a folder.
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         structure_file = Path(folder, STRUCTURE_NAME)
         shutil.copy(mesh_file, folder)
@@ -271,9 +275,14 @@ def drafted_part(name: str, mesh_file: Path | None) -> _DraftedPart:
 
 
 def mesh_project(name: str, mesh_file: Path | None) -> Project:
-    """Return the project of a part from a mesh, by default that of the shipped bracket."""
+    """Return a project with a part drafted from a mesh file, and a mission of its twin.
+
+    Without a mesh file it is that of the shipped bracket.
+    """
     part = drafted_part(name, mesh_file)
     mesh_name = part.mesh_file.name
+    # Noise and limit in the mission follow from the part's strains. To compute them, the part is
+    # assembled from its files, which are not in the project's folder yet.
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         structure_file = Path(folder, STRUCTURE_NAME)
         structure_file.write_text(part.structure, encoding="utf-8")

@@ -29,11 +29,12 @@ _PAUSE = 8 * 3600.0
 
 
 def stream_project(name: str, structure_file: Path | None) -> Project:
-    """Return the project of a part that is watched, by default of the shipped bracket.
+    """Return a project to watch a real part by the readings of its gauges.
 
-    The readings are simulated: from step `_STUCK_FROM` on the gauge with the largest strain is
-    stuck, and after step `_PAUSE_AFTER` there is a pause of hours.
+    The part is that of `structure_file`, or the shipped bracket. The project comes with simulated
+    readings, in which a gauge is stuck and the logger pauses; see `_simulated_stream`.
     """
+    # Structure and mission are read from files to simulate the readings: here they are temporary.
     with TemporaryDirectory(prefix="uav_twin_") as temporary_folder:
         folder = Path(temporary_folder)
         if structure_file is None:
@@ -93,7 +94,11 @@ def stream_project(name: str, structure_file: Path | None) -> Project:
 
 
 def _simulated_stream(scenario_file: Path, folder: Path) -> str:
-    """Simulate a mission, and return its readings as the table of a logger."""
+    """Simulate a mission and return its strains as CSV text, with two faults to be noticed.
+
+    From step `_STUCK_FROM` on, the gauge with the largest strain at the start repeats its last
+    reading. After step `_PAUSE_AFTER`, all times are `_PAUSE` later, as if the logger had stopped.
+    """
     fly(scenario_file, folder, {"in_process": True}, report=False)
     run = open_run(folder)
     readings = 1e6 * np.asarray(run["observed/strain"].values)

@@ -38,7 +38,7 @@ _LARGEST_PROBABILITY = 0.9
 
 
 def with_all_transitions_possible(probability: Float) -> Float:
-    """Return probabilities of worsening that are neither near 0 nor near 1.
+    """Return probabilities of worsening (K,), moved away from 0 and 1.
 
     Then any course of the damage is possible, so observations that are impossible with these
     probabilities contradict the sensor model.
@@ -102,18 +102,18 @@ class _Task(NamedTuple):
 
 
 class GridSum(NamedTuple):
-    """The log likelihood of twins on a grid.
+    """The log likelihood of the probabilities of worsening on a grid.
 
     Attributes
     ----------
     log_likelihood : (N, ..., N) array
-        The sum over the twins whose observations are possible.
-    explained : int
+        The sum of the twins' log evidence, for those whose observations are possible.
+    twin_count : int
         The number of these twins.
     """
 
     log_likelihood: Float
-    explained: int
+    twin_count: int
 
 
 @lru_cache(maxsize=2)
@@ -152,43 +152,48 @@ def _observed_twins(task: _Task) -> Sequence[ObservedTwins] | Iterator[ObservedT
 
 
 def _grid_sum(task: _Task, axes: Axes, prior: Float | None) -> GridSum | None:
-    """Return the log likelihood of a task's twins on a grid, see `GroupEvidence.grid_sum`.
+    """Return the log evidence of a task's twins on a grid, summed; see `GroupEvidence.grid_sum`.
 
-    None if this process cannot read their observations.
+    None if this process cannot read their observations. A twin's evidence is a sum over the draws
+    of the model's parameter. Those that are improbable at the centre of the grid are left out of
+    the sum at all its points.
     """
-    blocks = _observed_twins(task)
-    if blocks is None:
+    observation_blocks = _observed_twins(task)
+    if observation_blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
     if prior is None:
         prior = kit.sensor_model.draw_weight
-    # Which values of the parameter are probable is found out at the centre of the grid.
     centre = np.array([axis[len(axis) // 2] for axis in axes])
-    probability = with_all_transitions_possible(centre)
-    total = np.zeros([len(axis) for axis in axes])
-    explained = 0
-    for observed, control in blocks:
+    probability_at_centre = with_all_transitions_possible(centre)
+    log_likelihood = np.zeros([len(axis) for axis in axes])
+    twin_count = 0
+    for observed, control in observation_blocks:
         likelihood = likelihood_at_nodes(
-            kit.family, probability, prior, kit.sensor_model, observed, control
+            kit.family, probability_at_centre, prior, kit.sensor_model, observed, control
         )
-        log_evidence = likelihood.evidence_on_grid(kit.family, axes)
-        total += log_evidence.sum(axis=0).reshape(total.shape)
-        explained += len(log_evidence)
-    return GridSum(total, explained)
+        log_evidence = likelihood.evidence_on_grid(kit.family, axes)  # (B, N^K)
+        log_likelihood += log_evidence.sum(axis=0).reshape(log_likelihood.shape)
+        # twins whose observations are impossible have no row
+        twin_count += len(log_evidence)
+    return GridSum(log_likelihood, twin_count)
 
 
 def _evidence_of_draws(task: _Task, probability: Float) -> Float | None:
-    """Return the log evidence (B, E) of a task's twins, or None as `_grid_sum`."""
-    blocks = _observed_twins(task)
-    if blocks is None:
+    """Return the log evidence (B, E) of a task's twins for each of the E draws.
+
+    None if this process cannot read their observations.
+    """
+    observation_blocks = _observed_twins(task)
+    if observation_blocks is None:
         return None
     kit = _unpacked_kit(task.kit)
-    rows = []
-    for observed, control in blocks:
-        rows.append(
+    evidence_by_block = []
+    for observed, control in observation_blocks:
+        evidence_by_block.append(
             parameter_evidence(kit.family, probability, kit.sensor_model, observed, control)
         )
-    return np.concatenate(rows)
+    return np.concatenate(evidence_by_block)
 
 
 class GroupEvidence:
@@ -228,7 +233,7 @@ class GroupEvidence:
         return GroupEvidence(self._pool, self._group, flights, self._progress)
 
     def grid_sum(self, axes: Axes, prior: Float | None) -> GridSum:
-        """Return the log likelihood of the probabilities of worsening on a grid.
+        """Return the log likelihood of the probabilities of worsening on a grid, of all twins.
 
         Parameters
         ----------
@@ -239,11 +244,11 @@ class GroupEvidence:
             weight of the draw in the calibration.
         """
         log_likelihood = np.zeros([len(axis) for axis in axes])
-        explained = 0
-        for part in self._answers(partial(_grid_sum, axes=axes, prior=prior)):
-            log_likelihood += part.log_likelihood
-            explained += part.explained
-        return GridSum(log_likelihood, explained)
+        twin_count = 0
+        for sum_of_task in self._answers(partial(_grid_sum, axes=axes, prior=prior)):
+            log_likelihood += sum_of_task.log_likelihood
+            twin_count += sum_of_task.twin_count
+        return GridSum(log_likelihood, twin_count)
 
     def evidence_of_draws(self, probability: Float) -> Iterator[Float]:
         """Yield the log evidence (B, E) of all twins for each draw, some twins at a time.

@@ -499,7 +499,7 @@ def _growth(
     states of many twins do not fit in memory.
     """
     if not family.names:
-        return _Growth(None, evidence.grid_sum((), prior).explained)
+        return _Growth(None, evidence.grid_sum((), prior).twin_count)
     explained_count = 0
 
     def log_likelihood(axes: Axes) -> Float:
@@ -507,7 +507,7 @@ def _growth(
         nonlocal explained_count
         probabilities = tuple(logistic(axis) for axis in axes)
         total = evidence.grid_sum(probabilities, prior)
-        explained_count = total.explained
+        explained_count = total.twin_count
         return total.log_likelihood
 
     grid = likelihood_grid(log_likelihood, len(family.names), first_axes)
