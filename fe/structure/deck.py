@@ -136,12 +136,12 @@ class Deck:
         """
         point = tuple(float(coordinate) for coordinate in coordinates)
         if self.nodes.setdefault(number, point) != point:
-            fail(where, f"node {number} is there twice, at different places; delete one.")
+            fail(where, f"node {number} is defined twice, at different places; delete one.")
 
     def add_element(self, where: str, number: int, element_type: str, nodes: list[int]) -> None:
         """Add an element of a type of meshio; raise `MeshError` if its number is taken."""
         if number in self.elements:
-            fail(where, f"element {number} is there twice; delete one.")
+            fail(where, f"element {number} is defined twice; delete one definition.")
         self.elements[number] = DeckElement(element_type, nodes)
         if element_type not in FLAT:
             self._first_of_solid_type.setdefault(element_type, where)
@@ -281,7 +281,7 @@ class Deck:
         try:
             return [self._node_index[number] for number in numbers]
         except KeyError as missing:
-            fail(str(self.path), f"{owner} names node {missing}, which is not there.")
+            fail(str(self.path), f"{owner} names node {missing}, which is not defined.")
 
     @cached_property
     def _node_index(self) -> dict[int, int]:
@@ -295,7 +295,8 @@ class Deck:
         for number in members:
             if number not in self.elements:
                 fail(
-                    str(self.path), f"the set {name!r} names element {number}, which is not there."
+                    str(self.path),
+                    f"the set {name!r} names element {number}, which is not defined.",
                 )
         section = self.sections.get(name.casefold())
         if members and section:
