@@ -495,6 +495,24 @@ class ForceSearch:
         )
         return estimator.follow_laws(self.laws(candidate, trials), start)
 
+    def begin_along_simulation(self, point: Point) -> None:
+        """Estimate the model without effects along its simulation, as effects are estimated.
+
+        The first estimate is linear about other parameters than its own, and along a smoothed
+        motion in which a body that friction of the model holds still creeps. The more probable of
+        the two estimates is kept, and hypotheses begin at it.
+
+        Parameters
+        ----------
+        point : Point
+            The values of all unknowns, as the model without effects was fitted to the readings.
+        """
+        if self.thinned is not None:
+            self.thinned.begin_along_simulation(point)
+        estimate = self.estimate_along_simulation(NO_EFFECTS, point)
+        if estimate is not None:
+            self.estimate_without_effects = _best((estimate, self.estimate_without_effects))
+
     def estimate_roughly(
         self, base: Estimate, candidate: Candidate, effect: FloatArray, processes: Processes
     ) -> Estimate | None:

@@ -342,9 +342,8 @@ class Search(FittedCandidates):
         force_search : ForceSearch
             The search for the missing force.
         """
+        force_search.begin_along_simulation(self.no_effect.point)
         self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
-        if len(force_search.model_laws):
-            self._estimate_along_laws_of_model(force_search)
         best_estimate = next(
             estimate
             for estimate in self.force_estimates
@@ -357,24 +356,6 @@ class Search(FittedCandidates):
             if fit is not None:
                 self.record_fit(fit, exact=True)
         self.refine_time_steps()
-
-    def _estimate_along_laws_of_model(self, force_search: ForceSearch) -> None:
-        """Estimate the model without effect along its own laws, as effects are estimated.
-
-        Its missing force was estimated along a smoothed motion, in which a body that its own
-        friction holds still creeps. The more probable of the two estimates is kept.
-        """
-        estimate = force_search.estimate_along_simulation(Candidate(), self.no_effect.point)
-        if estimate is None:
-            return
-        number = next(
-            number
-            for number, earlier_estimate in enumerate(self.force_estimates)
-            if not earlier_estimate.candidate.terms
-        )
-        if estimate.log_evidence > self.force_estimates[number].log_evidence:
-            self.force_estimates[number] = estimate
-            self.force_estimates.sort(key=self.score, reverse=True)
 
     def add_effects(self) -> None:
         """Add one effect at a time to the best set, as long as the score rises."""
