@@ -120,7 +120,7 @@ class ForceSearch:
             self.estimate_by_port = self._estimates_of_ports_like(self.thinned)
 
     def _in_thinned_records(self) -> "ForceSearch | None":
-        """Return the search in thinned records; None if the records are short, or uneven."""
+        """Return the search in thinned records; None if they are short or cannot be thinned."""
         sample_count = sum(len(self.problem.trials[k].trial.time) for k in self.trial_indices)
         if sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
             return None
@@ -155,7 +155,11 @@ class ForceSearch:
         }
 
     def _estimates_of_ports_like(self, thinned: "ForceSearch") -> dict[str, Estimate]:
-        """Return the missing force at each port alone, from the estimates in thinned records."""
+        """Return the missing force at each port alone, searched from that in thinned records.
+
+        The trials are linear about the parameters that the thinned records gave, and the search for
+        the most probable process needs no grid.
+        """
         trials = self.trial_set.trials_about(thinned._point_of(thinned.best_port_estimate))
         return {
             name: self._estimate_along_motion(
@@ -258,7 +262,8 @@ class ForceSearch:
         prior_medians : dict of int to Process
             Their prior medians.
         skip_grid : bool
-            Whether the first forces are nearly the most probable ones.
+            Whether the search begins at the first forces, as they are nearly the most probable
+            ones; else at the best point of a grid.
         """
         linearisation = plain_linearisation(trials, self.shared_priors)
         solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
@@ -500,7 +505,7 @@ class ForceSearch:
 
         The first estimate is linear about other parameters than its own, and along a smoothed
         motion in which a body that friction of the model holds still creeps. The more probable of
-        the two estimates is kept, and hypotheses begin at it.
+        the two estimates replaces `estimate_without_effects`, at which hypotheses begin.
 
         Parameters
         ----------
