@@ -37,9 +37,9 @@ class Questionnaire:
     Attributes
     ----------
     questions : dict of (str, str) to list of str
-        The subjects of open questions, by option and what it expects.
+        The subjects of open questions; the key is an option, and the phrase on what it expects.
     assumptions : dict of (str, str) to dict of str to str
-        The default answers that were used, by subject, by option and what it expects.
+        The default answers that were used, by subject; the keys are those of `questions`.
     """
 
     def __init__(self, answers: Answers) -> None:
@@ -50,7 +50,8 @@ class Questionnaire:
     def stated_answer(self, option: str, subject: str) -> str | None:
         """Return the user's answer about exactly this column or file; None if there is none.
 
-        A missing answer is not noted as an open question.
+        An answer for all columns or files does not count, and a missing answer is not noted as an
+        open question.
         """
         return self.answers.get(option, {}).get(subject)
 
@@ -58,6 +59,8 @@ class Questionnaire:
         self, option: str, subject: str, expected_answer: str, choices: Collection[str] = ()
     ) -> str:
         """Return an answer; if there is none, note an open question and return an empty text.
+
+        An answer about exactly this column or file comes before one about all.
 
         Parameters
         ----------
@@ -115,7 +118,9 @@ class Questionnaire:
 
 
 def check_subjects(answers: Answers, heads: Collection[str], files: Collection[str]) -> None:
-    """Refuse an answer about a column or a file that does not exist.
+    """Raise an error if an answer is about a column or a file that does not exist.
+
+    An empty subject means all; it is allowed for `OF_FILES` and `OF_ALL_COLUMNS`.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ _NUMBERS = {
     )
     for mark, other in (".,", ",.")
 }
-"""Numbers with either decimal mark: those with groups of three digits have no exponent."""
+"""Patterns of numbers by decimal mark: with groups of three digits, or with an exponent."""
 _PLAIN = re.compile(r"[+-]?\d*[.,]?\d+(?:[eE][+-]?\d+)?", re.ASCII)
 """Simple numbers, which most cells contain; this pattern is faster."""
 LOGICAL = {"true": "1", "false": "0"}
@@ -34,7 +34,10 @@ class ExactNumber(str):
 
 
 def plain_number(cell: str, mark: str) -> str | None:
-    """Return the number in a cell as `float` reads it; None if the cell holds anything else.
+    """Return the number in a cell as a text for `float`; None if the cell holds anything else.
+
+    True and false are the numbers 1 and 0. Marks between groups of three digits are removed. An
+    `ExactNumber` has a decimal point whatever the mark.
 
     Parameters
     ----------
@@ -67,12 +70,16 @@ def decimal_mark(
 ) -> tuple[str | None, str]:
     """Return the decimal mark of a table.
 
+    A number such as 1.5 or 1.234.567 can be read with one mark only, and decides. If no number
+    does, the mark is a point: if no number has a mark, or if cells are separated by commas and the
+    first unclear number has none.
+
     Parameters
     ----------
     columns : sequence of sequence of str
         Cells (N,) of each column.
     lines : sequence of int
-        The line of the file for each row.
+        The line of the file for each row (N,).
     place : str
         The name of the file and what its rows are called, for messages.
     separator : str
@@ -83,14 +90,14 @@ def decimal_mark(
     mark : str or None
         The decimal mark; None if all numbers with a mark can be read in two ways, as 1,234 can.
     unclear : str
-        The first number that can be read in two ways, and its line.
+        The first number that can be read in two ways, and its line; empty if there is none.
 
     Raises
     ------
     CampaignFileError
-        If decimals are written in two ways.
+        If decimals are written with a point in one cell, and with a comma in another.
     """
-    examples: dict[str, str] = {}
+    examples: dict[str, str] = {}  # the first number of each mark, for the message
     unclear = ""
     for cells in columns:
         for cell, line in zip(cells, lines, strict=True):

@@ -70,8 +70,8 @@ def is_time(cell: str) -> bool:
 def _clock_time(cell: str) -> _ClockTime | None:
     """Return the clock time in a cell; None if it has none, or one that does not exist.
 
-    Without hours, a clock with a date has hours and minutes, and one without a date has minutes
-    and seconds with a fraction; `10:15` alone could be either.
+    Of two numbers, such as `10:15`, those after a date are hours and minutes, and those with a
+    fraction are minutes and seconds. Two numbers with neither, or with both, are not read.
     """
     if _is_date(cell):
         return _ClockTime(cell, Decimal(0), _DAY)
@@ -113,10 +113,11 @@ def _offset_seconds(offset: str) -> int:
 
 @lru_cache(4096)
 def _day_numbers(date: str) -> dict[str, int]:
-    """Return the days since the year 1 that a date can mean, by what its first number is.
+    """Return the days since the year 1 that a date can mean, by `DAY_FIRST` and `MONTH_FIRST`.
 
-    The result is the same for both orders if the date can be read in one way, as `2026-03-31` and
-    `31.3.2026` can, and lacks an order in which there is no such day.
+    Both orders have the same day if the date can be read in one way, as `2026-03-31` can, and as
+    any date with points is, whose day comes first. An order in which there is no such day is
+    missing; for a text that is no date, both are.
     """
     text = re.sub(r"(?<=\d)(?=[A-Za-z])|(?<=[A-Za-z])(?=\d)|[-/ ,.]+", " ", date)
     for layout in _CLEAR_LAYOUTS:
@@ -141,7 +142,7 @@ def possible_date_orders(columns: Iterable[Sequence[str]]) -> list[str]:
 
     It is `DAY_FIRST` alone if every date is clear, or if none of the orders fits all dates.
     """
-    days = set()
+    days = set()  # the dates as texts
     for cells in columns:
         if any(map(is_time, cells)):
             times = [_clock_time(cell) for cell in cells if cell]
@@ -188,10 +189,10 @@ def join_dates_with_times(
     units: Sequence[str],
     places: Sequence[str],
 ) -> tuple[list[tuple[str, ...]], dict[int, int]]:
-    """Write the dates of a table's columns into the cells of its columns of times of day.
+    """Return the columns of a table with its dates in the cells of its columns of times of day.
 
-    A single column of dates belongs to all columns of times; of several, each belongs to the
-    column of times at the same position among them.
+    A single column of dates belongs to all columns of times. Of several, the first belongs to the
+    first column of times, and so on. Without columns of dates, or of times of day, nothing changes.
 
     Parameters
     ----------
@@ -208,47 +209,54 @@ def join_dates_with_times(
         The cells, with a date and a time in each filled cell of a column of times, and empty ones
         in the columns of dates.
     times_of_dates : dict of int to int
-        The number of the column of times (the last one) of each joined column of dates.
+        The index of the column of times by that of its column of dates; of several columns of
+        times, the last one.
 
     Raises
     ------
     CampaignFileError
         If the numbers of columns do not fit, or a time has no date in its row.
     """
-    times = [index for index, cells in enumerate(columns) if _is_column_of_times_of_day(cells)]
-    dates = []
-    if times:
-        dates = [
+    time_columns = [
+        index for index, cells in enumerate(columns) if _is_column_of_times_of_day(cells)
+    ]
+    date_columns = []
+    if time_columns:
+        date_columns = [
             index
             for index, cells in enumerate(columns)
             if is_column_of_dates(cells) and not _is_unit_of_readings(units[index])
         ]
-    joined = [*columns]
-    if not dates:
-        return joined, {}
-    if len(dates) not in (1, len(times)):
-        named = [titles[index] for index in sorted([*dates, *times])]
+    joined_columns = [*columns]
+    if not date_columns:
+        return joined_columns, {}
+    if len(date_columns) not in (1, len(time_columns)):
+        titles_of_both = [titles[index] for index in sorted([*date_columns, *time_columns])]
         raise CampaignFileError(
             f"{places[0]}: which dates belong to which times is not clear among the columns "
-            f"{listing(map(repr, named))}: leave one column of dates, or one for each of times."
+            f"{listing(map(repr, titles_of_both))}: leave one column of dates, or one for each of "
+            "times."
         )
-    dates_of_times = dates * len(times) if len(dates) == 1 else dates
+    dates_of_times = date_columns
+    if len(date_columns) == 1:
+        dates_of_times = date_columns * len(time_columns)
     times_of_dates = {}
-    for time, date in zip(times, dates_of_times, strict=True):
+    for time, date in zip(time_columns, dates_of_times, strict=True):
         cells = []
-        for place, day, clock in zip(places, columns[date], columns[time], strict=True):
-            if clock and not day:
+        for place, date_cell, time_cell in zip(places, columns[date], columns[time], strict=True):
+            if time_cell and not date_cell:
                 raise CampaignFileError(
-                    f"{place}: {titles[time]!r} has the time {clock!r}, but {titles[date]!r} has "
-                    "no date: write the date into each row, or remove the column of dates."
+                    f"{place}: {titles[time]!r} has the time {time_cell!r}, but {titles[date]!r} "
+                    "has no date: write the date into each row, or remove the column of dates."
                 )
-            moment = _clock_time(day) if day else None
-            cells.append(f"{moment.day} {clock}" if clock and moment else "")
-        joined[time] = tuple(cells)
+            # the cell of a date may also hold the time 00:00:00, which is dropped
+            day = _clock_time(date_cell) if date_cell else None
+            cells.append(f"{day.day} {time_cell}" if time_cell and day else "")
+        joined_columns[time] = tuple(cells)
         times_of_dates[date] = time
     for date in times_of_dates:
-        joined[date] = ("",) * len(places)
-    return joined, times_of_dates
+        joined_columns[date] = ("",) * len(places)
+    return joined_columns, times_of_dates
 
 
 def _is_unit_of_readings(unit: str) -> bool:
@@ -268,7 +276,9 @@ def seconds_of_clock_times(
 ) -> dict[int, tuple[str, ...]]:
     """Return the columns of clock times, in seconds since the first time of their kind.
 
-    Times with a date are one kind, and times of day another.
+    Times with a date are one kind, and times of day another. Columns of dates alone do not set the
+    first time if another column does, since their days begin at midnight. A column without a time
+    is not among the result.
 
     Parameters
     ----------
@@ -289,11 +299,13 @@ def seconds_of_clock_times(
     Raises
     ------
     CampaignFileError
-        If a cell of such a column is no time, or a number among numbers became a date.
+        If a cell of a column of clock times is no time, or if fewer than half of the filled cells
+        of a column are times, or its unit is that of a reading. A spreadsheet may have turned
+        numbers into dates.
     """
-    seconds_of_columns: dict[int, dict[int, Decimal]] = {}
-    starts: dict[bool, Decimal] = {}  # first time of columns with, and without, a date
-    are_dated: dict[int, bool] = {}
+    seconds_of_columns: dict[int, dict[int, Decimal]] = {}  # by column, then by row
+    starts: dict[bool, Decimal] = {}  # first time of columns with (True) and without a date
+    are_dated: dict[int, bool] = {}  # by column
     for column, cells in enumerate(columns):
         filled_rows = {row: cell for row, cell in enumerate(cells) if cell}
         time_rows = [row for row, cell in filled_rows.items() if is_time(cell)]
@@ -315,11 +327,11 @@ def seconds_of_clock_times(
         are_dated[column] = is_dated
         seconds_of_columns[column] = seconds
 
-    # a column of dates alone begins at midnight, and others count from their own first time
-    not_midnight = [
+    # the first time of either kind, among the columns that are more than dates if there are any
+    columns_with_times = [
         column for column in seconds_of_columns if not is_column_of_dates(columns[column])
     ]
-    for column in not_midnight or seconds_of_columns:
+    for column in columns_with_times or seconds_of_columns:
         is_dated = are_dated[column]
         first_seconds = next(iter(seconds_of_columns[column].values()))
         starts[is_dated] = min(first_seconds, starts.get(is_dated, first_seconds))
@@ -335,13 +347,7 @@ def seconds_of_clock_times(
 
 
 def _time_of_cell(cell: str, place: str) -> _ClockTime:
-    """Return the clock time in a cell.
-
-    Raises
-    ------
-    CampaignFileError
-        If the cell holds no time, or one that does not exist.
-    """
+    """Return the clock time in a cell; raise an error if there is none or it does not exist."""
     time = _clock_time(cell) if len(cell) <= _LONGEST_TIME else None
     if time is None:
         raise CampaignFileError(
@@ -359,10 +365,7 @@ def _seconds_of_dated_times(
 ) -> dict[int, Decimal]:
     """Return times with dates in seconds since the year 1, by their row.
 
-    Raises
-    ------
-    CampaignFileError
-        If a time has no date, or one that does not exist in the order of the others.
+    Raises `CampaignFileError` if a time has no date, or one that does not exist in `date_order`.
     """
     seconds = {}
     for row, time in times.items():

@@ -12,17 +12,19 @@ TIME = "time"
 
 
 class TableClock(NamedTuple):
-    """A column of times, and the columns whose readings it stamps."""
+    """A column of times, and the columns whose readings were taken at these times."""
 
     times: LaboratoryColumn
     columns: tuple[LaboratoryColumn, ...]
 
 
 def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
-    """Return the clocks of a table with several columns of times, and the columns that each stamps.
+    """Assign the columns of a table to its several columns of times.
 
     Either the names show it, as in `acc2` and `time2`, or the positions: every column of times
-    comes before the columns that it stamps, or every one comes after them.
+    comes before the columns read at its times, or every one comes after them. If both show it, they
+    must agree. Columns that are left out count for the order, but are not returned, and neither is
+    a column of times without columns.
 
     Parameters
     ----------
@@ -32,7 +34,7 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
     Raises
     ------
     CampaignFileError
-        If neither names nor positions say which clock a column has, or they contradict each other.
+        If neither names nor positions say which times a column has, or they contradict each other.
     """
     times = [column.head for column in columns if column.role == TIME]
     readings = [column.head for column in columns if column.role != TIME]
@@ -60,6 +62,8 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
 
 def _columns_by_name(times: Sequence[str], readings: Sequence[str]) -> dict[str, list[str]] | None:
     """Assign columns of readings to columns of times, by the words that their names share.
+
+    Words that all columns of times have in common, such as "time", do not count.
 
     Returns
     -------

@@ -141,14 +141,14 @@ def merge_clocks(
 
 
 def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
-    """Return the end of the remark: which loads were filled in, and how many stamps are left out.
+    """Return the end of the remark: which loads were interpolated, and how many times are left out.
 
     Parameters
     ----------
     filled_loads : sequence of str
         Loads that were filled in between their samples, and how.
     outside : int
-        The number of stamps before or after the records of these loads.
+        The number of times before or after the records of these loads.
     """
     remark = ""
     if filled_loads:
@@ -160,8 +160,8 @@ def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
 
 
 def _time_cells(seconds: FloatArray) -> list[str]:
-    """Return times [s] as cells of a table."""
-    return [f"{moment:.15g}" for moment in seconds.tolist()]
+    """Return times (N,) [s] as cells of a table, with 15 significant digits."""
+    return [f"{time:.15g}" for time in seconds.tolist()]
 
 
 def _file_name(clocks: Sequence[TableClock]) -> str:
@@ -316,8 +316,8 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
 def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[int]]]:
     """Merge the times of all clocks into one increasing sequence.
 
-    Times of two clocks that differ by less than a thousandth of the shortest median interval are
-    taken as equal.
+    Times of two clocks that differ by at most a thousandth of the shortest median interval are
+    taken as equal: the earlier one stands for both. Times of one clock are never taken as equal.
 
     Parameters
     ----------
@@ -332,19 +332,20 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
         For each clock, the indices of its times in `seconds`.
     """
     steps = [
-        float(np.median(np.diff(own_times.seconds)))
-        for own_times in times
-        if len(own_times.seconds) > 1
+        float(np.median(np.diff(clock_times.seconds)))
+        for clock_times in times
+        if len(clock_times.seconds) > 1
     ]
     tolerance = EVENNESS_TOLERANCE * min(steps, default=0.0)
-    all_times = np.concatenate([own_times.seconds for own_times in times])
-    counts = [len(own_times.seconds) for own_times in times]
+    # all times in a row, with the number of the clock of each; sorted by time, then by clock
+    all_times = np.concatenate([clock_times.seconds for clock_times in times])
+    counts = [len(clock_times.seconds) for clock_times in times]
     clock_numbers = np.repeat(np.arange(len(times)), counts)
     order = np.lexsort((clock_numbers, all_times))
 
     positions: list[list[int]] = [[] for _ in times]
     seconds: list[float] = []
-    clocks_at_last_time: set[int] = set()  # clocks that have the last of the common times
+    clocks_at_last_time: set[int] = set()  # numbers of the clocks that have the time seconds[-1]
     for time, clock_number in zip(
         all_times[order].tolist(), clock_numbers[order].tolist(), strict=True
     ):
@@ -360,14 +361,14 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
 def _fill_between_samples(
     cells: list[str], seconds: FloatArray, positions: Sequence[int], hold: Hold
 ) -> None:
-    """Interpolate a load between its samples into its empty cells.
+    """Interpolate a load at the times of other clocks; `cells` is changed in place.
 
     A load with an empty cell at one of its own samples, or with a single sample, is not changed.
 
     Parameters
     ----------
     cells : list of str
-        Cells (N,) of the load, changed in place.
+        Cells (N,) of the load.
     seconds : (N,) ndarray
         Times of all cells [s].
     positions : sequence of int
@@ -393,7 +394,7 @@ def _fill_between_samples(
 
 
 def _stamped_columns_text(clocks: Sequence[TableClock]) -> str:
-    """Return the beginning of a remark, which lists the columns that a column of times stamps."""
+    """Return the beginning of a remark, which lists the columns that belong to each clock."""
     phrases = []
     for clock in clocks:
         heads = listing(repr(column.head) for column in clock.columns)

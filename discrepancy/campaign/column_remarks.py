@@ -14,7 +14,7 @@ def remarks_on_unused_columns(
     """Return a remark on each column that no channel and no input reads."""
     used_columns = {
         *schema.INPUT_COLUMNS,
-        *(recorded_input.table_column for recorded_input in section.columns),
+        *(channel_or_input.table_column for channel_or_input in section.columns),
     }
     files_of_columns: dict[str, list[str]] = {}
     for file in dict.fromkeys(trial.file for trial in section.trial):
@@ -34,11 +34,11 @@ def remarks_on_unused_columns(
 def remarks_on_missing_columns(
     section: schema.CampaignSection, tables: Mapping[str, TextTable]
 ) -> list[str]:
-    """Return a remark on each channel and input that the tables of some trials lack.
+    """Return a remark on each channel and input that the tables of some trials, not all, lack.
 
-    A trial that states its `channels` does not use the others, and is not mentioned for them.
-    Inputs belong to driven trials alone: a static trial may have a column `force` instead. The
-    remarks name no files, so that they stay the same when a campaign is written again.
+    Trials that state their `channels` do not count for channels, and only driven trials count for
+    inputs: a static trial may have a column `force` instead. The remarks name no files, so that
+    they stay the same when a campaign is written again.
     """
     open_trials = [trial for trial in section.trial if trial.channels is None]
     driven_trials = [trial for trial in section.trial if trial.kind is TrialKind.DRIVEN]

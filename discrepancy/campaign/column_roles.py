@@ -34,10 +34,12 @@ from reporting.words import listing
 _UNITS_OF_INPUT_COLUMNS = dict(
     zip(INPUT_COLUMNS, ("s", "N", "1", "degC", "1", "1", "1", "1"), strict=True)
 )
+"""The SI unit of each column that every table may have, by the role of the column."""
 _STRAIN = re.compile(r".*(strain|[εϵ]|m/m)")
+"""Units that only a strain has, such as microstrain, µε or m/m."""
 
 OutputQuantity = Callable[[str], Quantity | None]
-"""Returns the quantity of a model's output by its name; None for what is not an output."""
+"""Maps the name of a model's output to its quantity, and any other name to None."""
 
 
 class ColumnReader:
@@ -68,7 +70,19 @@ class ColumnReader:
         self._outputs = outputs
 
     def read_column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
-        """Return a column of a table by its head and the unit that the file states."""
+        """Return the record of a table's column; ask the user for what is not clear.
+
+        While the unit or the quantity is not known, the factor `to_si` of the record is None.
+
+        Parameters
+        ----------
+        sheet : Sheet
+            The table.
+        head : str
+            The name of the column as printed at its head.
+        unit : str
+            The unit that the file states, or an empty text; the option `--unit` replaces it.
+        """
         cell_unit, reading_unit, factor = self._scaled_unit(head, unit)
         column = self._column_of_readings(sheet, head, reading_unit)
         if column.to_si is None:
@@ -76,13 +90,18 @@ class ColumnReader:
         return replace(
             column,
             unit=cell_unit,
+            # the letters F and C of a temperature became degF and degC
             read_in=column.unit if column.quantity is Quantity.TEMPERATURE else reading_unit,
             to_si=factor * column.to_si,
             cell_at_zero=column.cell_at_zero / factor,
         )
 
     def _scaled_unit(self, head: str, unit: str) -> tuple[str, str, float]:
-        """Return the units of a column's cells and of its readings, and the factor between them."""
+        """Return the unit of a column's cells, that of its readings, and the factor between them.
+
+        The option `--unit` replaces the unit of the file. Units differ, and the factor is not 1,
+        only with an option `--scale`.
+        """
         stated_unit = self._questionnaire.stated_answer("unit", head)
         unit = unit if stated_unit is None else stated_unit
         scale = self._questionnaire.stated_answer("scale", head)
@@ -91,7 +110,11 @@ class ColumnReader:
         return scaled_unit(head, unit, scale)
 
     def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
-        """Return the record of a column of readings; ask the user for a role or unit it lacks."""
+        """Return the record of a column, as if its cells were readings without a scale.
+
+        The user is asked for a role or unit that is not known. The record then has no SI unit; nor
+        has it for a column that is left out.
+        """
         role = self._determine_role(sheet, head, unit)
         self._check_role(sheet, head, role)
         if not unit and role != LEFT_OUT:
@@ -140,11 +163,13 @@ class ColumnReader:
     def _check_role(self, sheet: Sheet, head: str, role: str) -> None:
         """Raise an error if the role of a column is neither an input nor an output of the model.
 
-        This is checked before the user is asked for the unit of the column, which it does not need.
+        Without a role yet, or without a model, nothing is checked. A wrong role is refused before
+        the user is asked for the unit of the column.
         """
-        is_unknown = not role or self._quantity_of is None  # no answer yet, or no model
+        if not role or self._quantity_of is None:
+            return
         names_an_input = role in _UNITS_OF_INPUT_COLUMNS or INPUT in role
-        if is_unknown or names_an_input or role == LEFT_OUT:
+        if names_an_input or role == LEFT_OUT:
             return
         if self._output_quantity(role) is None:
             available_outputs = f"; it has {listing(self._outputs)}" if self._outputs else ""
@@ -193,8 +218,9 @@ class ColumnReader:
     def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity that a channel or an input measures.
 
-        If the unit fits several quantities and neither an answer nor the model decides, the user is
-        asked, and the result is None.
+        It is one of the quantities with this unit, or the answer of the user. If the model's output
+        has one of them, it is this. Otherwise a length is a displacement, and a unit of strain is a
+        strain. If several are left, the user is asked, and the result is None.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
         quantities = possible_quantities(unit, answer)
@@ -202,8 +228,7 @@ class ColumnReader:
             modelled = self._quantity_of(role)
             if modelled is not None and modelled in quantities:
                 quantities = (modelled,)
-        # a length is taken as a displacement rather than as a level, and a unit of strain as strain
-        # rather than as a plain number
+        # a displacement rather than a level, and a strain rather than a plain number
         is_usual = quantities[0] is Quantity.DISPLACEMENT or _STRAIN.fullmatch(unit)
         if len(quantities) == 1 or is_usual:
             return quantities[0]
@@ -213,12 +238,9 @@ class ColumnReader:
 
 
 def _column_of_table(sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
-    """Return a column that every table may have, such as a time, a force or a temperature.
+    """Return the record of a column that every table may have, such as a time or a force.
 
-    Raises
-    ------
-    ValueError
-        If the unit is not one of its quantity.
+    Raises `ValueError` if the column cannot have this unit, such as a time in newtons.
     """
     if role == "temperature":
         return _temperature_in_celsius(sheet, head, role, LETTERS_OF_DEGREES.get(unit, unit))
@@ -233,12 +255,9 @@ def _column_of_table(sheet: Sheet, head: str, role: str, unit: str) -> Laborator
 
 
 def _temperature_in_celsius(sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
-    """Return a column of temperatures whose readings become degC.
+    """Return the record of a column of temperatures in any unit; its SI unit is degC.
 
-    Raises
-    ------
-    ValueError
-        If the unit is not one of temperature.
+    Raises `ValueError` if the unit is not one of temperature.
     """
     to_celsius = factor_to_si(Quantity.TEMPERATURE, unit)
     _, reading_at_zero = DEGREES[usual_name(unit)]

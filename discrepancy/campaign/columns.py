@@ -32,6 +32,7 @@ LEFT_OUT = "-"
 INPUT = "input:"
 """Prefix of the role of an input of the model, before its name."""
 _KINDS_WITH_FORCE = (TrialKind.STATIC, TrialKind.FORCED)
+"""Kinds of trials whose force is read from the column `force`."""
 EXACT = "exact"
 """Answer for a zero or a gain that has no error."""
 FREE = "free"
@@ -101,12 +102,14 @@ class LaboratoryColumn:
         cells = self.sheet.numbers(self.head, decimal)
         if self.to_si == 1.0 and not self.cell_at_zero:
             return cells
-        values = np.array([float(cell or "nan") for cell in cells])
+        values = np.array([float(cell or "nan") for cell in cells])  # (rows,)
         if self.cell_at_zero:
-            zero = Decimal(str(self.cell_at_zero))  # 68.1 degF minus 32 has no more digits
+            # in decimals, so that 68.1 degF minus 32 is 36.1 and not 36.099999999999994
+            zero = Decimal(str(self.cell_at_zero))
             values = np.array([float(Decimal(cell) - zero) if cell else np.nan for cell in cells])
         if self.role == "time" and len(cells) > 1 and np.all(np.diff(values) > 0.0):
-            values = undo_rounding(values, cells)  # minutes with few digits may be even
+            # times in minutes with few digits may be evenly spaced
+            values = undo_rounding(values, cells)
         cells_in_si = []
         for cell, value in zip(cells, values.tolist(), strict=True):
             # two digits fewer than a float may need, so that no rounding shows: 4.387 mm is
@@ -122,7 +125,7 @@ def role_by_unit(
 
     A column is a time if `time_heads` finds it among the times of the table, of which there may be
     several. Otherwise its unit determines a role only if no other column of the table has a unit of
-    the same role, and if `roles` allows it. The result is an empty text if it determines none.
+    the same role, and if the role is among `roles`. Else the result is an empty text.
 
     Parameters
     ----------
@@ -156,9 +159,11 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     Returns
     -------
     cell_unit, reading_unit : str
-        The units of the cells and of the readings.
+        The units of the cells and of the readings. Without a unit of the file, the cells have the
+        one after the slash.
     factor : float
-        The factor from cells to readings.
+        The factor from cells to readings, which includes a conversion of the unit of the cells to
+        the one after the slash.
 
     Raises
     ------
@@ -174,17 +179,18 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
     amount_text, ratio_of_units = amount.groups()
     if not ratio_of_units:
         return unit, unit, float(amount_text)
-    reading_unit, slash, per = ratio_of_units.rpartition("/")
+    reading_unit, slash, unit_of_scale = ratio_of_units.rpartition("/")
     if not slash:
-        reading_unit, per = ratio_of_units, "1"
+        reading_unit, unit_of_scale = ratio_of_units, "1"
+    cell_unit = unit or unit_of_scale
     try:
-        factor = conversion_factor(unit or per, per)
+        factor = conversion_factor(cell_unit, unit_of_scale)
     except ValueError:
         raise CampaignFileError(
-            f"--scale of {head!r} is for cells in {per}, but they are in {unit}: give one for "
-            f"{unit}, or give --unit {head}={per}."
+            f"--scale of {head!r} is for cells in {unit_of_scale}, but they are in {unit}: give "
+            f"one for {unit}, or give --unit {head}={unit_of_scale}."
         ) from None
-    return unit or per, reading_unit, float(amount_text) * factor
+    return cell_unit, reading_unit, float(amount_text) * factor
 
 
 def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> float | str:
@@ -326,9 +332,10 @@ def sampling_interval(answer: str) -> float:
 
 
 def release_in_si(answer: str) -> dict[str, str | float]:
-    """Return the table `release` of a trial from the option `--release`, a displacement with unit.
+    """Return the table `release` of a trial from the option `--release`.
 
-    For a force, the table has the only key `force` [N].
+    For a length or a voltage its keys are `displacement` and `unit`, m or V. For a force its only
+    key is `force` [N].
 
     Raises
     ------
@@ -358,7 +365,8 @@ def units_of_columns(
 ) -> dict[str, str]:
     """Return the unit in which each channel, input and force was read, by its name.
 
-    If tables have several units for one, it is that of the first table.
+    If tables have several units for one name, it is that of the first table. A temperature has its
+    SI unit.
 
     Parameters
     ----------

@@ -17,15 +17,16 @@ def table_of_release_by_force(
 ) -> TextTable:
     """Return the table of a forced trial for the record of a ring-down.
 
-    The release is at time 0 if the record begins before it, else at its first sample. Then a row
-    without readings comes before all others, in which the force acts.
+    Its new column `force` holds the force at negative times, and 0 from time 0 on. If the record
+    has no negative times, a row is put before all others, one interval earlier, in which the force
+    acts and the channels have no readings.
 
     Parameters
     ----------
     table : TextTable
         The record in SI.
     channels : collection of str
-        The columns with readings.
+        The names of the columns with readings.
     force : float
         The force that held the structure until the release [N].
 

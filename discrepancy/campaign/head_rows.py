@@ -99,7 +99,8 @@ def _names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
 def _campbell_names_with_units(names: list[str], cells: Sequence[str]) -> HeadRows:
     """Return the names and units of a file of Campbell's loggers.
 
-    Columns without readings keep their unit of `NO_READINGS`.
+    The unit of a column without readings stays as the key of `NO_READINGS` that the file states,
+    except that `TIMESTAMP` gets none, since it is the clock of the table.
     """
     units = _names_with_units(names, cells).units
     for index, (name, cell) in enumerate(zip(names, cells, strict=False)):

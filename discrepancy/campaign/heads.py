@@ -25,12 +25,16 @@ _CLOCK_FORMAT = re.compile(
 def split_head(text: str, unit: str) -> tuple[str, str]:
     """Return the name and the unit of a column's head such as `Weg [mm]`, `F (kN)` or `t / s`.
 
+    What stands in brackets or after a slash is part of the name if it is not a unit. The format of
+    a clock is dropped.
+
     Parameters
     ----------
     text : str
         The text at the head of the column.
     unit : str
-        The unit from a row of units below the heads, which comes first; empty if there is none.
+        The unit from a row of units below the heads, which replaces that of the head; empty if
+        there is none.
     """
     match = _HEAD.fullmatch(text[:_LONGEST_HEAD])
     if match is None:

@@ -170,7 +170,10 @@ class LaboratoryImport:
         return files[0] if files else None
 
     def _sheet_with_clear_dates(self, sheet: Sheet) -> Sheet:
-        """Return a table with the day or the month first; ask if its dates can be read as both."""
+        """Return a table with the day or the month first; ask if its dates can be read as both.
+
+        Until the user answers, the day comes first.
+        """
         if sheet.month_first is None:
             return sheet
         expected_answer = f"day or month, whichever comes first in {sheet.unclear_date}"
@@ -214,7 +217,11 @@ class LaboratoryImport:
         return sampling_interval(answer) if answer else None
 
     def _begin_of_trial(self, file: str) -> str | None:
-        """Return how a forced or driven trial begins; None if nobody stated it."""
+        """Return how a forced or driven trial begins; None if the user did not state it.
+
+        The default is then noted as assumed. Raises `CampaignFileError` if the user states it for
+        another kind of trial.
+        """
         kind = self.kinds[file]
         if kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
             if self._questionnaire.stated_answer("begins", file) is not None and kind:
@@ -233,7 +240,11 @@ class LaboratoryImport:
         return None if self._questionnaire.is_assumed("begins", file) else answer
 
     def _is_held_out(self, file: str) -> bool:
-        """Return whether a trial is kept for proof and not fitted."""
+        """Return whether a trial is kept for proof and not fitted; no by default.
+
+        A campaign of one trial is not asked. Raises `CampaignFileError` if the user states it for
+        samples at rest.
+        """
         trials = [name for name, kind in self.kinds.items() if kind != NOISE]
         is_noise = self.kinds[file] == NOISE
         is_a_choice = len(trials) > 1 or bool(self.answers.get("held-out", {}))
@@ -250,7 +261,7 @@ class LaboratoryImport:
         return answer == "yes"
 
     def _release_table(self, file: str) -> dict[str, Any]:
-        """Return the table `release` of a ring-down; of 1 m if the user has not answered yet."""
+        """Return the table `release` of a ring-down; 1 m stands in until the user answers."""
         expected_answer = (
             "displacement at which the release point was held, such as 15.5mm, or the force that "
             "held it, such as 600N"
@@ -259,7 +270,10 @@ class LaboratoryImport:
         return release_in_si(answer or "1m")
 
     def _reference_temperature(self) -> float | None:
-        """Return the reference temperature [degC]; None if no column is a temperature."""
+        """Return the reference temperature [degC] that the user states.
+
+        The result is None if no column is a temperature, or if the user has not answered yet.
+        """
         if not any(column.role == "temperature" for column in self.columns):
             return None
         expected_answer = "degC, at which the model's parameters hold"
@@ -269,9 +283,9 @@ class LaboratoryImport:
     # ---------------------------------------------------------------- loads
 
     def _is_sampled_load(self, column: LaboratoryColumn) -> bool:
-        """Return whether a column is a load whose course between samples must be stated.
+        """Return whether a column is a load whose course between its samples is asked for.
 
-        Motions are always smooth.
+        It is the force of a forced trial, or an input other than a motion: motions are smooth.
         """
         if self.kinds[column.sheet.name] == TrialKind.FORCED:
             return column.role == "force"
@@ -279,7 +293,10 @@ class LaboratoryImport:
         return is_input and not (column.quantity is not None and column.quantity.motion_chain)
 
     def _hold_of_load(self, column: LaboratoryColumn) -> str | None:
-        """Return the course of a load between its samples; None if nobody stated it."""
+        """Return the course of a load between its samples; None if the user did not state it.
+
+        The default is then noted as assumed.
+        """
         choices = [*map(str, Hold)]
         expected_answer = f"what it does between its samples, {listing(choices, 'or')}"
         answer = self._questionnaire.ask_or_assume(
@@ -365,7 +382,10 @@ class LaboratoryImport:
         return units_of_columns(self.columns, self.kinds)
 
     def _trial_table(self, file: str) -> dict[str, Any]:
-        """Return the table `[[trial]]` that `campaign.toml` needs for the trial in a file."""
+        """Return the table `[[trial]]` that `campaign.toml` needs for the trial in a file.
+
+        A ring-down from a force becomes a forced trial whose force is cut off.
+        """
         load_places = self.answers.get("load-place", {})
         hold = None
         for column in self.columns:
@@ -392,13 +412,14 @@ class LaboratoryImport:
         return {"name": _NOT_TITLE.sub("", file, count=1), "file": file, **stated_keys}
 
     def _holding_force(self, file: str) -> float | None:
-        """Return the force [N] that held a structure until its release; None if it is not known."""
+        """Return the force [N] that held the structure; None unless a ring-down began from one."""
         return self.releases.get(file, {}).get("force")
 
     def merge_clocks_of(self, sheet: Sheet) -> MergedTable | None:
-        """Return a table with several columns of times on one clock.
+        """Return a table with several columns of times on one clock; it is computed once.
 
-        None if the table has one column of times, or questions are open.
+        The result is None if the table has fewer than two columns of times, or if questions are
+        open.
 
         Raises
         ------

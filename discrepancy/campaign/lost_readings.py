@@ -61,6 +61,8 @@ def leave_out_lost_readings(
 ) -> tuple[list[tuple[str, ...]], str]:
     """Return the columns of a table with empty cells for NaN and for overloads at their ends.
 
+    Other texts stay. The remark names both.
+
     Parameters
     ----------
     columns : sequence of tuple of str
@@ -77,14 +79,15 @@ def leave_out_lost_readings(
     Returns
     -------
     columns : list of tuple of str
-        The cells. A column that has overloads above its first number, or no number, keeps them.
+        The cells (N,). A column without a number, or with an overload above its first number, keeps
+        its overloads.
     remark : str
-        The remark on what was left out.
+        The remark on what was left out; empty if nothing was.
 
     Raises
     ------
     CampaignFileError
-        If readings follow an overload.
+        If a number follows an overload in a column.
     """
     remark = ""
     cleaned_columns = []

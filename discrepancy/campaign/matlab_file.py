@@ -44,7 +44,9 @@ def read_matlab(path: Path) -> MatlabTable:
     """Read the table in a MATLAB file of version 4 to 7.3.
 
     Its columns are the vectors, the columns of matrices with at most 32 columns, and the same in
-    the fields of structs. All have one length, or several if each length has a column of times.
+    the fields of structs. All have one length, which is that with the most numbers in total, or
+    several if each length has a column of times. Variables that do not fit are left out, and the
+    remark names them.
 
     Raises
     ------
@@ -52,28 +54,28 @@ def read_matlab(path: Path) -> MatlabTable:
         If the file cannot be read, or holds no columns of numbers.
     """
     columns: dict[str, np.ndarray] = {}
-    passed_over: list[str] = []
+    left_out: list[str] = []
     for name, value in _variables(path):
         columns_of_variable = _columns(name, value)
         columns |= columns_of_variable
         if not columns_of_variable:
-            passed_over.append(name)
+            left_out.append(name)
     if not columns:
-        content = listing(map(repr, passed_over)) or "nothing"
+        content = listing(map(repr, left_out)) or "nothing"
         raise CampaignFileError(
             f"{path.name} holds no vectors of numbers (it has {content}): save columns as plain "
             "vectors; a table as S = table2struct(T, 'ToScalar', true), and a datetime as "
             "seconds(t - t(1))."
         )
     table = _columns_of_fitting_lengths(columns)
-    passed_over += [name for name in columns if name not in table]
+    left_out += [name for name in columns if name not in table]
     cells = [_cells(column) for column in table.values()]
     row_count = max(map(len, cells))
     # shorter columns end with empty cells
     padded_columns = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
     remark = f"rows 1 to {row_count} of {counted(len(table), 'vector')}"
-    if passed_over:
-        remark += f"; left out: {listing(map(repr, passed_over))}"
+    if left_out:
+        remark += f"; left out: {listing(map(repr, left_out))}"
     return MatlabTable(tuple(table), padded_columns, remark)
 
 
@@ -155,9 +157,10 @@ def _hdf5_array(stored_object: h5py.Dataset | h5py.Group) -> np.ndarray | None:
 
 
 def _columns(name: str, value: object) -> dict[str, np.ndarray]:
-    """Return the columns of a variable by name; none unless it is a vector or a narrow matrix.
+    """Return the columns (N,) of a variable by name; none unless it is a vector or narrow matrix.
 
-    A matrix NAME has columns NAME 1, NAME 2, and so on, along its longer side.
+    The longer side of a matrix NAME holds the samples, and its columns are called NAME 1, NAME 2
+    and so on. Texts, complex numbers, scalars and matrices wider than `_MOST_COLUMNS` give none.
     """
     if isinstance(value, MatlabOpaque | MatlabFunction) or not isinstance(value, np.ndarray):
         return {}
@@ -175,9 +178,9 @@ def _columns(name: str, value: object) -> dict[str, np.ndarray]:
 def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Choose, by their lengths, the columns of a file that make up one table.
 
-    Columns of equal length are taken together. The length whose columns hold most numbers in total
-    is chosen. If there are columns of times of several lengths, a table may have several clocks,
-    and the columns of these lengths are chosen too.
+    These are the columns of one length: that whose columns hold most numbers in total. If columns
+    of times have several lengths, the table has several clocks, and the columns of these lengths
+    belong to it too.
     """
     lengths = {name: len(column) for name, column in columns.items()}
     number_count: Counter[int] = Counter()  # in all columns of a length

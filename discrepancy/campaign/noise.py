@@ -54,7 +54,8 @@ class NoiseModel:
     Attributes
     ----------
     standard_deviation : float
-        s0 of the white innovation for dynamic trials, after whitening [channel's unit].
+        s0 of the noise of dynamic trials after whitening: of the innovation of the autoregression
+        [channel's unit].
     static_deviation : float
         s0 of a single reading [channel's unit].
     degrees_of_freedom : float
@@ -95,6 +96,7 @@ class NoiseModel:
             return columns
         filter_taps = np.r_[1.0, -self.autoregression]
         white_residuals = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
+        # the first samples, for which the filter would need samples before the record
         sample_count = columns.shape[-1]
         for sample, weights in enumerate(self._start_up_weights[:sample_count]):
             white_residuals[..., sample] = columns[..., : sample + 1] @ weights
@@ -297,7 +299,7 @@ def strongest_line_near(
     excluded = 3 + ceil(half_width / resolution)
     below = spectrum[max(1, centre - excluded - 9) : max(1, centre - excluded + 1)]
     above = spectrum[centre + excluded : centre + excluded + 10]
-    neighbours = np.r_[below, above]
+    neighbours = np.r_[below, above]  # ten on either side, fewer near the ends of the spectrum
     # By Parseval's theorem a sine has the sum of squares of two ordinates, at plus and minus its
     # frequency, over n. This is that of a sine fitted to noise alone.
     noise_power = neighbours.mean() * 2.0 / len(samples)
@@ -316,9 +318,11 @@ def find_line(series: FloatArray) -> LineTest:
 
     Slow noise has most of its power at low frequencies, where a test against white noise takes it
     for a line. So the ordinates of the periodogram are divided by the spectrum of an autoregression
-    before they are tested by Fisher's g. An autoregression would follow a line, and is fitted to
-    the record without it. Two lines are tried, the strongest one, and that which stands out most of
-    an autoregression of the whole record. The p-value allows for the choice (Bonferroni).
+    before they are tested by Fisher's g. An autoregression of a record with a line would follow the
+    line, so that it is fitted to the record minus the line. Two lines are tried: the strongest one,
+    and the one that exceeds the spectrum of an autoregression of the whole record most. The p-value
+    allows for the choice (Bonferroni). Fewer than `LEAST_LINE_PERIODS` periods are a drift and no
+    line.
 
     Parameters
     ----------
@@ -331,18 +335,18 @@ def find_line(series: FloatArray) -> LineTest:
         Its statistic is the fraction of the variance of the record that the line has.
     """
     count = len(series)
-    ordinates = periodogram(series)
+    ordinates = periodogram(series)  # (M,), at the frequencies 1 / n, 2 / n, ... per sample
     total_power = float(ordinates.sum())
     ordinates[: LEAST_LINE_PERIODS - 1] = 0.0
     coefficients, _ = fit_autoregression(series)
-    whitened = ordinates / _autoregressive_spectrum(coefficients, count)
-    candidates = {int(ordinates.argmax()) + 1, int(whitened.argmax()) + 1}
+    whitened_ordinates = ordinates / _autoregressive_spectrum(coefficients, count)
+    candidates = {int(ordinates.argmax()) + 1, int(whitened_ordinates.argmax()) + 1}
     tests = []
     for index in sorted(candidates):
         line = _strongest_line(series, 1.0, (index - 1) / count, (index + 1) / count)
         coefficients, _ = fit_autoregression(series - line)
-        whitened = ordinates / _autoregressive_spectrum(coefficients, count)
-        tests.append(largest_ordinate_test(whitened))
+        whitened_ordinates = ordinates / _autoregressive_spectrum(coefficients, count)
+        tests.append(largest_ordinate_test(whitened_ordinates))
     best = min(tests, key=lambda test: test.p_value)
     return LineTest(
         statistic=float(ordinates[best.frequency_index - 1]) / total_power,
@@ -352,9 +356,9 @@ def find_line(series: FloatArray) -> LineTest:
 
 
 def _autoregressive_spectrum(coefficients: FloatArray, count: int) -> FloatArray:
-    """Return the spectrum of an autoregression at the frequencies of a periodogram of n samples.
+    """Return the power spectrum (M,) of an autoregression whose innovation has unit variance.
 
-    The variance of its innovation is one.
+    It is given at the frequencies of `periodogram` for `count` samples.
     """
     filter_response = np.fft.rfft(np.r_[1.0, -coefficients], count)
     return np.asarray(1.0 / np.abs(filter_response[1 : (count - 1) // 2 + 1]) ** 2)
@@ -409,7 +413,7 @@ def fit_autoregression(series: FloatArray) -> tuple[FloatArray, float]:
         The variance of the innovation e.
     """
     count = len(series)
-    covariance = np.array(
+    covariance = np.array(  # (LARGEST_ORDER + 1,), at the lags 0, 1, ...
         [series[: count - lag] @ series[lag:] / count for lag in range(LARGEST_ORDER + 1)]
     )
     best_coefficients = np.empty(0)

@@ -30,7 +30,12 @@ def pre_trigger_record(
         Sampling interval [s]; None if the samples are not evenly spaced, so that their correlation
         in time is not known.
     name, source : str
-        The name of the channel, and of the file, for messages.
+        The name of the channel, for messages, and that of the file.
+
+    Returns
+    -------
+    NoiseRecord
+        Its samples have the mean subtracted.
 
     Raises
     ------
@@ -85,15 +90,16 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
     sum_of_squares = 0.0
     degrees_of_freedom = 0
     for repeats in repeated_readings(trials, channel.name):
-        used_rows = repeats.used.all(axis=0)
+        used_rows = repeats.used.all(axis=0)  # rows whose reading is used in every repeat
+        # (repeats, used rows)
         readings = repeats.values[:, used_rows] / repeats.trials[0].noise_factor
         residual = readings - readings.mean(axis=0)
-        free_rows = readings.shape[1]
+        degrees_per_repeat = readings.shape[1]
         if channel.offset_deviation > 0.0:
             residual = residual - residual.mean(axis=1, keepdims=True)
-            free_rows -= 1
+            degrees_per_repeat -= 1
         sum_of_squares += float(np.sum(residual**2))
-        degrees_of_freedom += (len(repeats.trials) - 1) * max(free_rows, 0)
+        degrees_of_freedom += (len(repeats.trials) - 1) * max(degrees_per_repeat, 0)
     if degrees_of_freedom < _LEAST_DEGREES or sum_of_squares == 0.0:
         return None
     return NoiseRecord(
@@ -122,7 +128,11 @@ class RepeatedReadings(NamedTuple):
 
 
 def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[RepeatedReadings]:
-    """Yield the readings of a channel in each group of static or flight trials that are repeats."""
+    """Yield the readings of a channel in each group of static or flight trials that are repeats.
+
+    A trial joins the first group whose first trial it repeats. Trials without a repeat, and
+    dynamic trials, are left out.
+    """
     groups: list[list[Trial]] = []
     for trial in trials:
         if trial.is_dynamic or channel not in trial.channels:
@@ -136,7 +146,7 @@ def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[Repeate
     for group in groups:
         if len(group) == 1:
             continue
-        values = []
+        values = []  # (repeats, rows), as is_used
         is_used = []
         for trial in group:
             column = trial.channels.index(channel)
@@ -146,7 +156,10 @@ def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[Repeate
 
 
 def _is_repeat(trial: Trial, other_trial: Trial) -> bool:
-    """Return whether two trials repeat each other: same labels, loads, inputs and health."""
+    """Return whether two trials have equal labels, numbers of rows, loads, inputs and damage.
+
+    Histories are equal if they differ by at most `SAME_INPUT` of the largest value.
+    """
     if any(getattr(trial, label) != getattr(other_trial, label) for label in _LABELS):
         return False
     if len(trial.time) != len(other_trial.time):
@@ -163,7 +176,10 @@ def _is_repeat(trial: Trial, other_trial: Trial) -> bool:
 
 
 def _acting_histories(trial: Trial) -> dict[str, FloatArray]:
-    """Return the loads, inputs and damage that act in a trial: values (N,) of its rows by name."""
+    """Return the loads, inputs and stiffness losses of a trial's rows, (N,) each, by name.
+
+    Damage regions without a loss are left out.
+    """
     histories = {
         "force": trial.force,
         "load_factor": trial.load_factor,

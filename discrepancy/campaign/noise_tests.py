@@ -102,7 +102,8 @@ def ljung_box(series: FloatArray, is_used: BoolArray | None = None) -> SeriesTes
     (Ljung and Box 1978, Biometrika 65, eq. (1.3)); the mean is known to be zero. Chi-squared is too
     light in its tail for Q: at n = 64 its 99 % point is exceeded up to four times too often. The
     p-value is therefore that of a gamma distribution with the mean, variance and skewness of Q at
-    this n. A model that was fitted to the series makes the test stricter, never laxer.
+    this n. If a model was fitted to the series, a false rejection becomes less probable, never
+    more. A series too short for one lag, or of zeros, has the p-value 1.
 
     Parameters
     ----------
@@ -192,8 +193,9 @@ def statistical_inefficiency(
     """Return how many samples of a correlated record count as one independent sample.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
-    zero even for white noise, so the expected sum of their squares by chance is subtracted. That
-    sum is larger for a correlated series (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41).
+    zero even for white noise, so the expected sum of their squares by chance is subtracted. For a
+    correlated series this expected sum is larger than for white noise, and is scaled by the
+    formula of Bartlett (1946, Suppl. J. R. Stat. Soc. 8, 27-41).
 
     Parameters
     ----------
@@ -314,7 +316,8 @@ def fisher_g(series: FloatArray) -> LineTest:
 def largest_ordinate_test(ordinates: FloatArray) -> LineTest:
     """Test the ordinates (M,) of a periodogram by Fisher's g; the first has the frequency index 1.
 
-    All must have the same mean if there is no line.
+    The test holds if all ordinates have the same expected value without a line. If all are zero,
+    the p-value is 1 and the frequency index 0.
     """
     total_power = float(ordinates.sum())
     if total_power == 0.0:
@@ -347,6 +350,7 @@ def holm_rejections(p_values: Sequence[float], level: float) -> tuple[bool, ...]
     values = np.asarray(p_values, dtype=float)
     tested = np.flatnonzero(np.isfinite(values))
     is_rejected = np.zeros(values.size, dtype=bool)
+    # from the least p-value on, until the first one that is not rejected
     for rank, index in enumerate(tested[np.argsort(values[tested])]):
         if values[index] > level / (tested.size - rank):
             break

@@ -17,7 +17,10 @@ _NUMBER_FORMAT = re.compile(
 
 
 def unit_beside_number_formats(name: str, head: str, unit: str, filled: Sequence[str]) -> str:
-    """Return the unit of a column of which the filled cells may be shown with a unit.
+    """Return the unit of a column, given its head and the number formats of its filled cells.
+
+    The unit that Excel shows beside the numbers replaces a missing unit, and a plain number by
+    per cent.
 
     Raises
     ------
@@ -46,9 +49,9 @@ def unit_beside_number_formats(name: str, head: str, unit: str, filled: Sequence
 
 
 def shown_number(value: float, number_format: str) -> ExactNumber:
-    """Return a number of a workbook as its cell shows it if it has a unit, else as it is stored.
+    """Return a number of a workbook as its cell shows it if it shows a unit, else as it is stored.
 
-    Per cent are shown times 100, and each comma behind the digits divides by 1000.
+    A number in per cent is shown times 100, and each comma behind the digits divides it by 1000.
     """
     unit, power_of_ten = _unit_of_number_format(number_format)
     text = f"{Decimal(repr(value)).scaleb(power_of_ten):f}" if power_of_ten else repr(value)
@@ -59,9 +62,9 @@ def shown_number(value: float, number_format: str) -> ExactNumber:
 
 @cache
 def _unit_of_number_format(number_format: str) -> tuple[str, int]:
-    """Return the unit that a number format shows, and the power of ten of what it shows.
+    """Return the unit that a number format shows, and the power of ten by which it multiplies.
 
-    They are empty and 0 if the text behind the digits is not a unit.
+    They are an empty text and 0 if the text behind the digits is not a unit.
     """
     match = _NUMBER_FORMAT.fullmatch(number_format.partition(";")[0])
     if match is None:

@@ -33,12 +33,12 @@ LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) els
 
 
 def _refuse_key(value: object) -> object:
-    """Refuse a key as one that no file may have."""
+    """Raise the error of pydantic for an unknown key, whatever the value of the key."""
     raise PydanticKnownError("unexpected_keyword_argument")
 
 
 def _refuse_empty_text(value: str) -> str:
-    """Return a text; refuse an empty one as a missing key."""
+    """Return a text; raise the error of pydantic for a missing key if it is empty."""
     if not value:
         raise PydanticKnownError("missing")
     return value

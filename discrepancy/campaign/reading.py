@@ -106,14 +106,17 @@ def assemble_campaign(
     data_hash: str,
     remarks_on_tables: Sequence[str] = (),
 ) -> Campaign:
-    """Return the campaign of a description and its tables.
+    """Return the campaign that `campaign.toml` and its tables describe.
+
+    Its remarks are those of the file, and then those on how it was read, except for sentences that
+    the file has already.
 
     Parameters
     ----------
     section : CampaignSection
         The content of `campaign.toml`.
     tables : mapping of str to TextTable
-        The tables by the names that the description has for them.
+        The tables by the names that `campaign.toml` has for them.
     data_hash : str
         SHA-256 of all that was read.
     remarks_on_tables : sequence of str
@@ -173,10 +176,10 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     Raises
     ------
     CampaignFileError
-        If a trial of an event does not exist or is not a record in time, two events have moments of
-        one name, or an event begins again before it is over.
+        If a trial of an event does not exist or is not a record in time, two events use one name in
+        expressions, or an event begins again before it is over.
     CampaignDataError
-        If a moment lies outside the record of its trial.
+        If an event begins or ends outside the record of its trial.
     """
     trials_by_name = {trial.name: trial for trial in trials}
     recorded_in_time = tuple(trial.name for trial in trials if trial.is_dynamic)
@@ -198,7 +201,7 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
 def _check_trial_of_event(
     event: Event, name: str, trials: Mapping[str, Trial], source: str
 ) -> None:
-    """Refuse an event in a trial that does not exist, or that is not a record in time."""
+    """Raise an error if the trial of an event does not exist, or is not a record in time."""
     if name not in trials:
         raise CampaignFileError(
             f"{source}: the event {event.name!r} names the trial {name!r}, which is not among the "
@@ -213,31 +216,34 @@ def _check_trial_of_event(
 
 
 def _check_moments(event: Event, trial: Trial) -> None:
-    """Refuse an event whose begin or end lies outside the record of a trial."""
+    """Raise an error if an event begins or ends outside the record of a trial."""
     first_time, last_time = trial.time[[0, -1]].tolist()
-    for key, moment in (("time", event.time), ("until", event.until)):
-        if moment is not None and not first_time <= moment <= last_time:
+    for key, time in (("time", event.time), ("until", event.until)):
+        if time is not None and not first_time <= time <= last_time:
             raise CampaignDataError(
-                f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
+                f"The event {event.name!r} has {key} = {time:g} s, but the record of the trial "
                 f"{trial.name!r} goes from {first_time:g} to {last_time:g} s: times count from the "
                 "trial's start."
             )
 
 
 def _check_names_of_moments(events: Sequence[Event], trial: str, source: str) -> None:
-    """Refuse different events of a trial that have moments of one name."""
-    owners: dict[str, str] = {}
+    """Raise an error if two events of a trial use one name in expressions.
+
+    `pump_until` is both an event of this name, and the end of the event `pump`.
+    """
+    event_of_name: dict[str, str] = {}
     for event in events:
-        for moment in event.moments:
-            if owners.setdefault(moment, event.name) != event.name:
+        for name in event.moments:
+            if event_of_name.setdefault(name, event.name) != event.name:
                 raise CampaignFileError(
-                    f"{source}: two events have a moment {moment!r} in the trial {trial!r}: rename "
+                    f"{source}: two events have a moment {name!r} in the trial {trial!r}: rename "
                     "one."
                 )
 
 
 def _check_occurrences(events: Sequence[Event], trial: str, source: str) -> None:
-    """Refuse an event of a trial that begins again before it is over."""
+    """Raise an error if an event of a trial begins again before it is over."""
     in_order = sorted(events, key=lambda event: (event.name, event.time))
     for event, following in pairwise(in_order):
         if event.name != following.name:
@@ -270,10 +276,8 @@ def _without_fill_values(
 ) -> tuple[TextTable, list[str]]:
     """Return a table with empty cells for the fill values of channels, and a clause on each.
 
-    Raises
-    ------
-    CampaignDataError
-        If a load or another input has a fill value.
+    Columns that nothing reads stay as they are. Raises `CampaignDataError` if a load or another
+    input has a fill value.
     """
     channel_columns = {channel.table_column for channel in section.channel}
     load_columns = {recorded_input.table_column for recorded_input in section.input}
@@ -342,10 +346,13 @@ def _samples_at_rest(
 ) -> dict[str, NoiseRecord]:
     """Return the noise records from the table of samples at rest, by the name of the channel.
 
+    The result is empty without such a table. If its times are too uneven for a filter, the records
+    have no sampling interval.
+
     Raises
     ------
     CampaignFileError
-        If the table has no column of a channel.
+        If the table has no column of any channel.
     CampaignDataError
         If a record has a gap. Empty cells are allowed only at its end, where it is shorter.
     """
@@ -406,7 +413,11 @@ _ASSUMED = ' (assumed; set `begins` to "settled", "still" or "unknown")'
 
 
 def _remarks_on_begins(trials: tuple[Trial, ...]) -> list[str]:
-    """Return a remark on each state in which trials begin, stated by the file or assumed."""
+    """Return a remark on each state in which trials begin, stated by the file or assumed.
+
+    An assumed state of a forced trial without a force at its first sample makes no difference and
+    gets no remark.
+    """
     groups: dict[tuple[Start, bool], list[str]] = {}
     for trial in trials:
         is_loaded_at_first = trial.kind is TrialKind.FORCED and trial.force[0] != 0.0

@@ -86,13 +86,13 @@ def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: 
 
 
 def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
-    """Undo the rounding of printed times: return them evenly spaced if rounding explains the rest.
+    """Undo the rounding of printed times: return an even grid if rounding explains the departures.
 
     Times that were printed with few decimals are not evenly spaced even if the samples were. They
-    are replaced by the evenly spaced grid of least squares if each may be off by half a unit of the
-    last printed decimal, in addition to the tolerance `EVENNESS_TOLERANCE`. The grid passes through
-    zero if the first time is zero. Times that are even to 1e-9 of the interval, and times that
-    rounding does not explain, are returned as they are.
+    are replaced by the evenly spaced grid of least squares if they depart from an even grid by at
+    most one unit of the last printed decimal, plus `EVENNESS_TOLERANCE` intervals. The grid passes
+    through zero if the first time is zero. Times that are even to 1e-9 of the interval, and times
+    that rounding does not explain, are returned as they are.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     (N,) ndarray
         The times, in the same unit.
     """
-    # trailing zeros may be dropped in print, so the cell with most decimals shows the last decimal
-    # a step between two times is wrong by up to one unit of it: half a unit at each end
+    # Trailing zeros may be dropped in print, so that the cell with most decimals shows the last
+    # decimal. A step between two times is wrong by up to one unit of it: half a unit at each end.
     rounding_of_a_step = min(_last_digit(cell) for cell in cells)
     interval = (time[-1] - time[0]) / (len(time) - 1)
     if (
@@ -130,7 +130,7 @@ def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
 def unevenness(time: FloatArray) -> float:
     """Return the largest departure of times (N,) from an even grid, as a fraction of its interval.
 
-    The grid goes through the first and the last time.
+    The grid goes through the first and the last time. For a single time the result is 0.
     """
     interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
     departure = np.abs(time - time[0] - interval * np.arange(len(time)))
@@ -156,8 +156,8 @@ def is_nearly_even(time: FloatArray) -> bool:
 def quantum_of(values: FloatArray) -> float:
     """Return the quantum of a sensor: the smallest step between two of its readings (N,).
 
-    It is the step of the lattice on which the readings repeat (`lattice_step`). If they do not
-    repeat, it is the least difference between readings that rounding of printed decimals does not
+    It is the step of the lattice on which the readings repeat (`lattice_step`). If there is no such
+    lattice, it is the least difference between readings that rounding of printed decimals does not
     explain. It is 0 if all readings are equal.
     """
     step = lattice_step(values)
@@ -186,18 +186,20 @@ def lattice_step(values: FloatArray) -> float | None:
         The step; None if neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at
         values that are not evenly spaced.
     """
-    repeats = np.diff(values) == 0.0
-    levels = np.unique(values[1:][repeats])
+    equals_previous = np.diff(values) == 0.0  # (N - 1,)
+    levels = np.unique(values[1:][equals_previous])
     if len(levels) < LEAST_LEVELS:
         return None
     distances = np.diff(levels)
     # a low quantile, because levels that do not repeat leave distances of several steps
     step = float(np.quantile(distances, 0.25))
-    off_lattice = np.abs(distances / step - np.round(distances / step))
-    on_lattice = np.mean(
-        (off_lattice < LATTICE_TOLERANCE) & (distances > (1.0 - LATTICE_TOLERANCE) * step)
+    # a distance is on the lattice if it is a whole number of steps, at least one
+    distance_from_whole_steps = np.abs(distances / step - np.round(distances / step))
+    share_on_lattice = np.mean(
+        (distance_from_whole_steps < LATTICE_TOLERANCE)
+        & (distances > (1.0 - LATTICE_TOLERANCE) * step)
     )
-    return step if on_lattice >= LEAST_LATTICE_SHARE else None
+    return step if share_on_lattice >= LEAST_LATTICE_SHARE else None
 
 
 def least_beyond_rounding(differences: FloatArray) -> float:
@@ -220,9 +222,10 @@ def least_beyond_rounding(differences: FloatArray) -> float:
     sorted_differences = np.sort(differences[differences > 0.0])
     if not sorted_differences.size:
         return 0.0
-    jumps = np.flatnonzero(sorted_differences[1:] > ROUNDING_GAP * sorted_differences[:-1]) + 1
-    jumps_above_rounding = jumps[jumps >= LEAST_ROUNDED]
-    first_true_difference = jumps_above_rounding[0] if jumps_above_rounding.size else 0
+    # a gap is the index of the first difference above it, and so the number of those below it
+    gaps = np.flatnonzero(sorted_differences[1:] > ROUNDING_GAP * sorted_differences[:-1]) + 1
+    gaps_above_rounding = gaps[gaps >= LEAST_ROUNDED]
+    first_true_difference = gaps_above_rounding[0] if gaps_above_rounding.size else 0
     return float(sorted_differences[first_true_difference])
 
 
@@ -255,13 +258,10 @@ def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
         "stamped, and spectra are approximate."
     )
     if steps.max() > 1.5 * usual_step:
-        widest_step_of_trial = {
-            name: float(np.diff(time).max()) for name, time in uneven_times.items()
-        }
-        name = max(widest_step_of_trial, key=lambda trial: widest_step_of_trial[trial])
-        begin_of_gap = float(uneven_times[name][int(np.argmax(np.diff(uneven_times[name])))])
+        name = max(uneven_times, key=lambda trial: float(np.diff(uneven_times[trial]).max()))
+        time_of_gap = float(uneven_times[name][int(np.argmax(np.diff(uneven_times[name])))])
         sentence += (
-            f" The widest gap, {steps.max():.4g} s, begins at {begin_of_gap:.6g} s of {name!r}."
+            f" The widest gap, {steps.max():.4g} s, begins at {time_of_gap:.6g} s of {name!r}."
         )
     return sentence
 

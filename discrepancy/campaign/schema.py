@@ -63,7 +63,11 @@ class NoiseFileSection(Section):
 
 
 def _unit_in_si(record: records.InTables) -> float:
-    """Return the factor from the unit of a channel or input to SI."""
+    """Return the factor from the unit of a channel or input to SI.
+
+    Raises `ValueError` if the unit does not fit the quantity, or is degF, which a factor alone does
+    not convert.
+    """
     if usual_name(record.unit) == FAHRENHEIT:
         raise ValueError(
             f"the unit of {record.name!r} is {record.unit}: convert its readings to degC or K, or "
@@ -76,7 +80,7 @@ def _unit_in_si(record: records.InTables) -> float:
 
 
 def _with_scaled_deviations(channel: records.Channel, scale: float) -> records.Channel:
-    """Return a channel with its standard deviations multiplied by a scale."""
+    """Return a channel with the standard deviations of its noise and offset times a scale."""
     noise = channel.noise
     if noise is not None:
         noise = replace(noise, standard_deviation=amount_in_si(noise.standard_deviation, scale))
@@ -292,10 +296,10 @@ class CampaignSection(Section):
         return any(trial.kind in kinds for trial in self.trial)
 
     def _column_checks(self) -> Iterator[Check]:
-        """Yield the checks of what inputs and channels read.
+        """Yield the checks of inputs and channels: which columns they read, and in which units.
 
-        Inputs are used, a column has one reader and is no input of the trial itself, and all
-        temperatures have one unit.
+        Inputs need a trial that uses them, no two of them read one column, a channel reads no
+        column in which trials have their loads, and all temperatures have one unit.
         """
         kinds_with_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
         no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*kinds_with_inputs)

@@ -26,6 +26,9 @@ ASSUMED_GAIN = "2%"
 class SensorDeviations:
     """Standard deviations of the zeros and gains of a laboratory's columns.
 
+    All are determined when the object is made. Where the user states none, the zero of a channel is
+    taken as known to 1 % of its largest reading, that of an input as exact, and gains to 2 %.
+
     Parameters
     ----------
     questionnaire : Questionnaire
@@ -80,9 +83,10 @@ class SensorDeviations:
         return zero_deviation(column, answer, self._largest_reading(column.head))
 
     def _largest_reading(self, head: str) -> float:
-        """Return the largest absolute reading of a column in all trials [SI], without wild ones.
+        """Return the largest absolute reading [SI] under a head in all trials.
 
-        It is 0 while the unit or decimal mark is not known.
+        Wild readings and records at rest do not count. The result is 0 while the unit or decimal
+        mark is not known.
         """
         largest = 0.0
         for column in self.columns:
@@ -104,7 +108,7 @@ class SensorDeviations:
 
     @property
     def assumed(self) -> str:
-        """The remark on zeros and gains that nobody stated; empty if all are stated."""
+        """The remark on the assumed deviations of zeros and gains; empty if all were stated."""
         phrases = []
         for column in self._columns_with_zero():
             zero = self.zeros[column.head]

@@ -117,7 +117,8 @@ class Sheet:
     def numbers(self, head: str, decimal: str) -> tuple[str, ...]:
         """Return the cells of a column with a decimal point and without grouped digits.
 
-        Empty cells stay empty, and so become numbers of `LEAST_LOST_VALUE` or more.
+        A number of `LEAST_LOST_VALUE` or more stands for no reading and becomes an empty cell. A
+        cell that is no number is returned as it is.
 
         Parameters
         ----------
@@ -133,7 +134,7 @@ class Sheet:
             if number is not None and abs(float(number)) >= LEAST_LOST_VALUE:
                 numbers.append("")
                 continue
-            numbers.append(number or cell)  # what is no number stays as it is printed
+            numbers.append(number or cell)
         return tuple(numbers)
 
 
@@ -332,7 +333,10 @@ def _sheet_of_columns(
     *,
     date_order: str,
 ) -> Sheet:
-    """Return the table of a layout's columns, whose dates have the day or the month first."""
+    """Return the table of a layout's columns, whose dates have the day or the month first.
+
+    `columns_of_file` holds the cells (N,) of each column of the layout, without lost readings.
+    """
     place = f"{name}, {unit_of_place}"
     lines = tuple(line for line, _ in layout.body)
     places = [f"{place} {line}" for line in lines]
@@ -403,7 +407,11 @@ def _columns_with_seconds(
     places: Sequence[str],
     date_order: str,
 ) -> _ColumnsWithSeconds:
-    """Return the columns of a layout, with seconds in place of its clock times and dates."""
+    """Return the columns of a layout, with seconds in place of its clock times.
+
+    A column of dates is joined to its column of times, or else left out. It stays only if it is the
+    one clock of the table, so that its dates increase.
+    """
     cells_of_columns, times_of_dates = join_dates_with_times(
         columns_of_file, layout.head, units, places
     )
@@ -429,7 +437,7 @@ def _columns_with_seconds(
 
 
 def _remark_on_extent(layout: TableLayout, unit_of_place: str, separator: str) -> str:
-    """Return in words between which lines the readings stand, and what separates their cells."""
+    """Return the phrase on the first and last line of the readings, and on their separator."""
     (first_line, _), (last_line, _) = layout.body[0], layout.body[-1]
     between_cells = ""
     if separator and len(layout.head) > 1:
@@ -489,14 +497,17 @@ def _matlab_sheet(path: Path) -> Sheet:
 
 
 def _text_rows(path: Path) -> tuple[Rows, str]:
-    """Return the rows of a text file, and the separator of cells that makes the best table."""
+    """Return the rows of a text file, and the separator of cells that makes the best table.
+
+    Tabs, semicolons and commas are tried on the first `_LINES_FOR_SEPARATOR` lines; see `merit`.
+    """
     lines = read_text(path, CampaignFileError, otherwise="latin-1").splitlines()
 
     def merit(separator: str) -> tuple[bool, bool, int]:
         """Return how good a table a separator gives; a larger tuple is better.
 
-        The entries are whether a table is found, whether its heads are words, and the number of
-        cells with numbers minus that of cells with texts.
+        The entries are whether a table is found, whether no head is a number, and the number of
+        cells with numbers minus that of cells with texts, over the rows with two numbers or more.
         """
         rows = _split_rows(lines[:_LINES_FOR_SEPARATOR], separator, path.name)
         numbers_minus_texts = 0

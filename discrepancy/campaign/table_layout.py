@@ -66,13 +66,18 @@ def _rows_of_longer_clocks(
     Parameters
     ----------
     rows : list of (int, list of str)
-        The rows below the table: the number of the line, and its cells.
+        The rows of the file below the table: the number of the line, and its cells.
     first_index : int
-        The index of the first of them.
+        The index of the first of these rows among all rows of the file.
     head, units : sequence of str
         The heads and units of the table.
     places_of_values : sequence of set of int
         The indices of the cells with numbers or times in each row of the file.
+
+    Returns
+    -------
+    list of int
+        Indices among all rows of the file; empty if the table has fewer than two columns of times.
     """
     names = []
     units_of_names = []
@@ -119,8 +124,10 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     """Return the table among the rows of a file: its head, perhaps a row of units, and its body.
 
     The columns that have a number in at least half of the rows with numbers are the core of the
-    table. Its body goes from the first row to the last that has a number in the first core column
-    and no text in any.
+    table. A row has readings if it has a number in the first core column and no text in any core
+    column. The body goes from the first such row to the last one, and on for longer columns of
+    times (see `_rows_of_longer_clocks`). Within it, rows without numbers or with a text in a core
+    column are left out.
 
     Parameters
     ----------
@@ -137,13 +144,13 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
         If there is no table, its columns have no names, or there are numbers that do not fit into
         it.
     """
-    places_of_values = places_of_readings(rows)
+    places_of_values = places_of_readings(rows)  # for each row, the indices of its values
     core = _core_columns(rows, places_of_values)
-    has_text = [
+    has_text = [  # in a core column, for each row
         any(index not in values and index < len(row) and row[index] for index in core)
         for (_, row), values in zip(rows, places_of_values, strict=True)
     ]
-    body = []
+    body = []  # indices of rows
     if core:
         body = [
             index
@@ -155,8 +162,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
             f"{name} holds no table: a row with the names of the columns is needed, and rows of "
             "numbers under it, with commas, semicolons or tabs between cells."
         )
-    # from the first to the last row with a number in the first core column, other rows of numbers
-    # belong to the table as well
+    # between these rows, those with numbers in other columns alone belong to the table as well
     first_row, last_row = body[0], body[-1]
     body = [
         index
@@ -169,11 +175,11 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     )
     last_row = body[-1]
 
-    width = 0
+    width = 0  # number of columns up to the last filled one
     for index in body:
         width = max(width, *(column + 1 for column, cell in enumerate(rows[index][1]) if cell))
     _check_head_is_no_reading(rows, first_row, core, places_of_values, place)
-    named_width = len(head)
+    named_width = len(head)  # the message names the first row that is wider than the head
     first_wide_row = next(
         (index for index in sorted(body) if any(rows[index][1][named_width:])), first_row
     )
@@ -212,7 +218,11 @@ def _check_head_is_no_reading(
     places_of_values: Sequence[set[int]],
     place: str,
 ) -> None:
-    """Refuse rows with a number first and numbers in half of the core columns above the table."""
+    """Raise an error if readings with a text among them stand just above the table.
+
+    They would pass for the row of names. A row counts as such if it has a number in the first core
+    column and in at least half of the core columns.
+    """
     first_reading = first_row
     for index in range(first_row - 1, -1, -1):
         values = places_of_values[index]
@@ -229,7 +239,10 @@ def _check_head_is_no_reading(
 
 
 def _check_names(head: Sequence[str], width: int, place: str) -> None:
-    """Refuse a table of more columns than have a name, or with few named columns."""
+    """Raise an error if the head is shorter than the table, or names at most half of its columns.
+
+    `width` is the number of columns of the table.
+    """
     named_columns = sum(map(bool, head))
     if 2 * named_columns <= width or len(head) < width:
         raise CampaignFileError(
@@ -247,10 +260,11 @@ def _check_other_rows(
     name: str,
     place: str,
 ) -> None:
-    """Refuse a row with texts within the table, and rows of numbers below it.
+    """Raise an error for a row with texts within the table, and for a row of numbers below it.
 
-    Below the table, only a row with numbers in the first core column, and in a further one or in
-    half of them, is refused; other rows are a footer. Comments and repeated heads are allowed.
+    A row below the table is a row of numbers if it has one in the first core column, and numbers in
+    two core columns or in half of them; other rows are a footer. Comments, which begin with `#`,
+    and repeated heads are allowed everywhere.
     """
     first_row, last_row = body[0], body[-1]
     other_rows = {*range(first_row, last_row)} - {*body}
@@ -275,7 +289,7 @@ def _check_other_rows(
 
 
 def _check_no_empty_lines(rows: Rows, body: Sequence[int], place: str) -> None:
-    """Refuse an empty line within a single column, where a reading may be missing."""
+    """Raise an error if a single column has an empty line, where a reading may be missing."""
     for index in body[1:]:
         line, previous_line = rows[index][0], rows[index - 1][0]
         if line != previous_line + 1:

@@ -104,7 +104,7 @@ def _read_force(
     campaign: schema.CampaignSection,
     inputs: Sequence[RecordedInput],
 ) -> FloatArray:
-    """Return the force [N], or torque [N m], in each row of a trial's table (rows,).
+    """Return the force [N], or torque [N m], in each row (N,) of a trial's table.
 
     It is the column `force` of a static or forced trial, else the first force or torque among the
     inputs, else zero.
@@ -141,7 +141,7 @@ def _read_times(
     Raises
     ------
     CampaignFileError
-        If a row at rest comes twice.
+        If two rows of a static or flight trial are equal; see `_times_of_rows_at_rest`.
     CampaignDataError
         If times run backwards, or a ring-down does not begin at its release.
     """
@@ -175,7 +175,8 @@ def _times_of_rows_at_rest(
 ) -> tuple[FloatArray, float]:
     """Return the times (N,) of a static or flight trial's rows and its start [s].
 
-    Without a column `time` all rows have the time of the start.
+    Without a column `time` all rows have the time of the start. With it, the start is the first
+    time unless the section states another.
 
     Raises
     ------
@@ -224,11 +225,11 @@ def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArra
     """
     begins_branch = np.zeros(len(table), dtype=np.int64)
     for column in loads:
-        # a turn: a change of the load has another sign than the previous change; rows of equal load
-        # are skipped
-        steps = np.diff(table.numbers(column, user))
-        changes = np.flatnonzero(steps)
+        steps = np.diff(table.numbers(column, user))  # (N - 1,)
+        changes = np.flatnonzero(steps)  # rows of equal load are skipped
+        # the load turns where a change has another sign than the previous change
         is_turn = np.diff(np.sign(steps[changes])) != 0.0
+        # step i leads from row i to row i + 1, which is the first row of the new branch
         begins_branch[changes[1:][is_turn] + 1] = 1
     return np.cumsum(begins_branch)
 
@@ -262,13 +263,14 @@ def _read_channel(
 ) -> tuple[FloatArray, BoolArray]:
     """Read the readings of a channel from the table of a trial.
 
-    An empty cell is replaced by interpolation and marked as not used, and a remark says so. Rows in
-    the key `left_out` of the trial are marked as not used, too.
+    An empty cell is replaced by linear interpolation over the rows and marked as not used; the
+    sentence that says so is appended to `remarks`. Rows in the key `left_out` of the trial are
+    marked as not used, too.
 
     Returns
     -------
     values : (N,) ndarray
-        The readings of a channel [SI].
+        The readings [SI].
     is_used : (N,) ndarray of bool
         False for readings that are left out.
     """

@@ -90,6 +90,7 @@ def conversion_factor(unit: str, si: str) -> float:
     """Return the factor from a unit to a unit of SI: 0.001 from mm to m.
 
     Units of angle and plain numbers do not convert into each other, and neither do hertz and rad/s.
+    The letter `g` is the standard gravity if the SI unit is that of acceleration, else a gram.
 
     Parameters
     ----------
@@ -146,10 +147,8 @@ def factor_to_si(quantity: Quantity, unit: str) -> float:
 def _factor_to_si(quantity: Quantity, unit: str) -> float:
     """Return the factor from a unit to the SI unit of a quantity.
 
-    Raises
-    ------
-    ValueError
-        If the quantity is not measured in that unit; the error has no message.
+    A signal may be a plain number. Raises `ValueError` if the quantity is not measured in that
+    unit, with or without a message.
     """
     if quantity is Quantity.TEMPERATURE:
         if usual_name(unit) not in DEGREES:

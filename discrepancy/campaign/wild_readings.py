@@ -50,6 +50,9 @@ def without_fill_values(
 ) -> CleanedColumn:
     """Return a column with empty cells for its fill values, and clauses on its wild readings.
 
+    Fill values are numbers beyond `LEAST_LOST_VALUE`, and wild readings with a number that loggers
+    write for no reading, such as -9999. Other wild readings stay.
+
     Parameters
     ----------
     cells, numbers : sequence of str
@@ -63,8 +66,9 @@ def without_fill_values(
     cleaned_cells = list(cells)
     fill_values = []
     unsupported = []
-    values = numbers_or_nan(numbers)
+    values = numbers_or_nan(numbers)  # (N,)
     is_beyond = np.isfinite(values) & (np.abs(values) >= LEAST_LOST_VALUE)
+    # `numbers` may have these left out already
     is_beyond |= [bool(cell) and not number for cell, number in zip(cells, numbers, strict=True)]
     if is_beyond.any():
         rows = is_beyond.nonzero()[0].tolist()
@@ -104,13 +108,14 @@ def wild_readings(values: FloatArray) -> BoolArray:
     """Return which readings (N,) of a column no other reading supports; none that is NaN.
 
     One or two values, however often they come, are wild if they lie more than ten times as far
-    from the median of the different values as all the others do.
+    from the median of the different values as all the others do. There must be at least three
+    others.
     """
     distinct_values = np.unique(values[np.isfinite(values)])
     if not distinct_values.size:
         return np.zeros(len(values), dtype=bool)
     centre = np.median(distinct_values)
-    distances = np.sort(np.abs(distinct_values - centre))[::-1]
+    distances = np.sort(np.abs(distinct_values - centre))[::-1]  # the largest first
     limit = np.inf
     for count in range(1, _MOST_WILD_VALUES + 1):
         if len(distances) < count + _LEAST_SUPPORTED_VALUES:

@@ -22,7 +22,7 @@ _DAYS_OF_YEAR = 366
 
 
 class WorkbookSheet(NamedTuple):
-    """The rows of a sheet of a workbook, and the names of cells that are stored without a value."""
+    """The filled rows of a sheet, and the names of cells such as `B7` stored without a value."""
 
     rows: Rows
     blank_cells: Set[str]
@@ -70,10 +70,20 @@ def read_workbook(path: Path) -> dict[str, WorkbookSheet]:
 def title_of_sheet(file: Path, stated_title: str, workbook: Mapping[str, WorkbookSheet]) -> str:
     """Return the title of the sheet that a user names, or of the only one that is not empty.
 
+    Parameters
+    ----------
+    file : Path
+        The workbook, for messages.
+    stated_title : str
+        The title that the user names, or an empty text.
+    workbook : mapping of str to WorkbookSheet
+        The sheets by title.
+
     Raises
     ------
     CampaignFileError
-        If the workbook does not have that sheet, or not one sheet only.
+        If all sheets are empty, the workbook does not have that sheet, or the user names none and
+        several are filled.
     """
     filled = [title for title, sheet in workbook.items() if sheet.rows]
     if not filled:
@@ -93,7 +103,18 @@ def _has_no_value(cell: Any) -> bool:
 
 
 def refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None:
-    """Refuse a sheet with formulas in cells without a value, as programs that do not compute write.
+    """Raise an error if one of the cells without a value holds a formula.
+
+    Programs that write formulas without computing them store no values.
+
+    Parameters
+    ----------
+    blank_cells : set of str
+        The names of the cells without a value, such as `B7`.
+    path : Path
+        The workbook.
+    title : str
+        The title of the sheet.
 
     Raises
     ------
@@ -102,7 +123,7 @@ def refuse_formulas_among(blank_cells: Set[str], path: Path, title: str) -> None
     """
     from openpyxl import load_workbook
 
-    formulas = []
+    formulas = []  # read again, since `data_only` returns values in the place of formulas
     with warnings.catch_warnings(action="ignore"):
         book = load_workbook(io.BytesIO(path.read_bytes()), read_only=True)
         book[title].reset_dimensions()
@@ -143,10 +164,13 @@ def _is_format_of_times(number_format: str) -> bool:
 def _time_of_serial_number(days: float, number_format: str, epoch: datetime) -> str:
     """Return the time that Excel stores as a number of days, to the microsecond.
 
-    Less than a year is a time that elapsed, of any number of hours; from one year on, it is a date
-    with a time, whatever part of it is shown. The number of a date is rounded by up to a
-    microsecond when it is stored. Stamps of even rates are multiples of 25 microseconds, and are
-    told apart from others by being that close to one.
+    A number below 366, or with a format of elapsed time, becomes hours, minutes and seconds, and
+    the hours may exceed 24. Any other becomes a date with a time, even if its format shows only one
+    of them. A negative number, or one beyond the calendar, stays a number.
+
+    A float of days since 1900 is off by up to a microsecond. Samples at usual rates are taken at
+    multiples of 25 microseconds, so that a date within a microsecond of such a multiple is moved
+    to it.
     """
     from openpyxl.styles.numbers import is_timedelta_format
 

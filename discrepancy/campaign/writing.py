@@ -52,14 +52,17 @@ class _FileUnits:
     left_out_as_empty: bool
 
     def in_unit(self, values: records.FloatArray, name: str, to_si: float) -> records.FloatArray:
-        """Return values (N,) of a channel or input in its unit, rounded to the digits of the files.
+        """Return values (N,) [SI] of a channel or input in its unit.
+
+        They are rounded to the digits of the files if `units` has the unit of this channel or
+        input.
 
         Parameters
         ----------
         values : (N,) ndarray
             The values to convert [SI].
         name : str
-            The name of the channel or input.
+            The name of the channel or input; "force" for the column of that name.
         to_si : float
             The factor from its unit to SI.
         """
@@ -67,14 +70,17 @@ class _FileUnits:
         return self.rounded(in_unit) if name in self.units else in_unit
 
     def rounded(self, values: records.FloatArray) -> records.FloatArray:
-        """Return values (N,) rounded to the digits of the files."""
+        """Return values (N,) rounded to the digits of the files; with 17 digits, unchanged."""
         if self.digits == _EXACT_DIGITS:
             return values
         return np.array([float(f"{value:.{self.digits}g}") for value in values.tolist()])
 
     @property
     def force_unit(self) -> str:
-        """Unit of the column `force`; a channel of another quantity may have that name, too."""
+        """Unit of the column `force`: the stated one if it is a unit of force, else N.
+
+        A channel of another quantity, with a unit of its own, may also be called `force`.
+        """
         unit = self.units.get("force", schema.FORCE_UNIT)
         return unit if records.Quantity.FORCE in quantities_of(unit) else schema.FORCE_UNIT
 
@@ -191,7 +197,10 @@ def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _
 
 
 def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
-    """Return the columns of stiffness losses and their standard deviations that are not zero."""
+    """Return a trial's stiffness losses and their standard deviations as columns (N,), by name.
+
+    Columns of zeros are left out.
+    """
     columns = {}
     for index, region in enumerate(trial.regions):
         name = region if region in records.USUAL_REGIONS else f"{schema.OF_REGION}{region}"
@@ -262,7 +271,7 @@ def _campaign_text(
     noise_interval: float | None,
     file_units: _FileUnits,
 ) -> str:
-    """Return the text of `campaign.toml`.
+    """Return the text of `campaign.toml`, after a check that the reader would accept it.
 
     Parameters
     ----------
@@ -309,14 +318,14 @@ def _campaign_text(
         event=tuple(complete_events(campaign.events, campaign.trials, source)),
     )
     content = section.model_dump(mode="json", exclude_defaults=True)
-    schema.parse_campaign(content, source)
+    schema.parse_campaign(content, source)  # raises for what the format cannot express
     return toml_text(content)
 
 
 def _channel_table(channel: records.Channel, file_units: _FileUnits) -> records.Channel:
-    """Return a channel as `campaign.toml` states it, without its samples at rest.
+    """Return a channel as `campaign.toml` states it.
 
-    These are written to a table of their own.
+    A noise record with samples is left out: its samples are written to a table of their own.
     """
     noise = channel.noise
     if noise is not None and noise.samples is not None:
@@ -329,7 +338,10 @@ def _channel_table(channel: records.Channel, file_units: _FileUnits) -> records.
 def _input_table(
     recorded_input: records.RecordedInput, file_units: _FileUnits
 ) -> records.RecordedInput:
-    """Return an input as `campaign.toml` states it, with its deviation in the unit of the file."""
+    """Return an input as `campaign.toml` states it, with its `offset_deviation` in its unit there.
+
+    A prescribed motion that is not smooth between its samples is written as a `reference`.
+    """
     is_reference = (
         bool(recorded_input.quantity.motion_chain)
         and recorded_input.hold is not records.Hold.SMOOTH
