@@ -10,7 +10,7 @@ from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.judgement.hypotheses import named_effects
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import render_report
+from discrepancy.report.page import verdict_page
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration_file import SELF_CALIBRATION_NAME, write_self_calibration
 from discrepancy.verdict import VerdictKind
@@ -20,6 +20,7 @@ from reporting.errors import FileNotWrittenError
 from reporting.figures import save_figure
 from reporting.files import atomic_write_text
 from reporting.folders import restore_folder, whole_folder
+from reporting.page import render_page
 
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"
@@ -120,11 +121,10 @@ def _write_files(folder: Path, content: ReportInput, *, report: bool) -> None:
         write_self_calibration(path, content.self_calibration, origin)
     if not report:
         return
-    figures = report_figures(content)
-    drawings = {}
-    for name, figure in figures.items():
-        drawings[name] = save_figure(figure.figure, folder / FIGURES, name)
-    atomic_write_text(folder / REPORT_NAME, render_report(content, drawings, figures))
+    figures = {}
+    for name, figure in report_figures(content).items():
+        figures[name] = save_figure(figure, folder / FIGURES)
+    atomic_write_text(folder / REPORT_NAME, render_page(verdict_page(content, figures)))
 
 
 def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:

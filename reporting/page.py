@@ -1,13 +1,12 @@
-"""A self-contained HTML page: sections, numbered figures and tables, one style sheet.
+"""A page as data, and the one function that renders pages as HTML.
 
 A page makes no request to any server, is light, and prints well. One short script shows the values
-under the pointer in figures; the page is complete without it. All text is escaped. `page.html` is
-the template of a page; the words of a page stand in a TOML file of its own, see `Words`.
+under the pointer in figures; the page is complete without it. All text is escaped.
 """
 
-import tomllib
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -16,75 +15,23 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from markupsafe import Markup
 
-from reporting.errors import InvalidFigureError
-from reporting.templates import fill_template, html_environment
+from reporting.inline_svg import InlineDrawing, inline_svg
+from reporting.table import Table
+from reporting.templates import html_environment
 
 if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes long to import
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class PageColumn:
-    """One column of a table.
-
-    Attributes
-    ----------
-    name : str
-        The heading.
-    unit : str
-        The unit, shown below the heading; empty for text and for plain counts.
-    numeric : bool
-        Whether cells are aligned to the right, in figures of equal width.
-    """
-
-    name: str
-    unit: str = ""
-    numeric: bool = False
-
-
-def number_column(name: str, unit: str = "") -> PageColumn:
-    """Return a column of numbers."""
-    return PageColumn(name, unit, numeric=True)
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of formatted text.
-
-    Attributes
-    ----------
-    columns : sequence of PageColumn
-        The headings and units.
-    rows : sequence of sequence of str
-        The cells of each row, one for each column.
-
-    Raises
-    ------
-    InvalidFigureError
-        If a row does not have one cell for each column.
-    """
-
-    columns: Sequence[PageColumn]
-    rows: Sequence[Sequence[str]]
-
-    def __post_init__(self) -> None:
-        cells_needed = len(self.columns)
-        for number, row in enumerate(self.rows):
-            if len(row) != cells_needed:
-                raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; {cells_needed} are needed."
-                )
-
-
 class ReportFigure(NamedTuple):
-    """A figure with its title and caption.
+    """A figure that is not rendered yet, with its title and caption.
 
     Attributes
     ----------
     name : str
         The name of its file, without ending.
     figure : Figure
-        The drawing.
+        The figure with all its panels drawn.
     title, caption : str
         The text below it.
     """
@@ -95,194 +42,175 @@ class ReportFigure(NamedTuple):
     caption: str
 
 
-class Words:
-    """The words of a page, from a TOML file: texts with plain fields, such as ``{{ step }}``.
+class PageFigure(NamedTuple):
+    """A rendered figure of a page.
 
-    ``[said]`` holds sentences by name, ``[figures]`` titles and captions, ``[tables]`` titles,
-    captions and, where a table always has the same, columns. A column is a heading of text, or a
-    table with the heading of `number` and its `unit`.
-
-    Parameters
+    Attributes
     ----------
-    package : str
-        The package of the file, such as ``twin_master.report``.
     name : str
-        The name of the file.
+        The name of its file, without ending.
+    svg : bytes
+        The drawing, from `reporting.figures.to_svg`.
+    title : str
+        A few words in bold before the caption, which also describe the drawing to readers who
+        cannot see it.
+    caption : str
+        What is seen, with units and source.
     """
 
-    def __init__(self, package: str, name: str = "words.toml") -> None:
-        file = resources.files(package).joinpath(name)
-        self.content = tomllib.loads(file.read_text(encoding="utf-8"))
-
-    def say(self, name: str, /, **fields: object) -> str:
-        """Return a sentence of the table ``[said]``."""
-        return fill_template(self.content["said"][name], **fields)
-
-    def words(self, kind: str, name: str, /, **fields: object) -> dict[str, str]:
-        """Return the title and the caption of one of the `figures` or `tables`."""
-        texts = self.content[kind][name]
-        return {key: fill_template(texts[key], **fields) for key in ("title", "caption")}
-
-    def figure(self, name: str, figure: "Figure", /, **fields: object) -> ReportFigure:
-        """Return a figure with its title and caption."""
-        return ReportFigure(name, figure, **self.words("figures", name, **fields))
-
-    def add_table(
-        self,
-        page: "Page",
-        name: str,
-        rows: Sequence[Sequence[str]],
-        /,
-        more: Sequence[PageColumn] = (),
-        **fields: object,
-    ) -> None:
-        """Add a table with its title and caption to a page, unless it has no rows.
-
-        Parameters
-        ----------
-        page : Page
-            The page to which content is added.
-        name : str
-            The name of the table in the file.
-        rows : sequence of sequence of str
-            The cells of each row.
-        more : sequence of PageColumn
-            The columns after those of the file.
-        **fields : object
-            The fields of title, caption and headings.
-        """
-        if rows:
-            headings = self.content["tables"][name]["columns"]
-            columns = [_column_of_heading(heading, fields) for heading in headings]
-            page.add_table(Table([*columns, *more], rows), **self.words("tables", name, **fields))
+    name: str
+    svg: bytes
+    title: str
+    caption: str
 
 
-def _column_of_heading(heading: str | dict[str, str], fields: Mapping[str, object]) -> PageColumn:
-    """Return the column that a heading in the file of texts describes, with fields filled in."""
-    if isinstance(heading, str):
-        return PageColumn(fill_template(heading, **fields))
-    return number_column(fill_template(heading["number"], **fields), heading.get("unit", ""))
+class Notice(NamedTuple):
+    """A paragraph that the reader must not overlook."""
+
+    text: str
 
 
-class _PageBlock(NamedTuple):
-    """A block of a page, as `page.html` takes it."""
+class Highlights(NamedTuple):
+    """A row of a few values in large print, each with its meaning: pairs (value, meaning)."""
 
-    kind: str
-    content: dict[str, object]
+    items: Sequence[tuple[str, str]]
 
 
+class Fold(NamedTuple):
+    """A part that the reader unfolds on demand; a printed page shows it."""
+
+    title: str
+    blocks: "Sequence[Block]"
+
+
+Block = str | Notice | Highlights | Fold | PageFigure | Table | None
+"""A part of a page. A string is a paragraph; None and whatever is empty are left out."""
+
+
+class Section(NamedTuple):
+    """A part of a page with a heading, which appears in the contents; left out without blocks."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
 class Page:
-    """Builds one page from top to bottom.
+    """A page: its first screen, then sections with tables and further figures.
 
-    Parameters
+    Attributes
     ----------
-    title : str
-        The title of the page and of the browser's window.
-    subtitle : str
-        One line below it.
+    title, subtitle : str
+        The title, also of the browser's window, and one line below it.
+    sentence : str
+        What a reader must know, in one or two sentences in large print.
+    picture : PageFigure or None
+        The picture that shows it.
+    outcome : sequence of Block
+        Notices, values and sentences that end the first screen.
+    sections : sequence of Section
+        Everything else.
     footer : sequence of str
         The lines at the end, such as the sources cited.
+    script : str
+        The address of a further script, for a page that a server keeps up to date; empty for none.
     """
 
-    def __init__(self, title: str, subtitle: str = "", footer: Sequence[str] = ()) -> None:
-        self._head = {"title": title, "subtitle": subtitle, "footer": footer}
-        self._blocks: list[_PageBlock] = []
+    title: str
+    subtitle: str = ""
+    sentence: str = ""
+    picture: PageFigure | None = None
+    outcome: Sequence[Block] = ()
+    sections: Sequence[Section] = ()
+    footer: Sequence[str] = ()
+    script: str = ""
 
-    def _add(self, kind: str, **content: object) -> None:
-        """Append a block of content to the page."""
-        self._blocks.append(_PageBlock(kind, content))
 
-    def _next_number(self, kind: str) -> int:
-        """Return the number of the next block of a kind; the first is 1."""
-        return 1 + sum(block.kind == kind for block in self._blocks)
+_WITH_VALUES = "figures with values under the pointer"
 
-    def add_section(self, title: str) -> None:
-        """Begin a section; it appears in the contents."""
-        self._add("section", title=title, number=self._next_number("section"))
 
-    def add_paragraph(self, text: str) -> None:
-        """Add a paragraph of plain text."""
-        self._add("paragraph", text=text)
+class _NumberedBlock(NamedTuple):
+    """A block as `page.html` takes it.
 
-    def add_notice(self, text: str) -> None:
-        """Add a paragraph that the reader must not overlook."""
-        self._add("notice", text=text)
+    Attributes
+    ----------
+    kind : str
+        The name of its class, by which the template chooses the element.
+    content : Block
+        The block.
+    number : int
+        Which one of its kind it is on the page, from 1.
+    drawing : InlineDrawing or None
+        The elements of a figure.
+    blocks : sequence of _NumberedBlock
+        What a fold contains.
+    """
 
-    def add_card(self, text: str) -> None:
-        """Add the one sentence of the page that a reader must know, in large print."""
-        self._add("card", text=text)
+    kind: str
+    content: Block
+    number: int
+    drawing: InlineDrawing | None
+    blocks: "Sequence[_NumberedBlock]"
 
-    def begin_fold(self, title: str) -> None:
-        """Begin a part that the reader unfolds on demand; `end_fold` ends it."""
-        self._add("fold", title=title)
 
-    def end_fold(self) -> None:
-        """End the part that `begin_fold` has begun."""
-        self._add("end of fold")
+def render_page(page: Page) -> str:
+    """Return a page as one string of HTML.
 
-    def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
-        """Add a row of a few values in large print, each with its meaning."""
-        self._add("highlights", items=items)
+    Figures and tables are numbered in the order of the page.
 
-    def add_figure(self, svg: bytes, caption: str, *, title: str) -> int:
-        """Add a numbered figure, and return its number.
+    Raises
+    ------
+    InvalidFigureError
+        If the drawing of a figure is not an SVG that can be scaled.
+    """
+    counts: Counter[str] = Counter()
+    opening = _number_blocks((page.picture, *page.outcome), counts)
+    sections = []
+    for section in page.sections:
+        blocks = _number_blocks(section.blocks, counts)
+        if blocks:
+            sections.append((section.title, blocks))
+    template = html_environment().from_string(_read_resource("page.html"))
+    return template.render(
+        page=page,
+        opening=opening,
+        sections=sections,
+        style=Markup(_read_resource("page.css")),
+        hover_script=Markup(_read_resource("hover.js")) if counts[_WITH_VALUES] else "",
+    )
 
-        Parameters
-        ----------
-        svg : bytes
-            The drawing, from `reporting.figures.to_svg`.
-        caption : str
-            What is seen, with units and source.
-        title : str
-            A few words in bold before the caption, which also describe the drawing to readers who
-            cannot see it.
 
-        Raises
-        ------
-        InvalidFigureError
-            If `svg` is not an SVG that can be scaled.
-        """
-        from reporting.figures import inline_svg
+def _number_blocks(blocks: Iterable[Block], counts: Counter[str]) -> list[_NumberedBlock]:
+    """Return the blocks that are not empty with their numbers; `counts` goes on by kind."""
+    numbered = []
+    for block in blocks:
+        if _is_empty(block):
+            continue
+        kind = type(block).__name__
+        counts[kind] += 1
+        number = counts[kind]
+        drawing = None
+        if isinstance(block, PageFigure):
+            drawing = inline_svg(block.svg, prefix=f"f{number}", description=block.title)
+            counts[_WITH_VALUES] += " data-axes=" in drawing.full
+        inner = _number_blocks(block.blocks, counts) if isinstance(block, Fold) else ()
+        numbered.append(_NumberedBlock(kind, block, number, drawing, inner))
+    return numbered
 
-        number = self._next_number("figure")
-        drawing = inline_svg(svg, prefix=f"f{number}", description=title)
-        self._add(
-            "figure",
-            number=number,
-            drawing=Markup(drawing.full),
-            tiles=[Markup(tile) for tile in drawing.tiles],
-            is_wide=drawing.is_wide,
-            title=title,
-            caption=caption,
-        )
-        return number
 
-    def add_report_figure(self, figure: ReportFigure) -> int:
-        """Add a figure with its title and caption, and return its number."""
-        from reporting.figures import to_svg
-
-        return self.add_figure(to_svg(figure.figure), figure.caption, title=figure.title)
-
-    def add_table(self, table: Table, caption: str, *, title: str) -> int:
-        """Add a numbered table, and return its number."""
-        number = self._next_number("table")
-        self._add("table", number=number, table=table, title=title, caption=caption)
-        return number
-
-    def render(self) -> str:
-        """Return the page as one string of HTML."""
-        has_values_in_figures = any(
-            " data-axes=" in str(block.content["drawing"])
-            for block in self._blocks
-            if block.kind == "figure"
-        )
-        template = html_environment().from_string(_read_resource("page.html"))
-        return template.render(
-            **self._head,
-            blocks=self._blocks,
-            style=Markup(_read_resource("page.css")),
-            script=Markup(_read_resource("hover.js")) if has_values_in_figures else "",
-        )
+def _is_empty(block: Block) -> bool:
+    """Return whether a block has nothing to show."""
+    if isinstance(block, Notice):
+        return not block.text.strip()
+    if isinstance(block, Highlights):
+        return not block.items
+    if isinstance(block, Fold):
+        return all(_is_empty(inner) for inner in block.blocks)
+    if isinstance(block, Table):
+        return not block.rows
+    if isinstance(block, str):
+        return not block.strip()
+    return block is None
 
 
 @cache

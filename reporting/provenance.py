@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import metadata, util
 from pathlib import Path
+from typing import Any
 
 from reporting.files import hash_tree
 
@@ -44,6 +45,14 @@ SOURCE_PACKAGES = (
 
 _PLUG_IN_GROUPS = "uav_twin."
 """The beginning of all groups of entry points by which packages add something to this project."""
+_KEY_OF_TITLE = {
+    "software": "versions",
+    "plug-ins": "plug_ins",
+    "sources": "source_hashes",
+    "inputs": "input_hashes",
+}
+"""The key of a stored provenance for each item of a page."""
+_HASH_DIGITS = 12
 _SOURCE_SUFFIXES = frozenset({".py", ".toml", ".css"})
 
 
@@ -147,3 +156,18 @@ def source_hash(package: str) -> str:
         raise ValueError(f"There is no package {package!r} whose sources could be hashed.")
     root = Path(next(iter(specification.submodule_search_locations)))
     return hash_tree(root, suffixes=_SOURCE_SUFFIXES)
+
+
+def provenance_items(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the items of a stored provenance for a page: each kind with its sorted entries.
+
+    A hash is shortened to its first 12 digits.
+    """
+    items = []
+    for title, key in _KEY_OF_TITLE.items():
+        entries = provenance.get(key, {})
+        texts = []
+        for name, value in sorted(entries.items()):
+            texts.append(f"{name} {value[:_HASH_DIGITS] if key.endswith('hashes') else value}")
+        items.append((title, ", ".join(texts)))
+    return items

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from reporting.page import Table as TextTable
     from reporting.progress import Progress
+    from reporting.table import Table as TextTable
 
 _Command = Any  # Typer does not export the classes of its commands and options.
 _Option = Any
@@ -96,11 +96,11 @@ def say(text: str, *, fg: str | None = None, bold: bool | None = None) -> None:
 
 
 def show(blocks: "Iterable[str | TextTable]") -> None:
-    """Print the result of a command: its lines and tables, one after the other."""
+    """Print the lines and tables of a result in their order; tables without rows are left out."""
     for block in blocks:
         if isinstance(block, str):
             say(block)
-        else:
+        elif block.rows:
             print_table([column.name for column in block.columns], block.rows)
 
 

@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.transforms import Bbox
 
-NARROW = 340.0
-"""Width of a tile that fits a screen of 400 pixels with letters that can be read [pt]."""
+from reporting.inline_svg import NARROW
+
 _ALLOWED_OVERLAP = 4.0
 """Overlap of two boxes that is ignored, since it is the margin around their letters [pt]."""
 _MARGIN = 3.0

@@ -1,6 +1,7 @@
 """`uav-twin calibrate`: all three steps of a wing; `ringdown`, `simulate` and `campaign`."""
 
 import json as json_text
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +17,7 @@ from uav_twin.discrepancy_commands import use_one_thread
 from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
 
 if TYPE_CHECKING:
+    from calibration.paper.figures import TableRow
     from calibration.result.record import Calibration
     from calibration.virtual_wing import TestBench
     from fe.runtime.state import DigitalState
@@ -79,7 +81,12 @@ def calibrate_campaign(
 
 
 def print_calibration(
-    result: "Calibration", written_file: Path | None, *, json: bool, report: bool
+    result: "Calibration",
+    written_file: Path | None,
+    *,
+    json: bool,
+    report: bool,
+    table_1: "Sequence[TableRow]" = (),
 ) -> None:
     """Print the posterior of a calibration, and the files that were written.
 
@@ -89,14 +96,17 @@ def print_calibration(
         The file of the calibration, if one was written.
     report : bool
         Whether a report was written beside the file.
+    table_1 : sequence of TableRow
+        Table 1 of the paper with the values of a wing; empty for other models.
     """
     if json:
         file = None if written_file is None else str(written_file)
         terminal.print_json({"calibration": file} | _calibration_record(result))
         return
+    from calibration.paper.figures import printed_table_1
     from calibration.result.text import printed_calibration
 
-    terminal.show(printed_calibration(result))
+    terminal.show(printed_calibration(result, [printed_table_1(table_1)]))
     if written_file is None:
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
@@ -226,14 +236,16 @@ def calibrate_wing(
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
     calibration = calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
-    if not json:
-        from calibration.paper.figures import printed_table_1
-
-        terminal.show([printed_table_1(calibration.table_1).table])
     written_file = None
     if out is not None:
         written_file = write_wing_folder(calibration, out, report=not no_report)
-    print_calibration(calibration.result, written_file, json=json, report=not no_report)
+    print_calibration(
+        calibration.result,
+        written_file,
+        json=json,
+        report=not no_report,
+        table_1=calibration.table_1,
+    )
 
 
 def calibrate_ringdown(
@@ -281,6 +293,7 @@ def calibrate_ringdown(
         fit_trials,
     )
     from reporting.figures import save_figure
+    from reporting.page import ReportFigure
     from reporting.table_file import table_text
 
     start = FIRST_PEAK if start is None else start
@@ -311,7 +324,8 @@ def calibrate_ringdown(
         columns = zip(*(row.cells(".10g") for row in rows), strict=True)
         table = dict(zip(headings, columns, strict=True))
         atomic_write_text(out / "ringdown.csv", table_text(table))
-        save_figure(ring_down_figure(trials), out / "figures", "ringdown")
+        picture = ReportFigure("ringdown", ring_down_figure(trials), title="", caption="")
+        save_figure(picture, out / "figures")
 
 
 class RingDownRow(NamedTuple):

@@ -15,14 +15,8 @@ from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
 from reporting import figures as style
 from reporting.files import atomic_write_text
-from reporting.page import Words
-from reporting.record_table import (
-    RecordColumn,
-    TitledTable,
-    number_cells,
-    table_of_records,
-    text_cells,
-)
+from reporting.page_words import Words
+from reporting.table import RecordColumn, Table, number_cells, table_of_records, text_cells
 from reporting.table_file import table_text
 
 WORDS = Words("calibration.paper", "table_1.toml")
@@ -120,7 +114,7 @@ def _printed_moments(row: TableRow, moments: Moments) -> str:
     return row.paper.printed(moments.mean, moments.standard_deviation)
 
 
-def printed_table_1(rows: Sequence[TableRow]) -> TitledTable:
+def printed_table_1(rows: Sequence[TableRow]) -> Table:
     """Return Table 1 of the paper with the values of this calibration added."""
     columns: list[RecordColumn[TableRow]] = [
         text_cells(
@@ -137,7 +131,7 @@ def printed_table_1(rows: Sequence[TableRow]) -> TitledTable:
         ),
         number_cells("difference", lambda row: row.paper.printed(row.difference, sign="+")),
     ]
-    return TitledTable(table_of_records(columns, rows), **WORDS.words("tables", "table_1"))
+    return table_of_records(columns, rows, **WORDS.words("tables", "table_1"))
 
 
 def table_1(

@@ -19,6 +19,7 @@ from reporting.arrays import Float
 
 _COLOURS = (style.PAST, style.PRESENT, style.REFERENCE)
 _COLUMNS = 3
+_MOST_MARGINAL_COLUMNS = 5
 _MOST_READINGS = 12
 _TITLE_WIDTH = 14  # of a line beside an axis, in characters
 
@@ -73,12 +74,46 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
         else:
             axes.set_ylim(limits[row])
             _draw_scatter(axes, samples, column, row)
+    _draw_legend(figure, sets)
+    return figure
+
+
+def _draw_legend(figure: Figure, sets: Sequence[tuple[str, Float]]) -> None:
+    """Draw the names of the distributions beside their colours, in the upper right corner."""
     handles = []
     for colour, (name, _) in zip(_COLOURS, sets, strict=False):
         handles.append(
             Line2D([], [], linestyle="none", marker="s", color=colour, ms=4.0, label=name)
         )
-    figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.985, 0.99))
+    figure.legend(
+        handles=handles, loc="upper right", bbox_to_anchor=(0.985, 1.0), ncols=len(handles)
+    )
+
+
+@style.publication_style()
+def marginal_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> Figure:
+    """Draw histograms of samples, a panel for each parameter; the first set is filled.
+
+    Parameters
+    ----------
+    titles : sequence of str
+        The title of each parameter, with its unit.
+    sets : sequence of (str, (N, F) array)
+        The names and samples of up to three distributions, in the units of the titles.
+    """
+    columns = min(len(titles), _MOST_MARGINAL_COLUMNS)
+    rows = math.ceil(len(titles) / columns)
+    height = 0.35 + 1.5 * rows
+    figure, grid = style.panels(
+        rows, columns, height, 0.3, 0.6, left=0.03, right=0.97, wspace=0.15, hspace=0.85
+    )
+    for column, axes in enumerate(style.keep_first_panels(grid, len(titles))):
+        values = [samples[:, column] for _, samples in sets]
+        limits = _limits(values)
+        _prepare_corner_axes(axes)
+        axes.set(xlim=limits, xlabel=titles[column])
+        _draw_histograms(axes, values, limits)
+    _draw_legend(figure, sets)
     return figure
 
 

@@ -5,7 +5,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from calibration.result.figures import corner_figure, readings_figure, unmeasured_parameters
+from calibration.result.figures import (
+    corner_figure,
+    marginal_figure,
+    readings_figure,
+    unmeasured_parameters,
+)
 from calibration.result.file import FILE_NAME, result_bytes
 from calibration.result.record import Calibration
 from calibration.result.tables import (
@@ -15,12 +20,19 @@ from calibration.result.tables import (
     readings_table,
     sensors_table,
 )
-from calibration.result.text import NOTICEABLE_CORRELATION, correlation_lines
+from calibration.result.text import NOTICEABLE_CORRELATION, correlation_lines, outcome_sentences
 from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors
-from reporting.page import Page, ReportFigure
+from reporting.page import (
+    Fold,
+    Highlights,
+    Notice,
+    Page,
+    ReportFigure,
+    Section,
+    render_page,
+)
 from reporting.progress import stage
-from reporting.record_table import add_titled_table
 
 FIGURES = "figures"
 REPORT_NAME = "report.html"
@@ -87,39 +99,23 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
     with calibration_folder(result, folder) as new_folder:
         if report:
             with stage("Drawing the report"):
-                finish_page(start_page(result, new_folder), result, new_folder)
+                write_page(result, new_folder)
     return folder / FILE_NAME
 
 
-def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
-    """Add a figure to a page, and write its files beside the page."""
-    drawing = save_figure(figure.figure, folder / FIGURES, figure.name)
-    page.add_figure(drawing, figure.caption, title=figure.title)
+def write_page(result: Calibration, folder: Path, further_sections: Sequence[Section] = ()) -> None:
+    """Write the page of a calibration, and the files of its figures.
 
-
-def start_page(result: Calibration, folder: Path) -> Page:
-    """Start a page with the sections of every calibration; write their figures to the folder."""
+    `further_sections` stand after the parameters and the residuals.
+    """
     hashes = result.provenance["input_hashes"].items()
     inputs = ", ".join(f"{name} {value[:12]}" for name, value in hashes)
-    page = Page(
-        title=f"Calibration of {result.asset}",
-        subtitle=f"Parameters of {result.model} from {result.source}",
-        footer=(f"Seed {result.seed}. Inputs: {inputs}{'.' if inputs else ''}",),
-    )
-    page.add_section("Result")
-    highlights = []
+    values = []
     for prior in result.priors[:6]:
         value = prior.quantity.printed(
             result.mean(prior.name), result.standard_deviation(prior.name)
         )
-        highlights.append((value, prior.quantity.title))
-    page.add_highlights(highlights)
-    for sentence in result.findings:
-        page.add_notice(sentence)
-    if not result.findings:
-        page.add_paragraph(
-            "The residuals agree with noise and priors, and the data determine every parameter."
-        )
+        values.append((value, prior.quantity.title))
     parameter_columns, titles = unmeasured_parameters(result)
     posterior_set = ("posterior", result.samples[:, parameter_columns])
     prior_set = ("prior", result.prior_samples[:, parameter_columns])
@@ -132,28 +128,45 @@ def start_page(result: Calibration, folder: Path) -> Page:
             f"{NOTICEABLE_CORRELATION:g} are blue."
         ),
     )
-    add_figure(page, posterior, folder)
     prior_and_posterior = ReportFigure(
         "prior_and_posterior",
-        corner_figure(titles, [posterior_set, prior_set]),
+        marginal_figure(titles, [posterior_set, prior_set]),
         title="Prior and posterior",
         caption=(
-            "The same figure with samples of the prior. The histograms have scales of their own."
+            "Samples of each parameter before and after the calibration. Each histogram has a "
+            "scale of its own."
         ),
     )
-    add_figure(page, prior_and_posterior, folder)
-    add_titled_table(page, parameters_table(result))
-    for line in correlation_lines(result):
-        page.add_paragraph(f"{line}.")
-    _add_residuals(page, result, folder)
-    return page
+    parameters = Section(
+        "Parameters",
+        [
+            parameters_table(result),
+            *(f"{line}." for line in correlation_lines(result)),
+            save_figure(posterior, folder / FIGURES),
+        ],
+    )
+    page = Page(
+        title=f"Calibration of {result.asset}",
+        subtitle=f"Parameters of {result.model} from {result.source}",
+        sentence=outcome_sentences(result),
+        picture=save_figure(prior_and_posterior, folder / FIGURES),
+        outcome=[Highlights(values), *(Notice(finding) for finding in result.findings)],
+        sections=[
+            parameters,
+            _residual_section(result, folder),
+            *further_sections,
+            Section("Where the calibration comes from", [Fold("Origin", [origin_table(result)])]),
+        ],
+        footer=(f"Seed {result.seed}. Inputs: {inputs}{'.' if inputs else ''}",),
+    )
+    atomic_write_text(folder / REPORT_NAME, render_page(page))
 
 
-def _add_residuals(page: Page, result: Calibration, folder: Path) -> None:
-    """Add the section on residuals, with the fitted gains and zeros, to a page."""
-    page.add_section("Residuals of the readings")
+def _residual_section(result: Calibration, folder: Path) -> Section:
+    """Return the section on residuals, with the fitted gains and zeros; write its figure."""
+    readings = None
     if result.readings:
-        readings = ReportFigure(
+        figure = ReportFigure(
             "readings",
             readings_figure(result),
             title="Readings",
@@ -162,16 +175,8 @@ def _add_residuals(page: Page, result: Calibration, folder: Path) -> None:
                 "intervals. Each panel has a vertical scale of its own."
             ),
         )
-        add_figure(page, readings, folder)
-    add_titled_table(page, readings_table(result))
-    add_titled_table(page, channels_table(result))
-    if result.sensors:
-        add_titled_table(page, sensors_table(result))
-
-
-def finish_page(page: Page, result: Calibration, folder: Path) -> None:
-    """Add the last section, the origin of the calibration, to its page, and write the page."""
-    page.begin_fold("Where the calibration comes from")
-    add_titled_table(page, origin_table(result))
-    page.end_fold()
-    atomic_write_text(folder / REPORT_NAME, page.render())
+        readings = save_figure(figure, folder / FIGURES)
+    return Section(
+        "Residuals of the readings",
+        [readings, readings_table(result), channels_table(result), sensors_table(result)],
+    )

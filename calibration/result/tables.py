@@ -9,10 +9,11 @@ from calibration.result.sensors import (
     gains_and_farthest_zeros,
     printed_rows,
 )
-from reporting.page import PageColumn, Table
-from reporting.record_table import (
+from reporting.provenance import provenance_items
+from reporting.table import (
     RecordColumn,
-    TitledTable,
+    Table,
+    item_table,
     number_cells,
     table_of_records,
     text_cells,
@@ -28,7 +29,7 @@ PROCEDURES = {
 }
 
 
-def parameters_table(result: Calibration) -> TitledTable:
+def parameters_table(result: Calibration) -> Table:
     """Return the table of the parameters before and after the calibration."""
 
     def posterior(prior: ParameterPrior) -> str:
@@ -58,7 +59,7 @@ def parameters_table(result: Calibration) -> TitledTable:
     )
     if result.information is not None:
         caption += f" Information gained: {result.information:.2f} nat."
-    return TitledTable(table_of_records(columns, result.priors), "Parameters", caption)
+    return table_of_records(columns, result.priors, "Parameters", caption)
 
 
 def _prior_text(result: Calibration, name: str) -> str:
@@ -67,7 +68,7 @@ def _prior_text(result: Calibration, name: str) -> str:
     return plus_minus(mean, deviation)
 
 
-def readings_table(result: Calibration) -> TitledTable:
+def readings_table(result: Calibration) -> Table:
     """Return the table of measured quantities, with the model's before and after calibration."""
     units = {quantity.name: quantity.printed_unit for quantity in reversed(result.all_quantities)}
     columns: list[RecordColumn[QuantityReading]] = [
@@ -87,8 +88,9 @@ def readings_table(result: Calibration) -> TitledTable:
             lambda reading: f"{result.score(reading):+.1f}",
         ),
     ]
-    return TitledTable(
-        table_of_records(columns, result.readings),
+    return table_of_records(
+        columns,
+        result.readings,
         title="Measured and modelled",
         caption=(
             "Mean ± standard deviation: measured, and of the model before and after the "
@@ -98,7 +100,7 @@ def readings_table(result: Calibration) -> TitledTable:
     )
 
 
-def channels_table(result: Calibration) -> TitledTable:
+def channels_table(result: Calibration) -> Table:
     """Return the table of the residuals of each channel before and after the calibration."""
     columns: list[RecordColumn[ChannelFit]] = [
         text_cells("channel", lambda channel: channel.name),
@@ -107,8 +109,9 @@ def channels_table(result: Calibration) -> TitledTable:
         number_cells("rms before", lambda channel: _rms_text(channel.before)),
         number_cells("rms after", lambda channel: _rms_text(channel.after)),
     ]
-    return TitledTable(
-        table_of_records(columns, result.channels),
+    return table_of_records(
+        columns,
+        result.channels,
         title="Residuals",
         caption=(
             "Rms residual in standard deviations of the noise, with the parameters at their prior "
@@ -118,20 +121,21 @@ def channels_table(result: Calibration) -> TitledTable:
     )
 
 
-def sensors_table(result: Calibration) -> TitledTable:
+def sensors_table(result: Calibration) -> Table:
     """Return the table of fitted gains and zeros beside the stated values, for the page."""
     return _sensors_table(gains_and_farthest_zeros(result.sensors))
 
 
-def printed_sensors_table(result: Calibration) -> TitledTable:
+def printed_sensors_table(result: Calibration) -> Table:
     """Return the table of fitted gains and zeros, at most `MOST_PRINTED_SENSORS` of them."""
     return _sensors_table(printed_rows(result.sensors))
 
 
-def _sensors_table(rows: list[SensorFit]) -> TitledTable:
+def _sensors_table(rows: list[SensorFit]) -> Table:
     """Return the table of the given gains and zeros."""
-    return TitledTable(
-        table_of_records(SENSOR_COLUMNS, rows),
+    return table_of_records(
+        SENSOR_COLUMNS,
+        rows,
         title="Gains and zeros of the channels",
         caption=(
             "Fitted together with the parameters, with their standard deviations; of the zeros of "
@@ -146,20 +150,14 @@ def _rms_text(rms: float) -> str:
     return f"{rms:.2f}" if isfinite(rms) else "noise unknown"
 
 
-def origin_table(result: Calibration) -> TitledTable:
+def origin_table(result: Calibration) -> Table:
     """Return a table with the origin of a calibration: asset, model, data, seed, software."""
-    versions = result.provenance["versions"].items()
-    items = {
-        "asset": result.asset,
-        "model": f"{result.model}, SHA-256 {result.model_hash[:16]}",
-        "measured": result.source,
-        "seed": str(result.seed),
-        "priors": ", ".join(f"{prior.name}: {prior.stated_by}" for prior in result.priors),
-        "software": ", ".join(f"{name} {version}" for name, version in versions),
-    }
-    rows = [[item, value] for item, value in items.items() if value]
-    return TitledTable(
-        Table([PageColumn("item"), PageColumn("value")], rows),
-        title="Where it comes from",
-        caption="calibration.nc has everything.",
-    )
+    items = [
+        ("asset", result.asset),
+        ("model", f"{result.model}, SHA-256 {result.model_hash[:16]}"),
+        ("measured", result.source),
+        ("seed", str(result.seed)),
+        ("priors", ", ".join(f"{prior.name}: {prior.stated_by}" for prior in result.priors)),
+        *provenance_items(result.provenance),
+    ]
+    return item_table(items, "Where it comes from", "calibration.nc has everything.")

@@ -1,12 +1,13 @@
 """A calibration in words, for console and page."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from calibration.result import tables
 from calibration.result.record import Calibration
-from reporting.page import Table
+from reporting.table import Table
+from reporting.words import counted
 
 NOTICEABLE_CORRELATION = 0.3
 """Correlation from which it is reported, and printed in colour."""
@@ -38,17 +39,33 @@ def headline(result: Calibration) -> str:
     )
 
 
-def printed_calibration(result: Calibration) -> Iterator[str | Table]:
-    """Yield the printed lines and tables of a calibration."""
+def outcome_sentences(result: Calibration) -> str:
+    """Return how far the data narrow the parameters, and whether data, priors and model agree."""
+    ratios = sorted(100 * result.posterior_over_prior(prior.name) for prior in result.priors)
+    narrowed = f"{ratios[0]:.0f} to {ratios[-1]:.0f} %" if len(ratios) > 1 else f"{ratios[0]:.0f} %"
+    parameters = counted(len(ratios), "parameter")
+    agreement = "The residuals agree with noise and priors."
+    if result.findings:
+        disagree = "says" if len(result.findings) == 1 else "say"
+        agreement = (
+            f"{counted(len(result.findings), 'finding')} below {disagree} where data and model "
+            "disagree."
+        )
+    return (
+        f"The data narrow {parameters} to {narrowed} of the prior standard deviation. {agreement}"
+    )
+
+
+def printed_calibration(
+    result: Calibration, further_tables: Iterable[Table] = ()
+) -> Iterator[str | Table]:
+    """Yield the printed lines and tables of a calibration: first the outcome, then the tables."""
     yield headline(result)
-    yield tables.parameters_table(result).table
-    yield from correlation_lines(result)
-    for titled in (
-        tables.readings_table(result),
-        tables.channels_table(result),
-        tables.printed_sensors_table(result),
-    ):
-        if titled.table.rows:
-            yield titled.table
     for finding in result.findings:
         yield f"- {finding}"
+    yield from further_tables
+    yield tables.parameters_table(result)
+    yield from correlation_lines(result)
+    yield tables.readings_table(result)
+    yield tables.channels_table(result)
+    yield tables.printed_sensors_table(result)

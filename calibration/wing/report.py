@@ -16,12 +16,11 @@ from calibration.paper.load_test import StaticCalibration, push_forward
 from calibration.result.figures import corner_figure, unmeasured_parameters
 from calibration.result.file import FILE_NAME
 from calibration.result.folder import (
+    FIGURES,
     MODE_FIELDS,
     WING_FIELDS,
-    add_figure,
     calibration_folder,
-    finish_page,
-    start_page,
+    write_page,
 )
 from calibration.wing.calibrate import WingCalibration
 from calibration.wing.lab_data import StepOrigin
@@ -29,9 +28,10 @@ from fe.reduction.model_cache import WingFields, wing_fields, write_modes_vtu, w
 from fe.runtime.reduced_results import ReducedModes
 from reporting import figures as style
 from reporting.arrays import Float
-from reporting.page import Page, Words
+from reporting.figures import save_figure
+from reporting.page import Block, Notice, Section
+from reporting.page_words import Words
 from reporting.progress import stage
-from reporting.record_table import add_titled_table
 from reporting.words import plus_minus
 
 WORDS = Words("calibration.wing")
@@ -68,56 +68,48 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
             write_wing_vtu(new_folder / WING_FIELDS, fields, model_vector)
             write_modes_vtu(new_folder / MODE_FIELDS, fields, model_vector)
             with stage("Drawing the report"):
-                page = start_page(result, new_folder)
-                _add_sections(page, calibration, fields, new_folder)
-                finish_page(page, result, new_folder)
+                sections = _wing_sections(calibration, fields, new_folder / FIGURES)
+                write_page(result, new_folder, sections)
     return folder / FILE_NAME
 
 
-def _add_sections(
-    page: Page, calibration: WingCalibration, fields: WingFields, folder: Path
-) -> None:
-    """Add the sections about a wing to the page of its calibration; write their figures."""
-    _add_origins(page, calibration.lab.origins)
-    page.add_section("Beside the paper")
-    _add_comparison_with_paper(page, calibration, folder)
-    page.add_section("Ring-down")
+def _wing_sections(calibration: WingCalibration, fields: WingFields, folder: Path) -> list[Section]:
+    """Return the sections on a wing for the page of its calibration; write their figures."""
     trials = calibration.lab.trials
-    if trials is None:
-        page.add_paragraph(WORDS.say("no_record"))
-    else:
-        add_figure(page, WORDS.figure("ring_down", ring_down_figure(trials)), folder)
-    page.add_section("The calibrated wing")
+    ring_down: Block = WORDS.say("no_record")
+    if trials is not None:
+        ring_down = save_figure(WORDS.figure("ring_down", ring_down_figure(trials)), folder)
     state = calibration.result.mean_state()
     modes = calibration.model.modes(state.values, state.stiffness_loss)
-    figure = modes_figure(fields, modes, _mode_titles(modes))
-    add_figure(page, WORDS.figure("modes", figure), folder)
+    mode_figure = WORDS.figure("modes", modes_figure(fields, modes, _mode_titles(modes)))
+    return [
+        Section("What was measured", _origins(calibration.lab.origins)),
+        Section("Beside the paper", _comparison_with_paper(calibration, folder)),
+        Section("Ring-down", [ring_down]),
+        Section("The calibrated wing", [save_figure(mode_figure, folder)]),
+    ]
 
 
-def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
-    """Add the origin of the measurements of each step to a page.
+def _origins(origins: Sequence[StepOrigin]) -> list[Block]:
+    """Return where the measurements of each step come from.
 
     If some steps use measurements of this wing and others published values, the latter are notices.
     """
     has_measurements = any(origin.read for origin in origins)
+    blocks: list[Block] = []
     for origin in origins:
         text = WORDS.say("origin", origin=origin)
-        if has_measurements and not origin.read:
-            page.add_notice(text)
-        else:
-            page.add_paragraph(text)
+        blocks.append(Notice(text) if has_measurements and not origin.read else text)
+    return blocks
 
 
-def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder: Path) -> None:
-    """Add Table 1, the load test, and the posteriors next to those of the paper to a page."""
-    add_titled_table(page, printed_table_1(calibration.table_1))
-    load_test_figure = calibration_figure(calibration.static)
-    add_figure(page, WORDS.figure("load_test", load_test_figure), folder)
+def _comparison_with_paper(calibration: WingCalibration, folder: Path) -> list[Block]:
+    """Return Table 1, the load test, and the posteriors beside those of the paper."""
+    load_test = WORDS.figure("load_test", calibration_figure(calibration.static))
     rows = [
         *_posterior_rows("tailored model", calibration.static),
         *_posterior_rows("line of the paper, eq. (14)", calibration.static_published),
     ]
-    WORDS.add_table(page, "two_models", rows)
     columns, names = unmeasured_parameters(calibration.joint)
     sets = [
         ("joint posterior", calibration.joint.samples[:, columns]),
@@ -128,8 +120,13 @@ def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder:
     if authors is not None:
         sets.append(("authors' model", authors.samples))
         remark = "; grey are the authors’ published samples"
-    figure = WORDS.figure("procedure", corner_figure(names, sets), authors=remark)
-    add_figure(page, figure, folder)
+    procedure = WORDS.figure("procedure", corner_figure(names, sets), authors=remark)
+    return [
+        printed_table_1(calibration.table_1),
+        save_figure(load_test, folder),
+        WORDS.table("two_models", rows),
+        save_figure(procedure, folder),
+    ]
 
 
 def _posterior_rows(model: str, static: StaticCalibration) -> list[tuple[str, str, str, str]]:

@@ -195,7 +195,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     sample_count = sum(len(course.time) for course in missing.courses)
     drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
     figure, rows = residual_figures.new_panels(
-        len(row_titles), 3, 2.4 * len(row_titles) + 0.5, sharey=True
+        len(row_titles), 3, 1.6 * len(row_titles) + 0.5, sharey=True
     )
     letters = iter("abcdef")
     for row, (series, title) in zip(rows, row_titles.items(), strict=True):

@@ -1,8 +1,7 @@
 """The page of an investigation: verdict, location of the gap, reasons, proof, and origin."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from math import isfinite, isnan
+from math import isfinite
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.closed_share import percent_with_interval
@@ -38,8 +37,7 @@ from discrepancy.report.verdict_sentences import (
 )
 from discrepancy.verdict import Gate, NamedEffect, ParameterEstimate, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Page, ReportFigure
-from reporting.record_table import add_titled_table
+from reporting.page import Block, Fold, Highlights, Notice, Page, PageFigure, Section
 from reporting.words import capital, counted, listing, with_short_hashes
 
 LONGEST_CARD = 60
@@ -69,108 +67,68 @@ TEXT_WITHOUT_EFFECT = {
 """The text of the first card for verdicts that name no effect."""
 
 
-@dataclass(frozen=True)
-class _PictureBook:
-    """The page with the figures that it may show.
-
-    Attributes
-    ----------
-    page : Page
-        The page.
-    drawings : mapping of str to bytes
-        SVG of each figure, by name.
-    figures : mapping of str to ReportFigure
-        The figures with their titles and captions.
-    """
-
-    page: Page
-    drawings: Mapping[str, bytes]
-    figures: Mapping[str, ReportFigure]
-
-    def add(self, *names: str) -> None:
-        """Add those of the named figures that could be drawn."""
-        for name in names:
-            if name in self.figures:
-                figure = self.figures[name]
-                self.page.add_figure(self.drawings[name], figure.caption, title=figure.title)
-
-    def add_paragraph(self, text: str) -> None:
-        """Add a paragraph, unless it is empty."""
-        if text.strip():
-            self.page.add_paragraph(text.strip())
-
-
-def render_report(
-    content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]
-) -> str:
-    """Return the report as an HTML page.
+def verdict_page(content: ReportInput, figures: Mapping[str, PageFigure]) -> Page:
+    """Return the page of an investigation.
 
     Parameters
     ----------
     content : ReportInput
-        Content of the report.
-    drawings : dict of str to bytes
-        SVG of each figure, by name.
-    figures : dict of str to ReportFigure
-        The figures with their captions, as `report_figures` returned them.
+        The investigation and its origin.
+    figures : mapping of str to PageFigure
+        The figures by name; those that these data do not allow are missing.
     """
     origin = content.origin
     investigation = content.investigation
     verdict = investigation.verdict
-    page = Page(
+    sections = []
+    if verdict.kind is not VerdictKind.DATA_ERROR:  # faulty data are not fitted
+        looks = [figures.get(name) for name in ("history", "backbone", "spectrum", "load")]
+        sections = [
+            _next_experiment_section(verdict),
+            _location_section(investigation, figures),
+            Section("What it looks like", looks),
+            _reasons_section(investigation),
+            _proof_section(investigation, figures),
+            _decidability_section(content, figures),
+        ]
+    provenance = Fold("Campaign, model, command and versions", [tables.origin_table(origin)])
+    return Page(
         origin.campaign,
         f"What the model “{origin.model}” lacks compared with these data: located, named, added, "
         "proved",
+        sentence=verdict_card(verdict),
+        picture=figures.get("missing_force"),
+        outcome=_outcome(content),
+        sections=[
+            Section("Effects", [verdict_tables.effects_table(content)]),
+            *sections,
+            _data_section(investigation),
+            Section("Where it comes from", [provenance]),
+        ],
         footer=(
             f"Repeat it: {origin.short_command}",
             f"Data {origin.data_hash[:16]}, model {origin.model_hash[:16]}, seed "
             f"{origin.provenance.seed}.",
         ),
     )
-    book = _PictureBook(page, drawings, figures)
-    _add_verdict(book, content)
-    if verdict.kind is not VerdictKind.DATA_ERROR:  # faulty data are not fitted
-        if verdict.next_experiments:
-            _add_next_experiment(book, verdict)
-        _add_location(book, investigation)
-        page.add_section("What it looks like")
-        book.add("history", "backbone", "spectrum", "load")
-        _add_reasons(book, investigation)
-        if investigation.proof is not None:
-            _add_proof(book, investigation)
-        if content.separability is not None or content.self_calibration is not None:
-            _add_decidability(book, content)
-    _add_data(book, investigation)
-    page.add_section("Where it comes from")
-    page.begin_fold("Campaign, model, command and versions")
-    add_titled_table(page, tables.origin_table(origin))
-    page.end_fold()
-    return page.render()
 
 
-def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
-    """Add the first section: the verdict in one line, as a picture, in sentences and as a table.
-
-    The sentences are unfolded on demand.
-    """
+def _outcome(content: ReportInput) -> list[Block]:
+    """Return the verdict in figures, and folded below them in sentences."""
     investigation = content.investigation
     verdict = investigation.verdict
-    page = book.page
-    page.add_section("Verdict")
-    page.add_card(verdict_card(verdict))
-    book.add("missing_force")
-    page.begin_fold("How this was concluded")
-    page.add_highlights(_cards(investigation))
-    page.add_notice(headline(verdict))
-    book.add_paragraph(f"{sizes_sentence(content)} {error_sentence(investigation)}")
-    book.add_paragraph(_meaning(verdict))
-    book.add_paragraph(remainders_sentence(verdict))
     catalogue: dict[str, Effect] = {}
     if investigation.search is not None:
         catalogue = {effect.identifier: effect for effect in investigation.search.effects}
+    sentences: list[Block] = [
+        Notice(headline(verdict)),
+        f"{sizes_sentence(content)} {error_sentence(investigation)}",
+        _meaning(verdict),
+        remainders_sentence(verdict),
+    ]
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
-        book.add_paragraph(
+        sentences.append(
             f"The nearest in the catalogue is {listing(names)}; this is a resemblance and not a "
             "name."
         )
@@ -179,9 +137,8 @@ def _add_verdict(book: _PictureBook, content: ReportInput) -> None:
         effects.setdefault(effect.identifier, effect)
     for effect in effects.values():
         if effect.identifier in catalogue:
-            book.add_paragraph(_effect_paragraph(effect, catalogue[effect.identifier]))
-    page.end_fold()
-    add_titled_table(page, verdict_tables.effects_table(content))
+            sentences.append(_effect_paragraph(effect, catalogue[effect.identifier]))
+    return [Highlights(_highlights(investigation)), Fold("How this was concluded", sentences)]
 
 
 def verdict_card(verdict: Verdict) -> str:
@@ -224,14 +181,12 @@ def verdict_card(verdict: Verdict) -> str:
     return f"{'; '.join(clauses)}."
 
 
-def _cards(investigation: Investigation) -> list[tuple[str, str]]:
-    """Return the cards at the top of the page: values with their meaning."""
+def _highlights(investigation: Investigation) -> list[tuple[str, str]]:
+    """Return the values that support the card of the page, each with its meaning."""
     verdict = investigation.verdict
     proof = investigation.proof
     force = verdict.force
-    cards = [(capital(missing_effects_text(verdict)), OPENING[verdict.kind])]
-    if force is not None:
-        cards.append((f"{number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
+    values = []
     if proof is not None and proof.closed is not None:
         taken_or_added = "taken away" if proof.closed.value >= 0.0 else "added"
         is_named = verdict.kind in (*NAMING, VerdictKind.FAMILY)
@@ -240,26 +195,21 @@ def _cards(investigation: Investigation) -> list[tuple[str, str]]:
             f"of the mean square error in {proof.closed.trials} trials is {taken_or_added} by "
             f"{added_label(investigation)}{reservation}"
         )
-        cards.append((percent_with_interval(proof.closed), meaning))
+        values.append((percent_with_interval(proof.closed), meaning))
     if force is not None and force.ordered_by and not tested_trials(force):
         meaning = f"what it follows: {force.followed_percent} % of its variance"
-        cards.append((listing(force.ordered_by), meaning))
+        values.append((listing(force.ordered_by), meaning))
     if proof is not None and force is None:
         before, _, trials = proof_scores(proof)
         if isfinite(before.chi_square_per_sample):
             meaning = f"times the noise, rms on {trials} trials, before and after"
-            cards.append((" → ".join(noise_levels(proof)), meaning))
-    if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        meaning = "probability of the verdict"
-        if verdict.kind is VerdictKind.BELOW_LIMIT:
-            meaning = ROLE_OF_PROBABILITY[verdict.kind]
-        cards.append((probability_text(verdict.probability), meaning))
+            values.append((" → ".join(noise_levels(proof)), meaning))
     gates = deciding_gates(verdict)
     if gates and proof is None and force is None:
         gate = gates[0]
         meaning = f"p of the {gate.name}; a fit has at least {number(gate.limit)}"
-        cards.append((number(gate.statistic), meaning))
-    return cards
+        values.append((number(gate.statistic), meaning))
+    return values
 
 
 def missing_effects_text(verdict: Verdict) -> str:
@@ -325,30 +275,34 @@ def _effect_paragraph(effect: NamedEffect, entry: Effect) -> str:
     )
 
 
-def _add_next_experiment(book: _PictureBook, verdict: Verdict) -> None:
-    """Add the section on the tests that would decide most."""
-    book.page.add_section("Next experiment")
-    book.add_paragraph(
-        "What would decide most between the hypotheses that are still open, for its cost. "
-        "Information is the mutual information of hypothesis and data, by simulation; ln 2 = 0.69 "
-        "nat decides between two equals."
+def _next_experiment_section(verdict: Verdict) -> Section:
+    """Return the section on the tests that would decide most; it is empty without any."""
+    if not verdict.next_experiments:
+        return Section("Next experiment", [])
+    return Section(
+        "Next experiment",
+        [
+            "What would decide most between the hypotheses that are still open, for its cost. "
+            "Information is the mutual information of hypothesis and data, by simulation; ln 2 = "
+            "0.69 nat decides between two equals.",
+            gap_times_sentence(verdict.windows),
+            verdict_tables.next_experiments_table(verdict),
+        ],
     )
-    book.add_paragraph(gap_times_sentence(verdict.windows))
-    add_titled_table(book.page, verdict_tables.next_experiments_table(verdict))
 
 
-def _add_location(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on where, when and in which channel model and data disagree."""
+def _location_section(investigation: Investigation, figures: Mapping[str, PageFigure]) -> Section:
+    """Return the section on where, when and in which channel model and data disagree."""
     location = investigation.location
     has_no_gap = investigation.verdict.kind in KINDS_WITHOUT_GAP
-    book.page.add_section("What the model leaves" if has_no_gap else "Where the gap is")
-    book.add_paragraph(_location_sentence(location, has_no_gap=has_no_gap))
-    book.add("residual_map", "residual_table", "time_line")
+    blocks: list[Block] = [_location_sentence(location, has_no_gap=has_no_gap)]
+    blocks += [figures.get(name) for name in ("residual_map", "residual_table", "time_line")]
     if location is not None:
         shown = [found for found in location.disagreements if found.share >= LEAST_SHOWN_SHARE]
         for disagreement in shown[:MOST_SHOWN_DISAGREEMENTS]:
-            book.add_paragraph(f"• {disagreement.sentence}")
-        add_titled_table(book.page, tables.global_tests_table(location))
+            blocks.append(f"• {disagreement.sentence}")
+        blocks.append(tables.global_tests_table(location))
+    return Section("What the model leaves" if has_no_gap else "Where the gap is", blocks)
 
 
 def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
@@ -374,45 +328,48 @@ def _location_sentence(location: Location | None, *, has_no_gap: bool) -> str:
     )
 
 
-def _add_reasons(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on gates, compared hypotheses, parameters, and fitted gains and zeros."""
+def _reasons_section(investigation: Investigation) -> Section:
+    """Return the section on gates, compared hypotheses, parameters, and fitted gains and zeros."""
     verdict = investigation.verdict
-    book.page.add_section("Why this verdict")
-    add_titled_table(book.page, verdict_tables.gates_table(verdict))
-    add_titled_table(book.page, verdict_tables.evidence_table(verdict))
-    add_titled_table(book.page, verdict_tables.not_compared_table(verdict))
-    add_titled_table(book.page, tables.parameters_table(investigation))
-    add_titled_table(book.page, sensor_table(verdict.sensors, investigation.campaign.channels))
+    return Section(
+        "Why this verdict",
+        [
+            verdict_tables.gates_table(verdict),
+            verdict_tables.evidence_table(verdict),
+            verdict_tables.not_compared_table(verdict),
+            tables.parameters_table(investigation),
+            sensor_table(verdict.sensors, investigation.campaign.channels),
+        ],
+    )
 
 
-def _add_proof(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on the scores of held-out trials, without and with the effects."""
+def _proof_section(investigation: Investigation, figures: Mapping[str, PageFigure]) -> Section:
+    """Return the section on the scores of held-out trials, without and with the effects."""
+    title = "Proof on held-out trials"
     proof = investigation.proof
-    assert proof is not None
-    book.page.add_section("Proof on held-out trials")
+    if proof is None:
+        return Section(title, [])
+    reservation = None
     if investigation.verdict.kind not in NAMING:
-        book.page.add_notice(
+        reservation = Notice(
             f'The model "with the effect" has {added_label(investigation)} here, which is not '
             "named: the figures say how well it does, not that it is there."
         )
-    book.add_paragraph(proof.remaining)
-    book.add("pit")
-    add_titled_table(book.page, tables.proof_table(investigation, proof))
+    table = tables.proof_table(investigation, proof)
+    return Section(title, [reservation, proof.remaining, figures.get("pit"), table])
 
 
-def _add_decidability(book: _PictureBook, content: ReportInput) -> None:
-    """Add the section on which effects the campaign can detect and tell apart."""
-    page = book.page
-    page.add_section("What this campaign can decide")
+def _decidability_section(content: ReportInput, figures: Mapping[str, PageFigure]) -> Section:
+    """Return the section on which effects the campaign can detect and tell apart."""
+    blocks: list[Block] = []
     if content.separability is not None:
-        for line in group_lines(content.separability):
-            book.add_paragraph(line)
-    book.add("separability")
-    if content.separability is not None:
-        add_titled_table(page, tables.detectable_sizes_table(content.separability))
-    book.add("self_calibration")
+        blocks += group_lines(content.separability)
+        blocks.append(figures.get("separability"))
+        blocks.append(tables.detectable_sizes_table(content.separability))
     if content.self_calibration is not None:
-        add_titled_table(page, tables.self_calibration_table(content.self_calibration))
+        blocks.append(figures.get("self_calibration"))
+        blocks.append(tables.self_calibration_table(content.self_calibration))
+    return Section("What this campaign can decide", blocks)
 
 
 def remarks_beside_faults(investigation: Investigation) -> list[str]:
@@ -421,14 +378,11 @@ def remarks_beside_faults(investigation: Investigation) -> list[str]:
     return [remark for remark in investigation.verdict.remarks if remark not in fault_sentences]
 
 
-def _add_data(book: _PictureBook, investigation: Investigation) -> None:
-    """Add the section on the faults of the data, the remarks, and the trials."""
-    book.page.add_section("Data")
-    for fault in investigation.faults:
-        book.page.add_notice(fault.sentence)
+def _data_section(investigation: Investigation) -> Section:
+    """Return the section on the faults of the data, the remarks, and the trials."""
     remarks = remarks_beside_faults(investigation)
-    for remark in remarks:
-        book.add_paragraph(f"• {with_short_hashes(remark)}")
-    if not investigation.faults and not remarks:
-        book.add_paragraph("No fault was found.")
-    add_titled_table(book.page, tables.trials_table(investigation.campaign))
+    blocks: list[Block] = [Notice(fault.sentence) for fault in investigation.faults]
+    blocks += [f"• {with_short_hashes(remark)}" for remark in remarks]
+    if not blocks:
+        blocks.append("No fault was found.")
+    return Section("Data", [*blocks, tables.trials_table(investigation.campaign)])

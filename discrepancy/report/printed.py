@@ -27,7 +27,7 @@ from discrepancy.self_calibration import SelfCalibration
 from discrepancy.system.interface import Model
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Table
+from reporting.table import Table
 from reporting.words import counted, listing
 
 MOST_PRINTED_EXPERIMENTS = 3
@@ -45,12 +45,8 @@ def verdict_lines(content: ReportInput) -> Iterator[str | Table]:
     investigation = content.investigation
     verdict = investigation.verdict
     yield from _sentences_on_gap(content)
-    table = verdict_tables.printed_effects_table(verdict)
-    if table.rows:
-        yield table
-    sensors = printed_sensor_table(verdict.sensors, investigation.campaign.channels)
-    if sensors.rows:
-        yield sensors
+    yield verdict_tables.printed_effects_table(verdict)
+    yield printed_sensor_table(verdict.sensors, investigation.campaign.channels)
     yield from filter(None, _sentences_on_proof(investigation))
     for experiment in verdict.next_experiments[:MOST_PRINTED_EXPERIMENTS]:
         yield f"Next: {experiment.description} ({experiment.information:.2f} nat)"

@@ -6,13 +6,10 @@ from calibration.result.sensors import SENSOR_COLUMNS, gains_and_farthest_zeros,
 from discrepancy.campaign.records import Channel
 from discrepancy.judgement.sensor_estimates import sensor_fits
 from discrepancy.verdict import SensorEstimate
-from reporting.page import Table
-from reporting.record_table import TitledTable, table_of_records
+from reporting.table import Table, table_of_records
 
 
-def sensor_table(
-    estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
-) -> TitledTable:
+def sensor_table(estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]) -> Table:
     """Return the table of fitted gains and zeros, for the report.
 
     Parameters
@@ -23,8 +20,9 @@ def sensor_table(
         The channels of the campaign by name.
     """
     rows = gains_and_farthest_zeros(sensor_fits(estimates, channels))
-    return TitledTable(
-        table_of_records(SENSOR_COLUMNS, rows),
+    return table_of_records(
+        SENSOR_COLUMNS,
+        rows,
         title="Gains and zeros of the channels",
         caption=(
             "Fitted beside the named effects, or without an effect if none is named, with their "

@@ -22,11 +22,14 @@ from discrepancy.report.text import (
 )
 from discrepancy.self_calibration import Proportion, SelfCalibration, ordered_outcomes
 from discrepancy.workflow import Investigation
-from reporting.page import PageColumn, Table, number_column
-from reporting.record_table import (
+from reporting.provenance import provenance_items
+from reporting.table import (
+    PageColumn,
     RecordColumn,
-    TitledTable,
+    Table,
+    item_table,
     number_cells,
+    number_column,
     table_of_records,
     text_cells,
 )
@@ -41,7 +44,7 @@ NINETY = 1.6449
 """Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
 
 
-def global_tests_table(location: Location) -> TitledTable:
+def global_tests_table(location: Location) -> Table:
     """Return the table of the tests for any disagreement of model and data."""
     columns: list[RecordColumn[OmnibusTest]] = [
         text_cells("test", lambda test: test.name),
@@ -52,8 +55,9 @@ def global_tests_table(location: Location) -> TitledTable:
             lambda test: UNKNOWN if isnan(test.p_value) else cell_text(test.rejected),
         ),
     ]
-    return TitledTable(
-        table_of_records(columns, location.tests),
+    return table_of_records(
+        columns,
+        location.tests,
         title="Global tests",
         caption=(
             "Residuals of the unchanged model on fitted trials, each against what noise would "
@@ -101,7 +105,7 @@ def _with_half_width(value: float, deviation: float) -> str:
     return plus_minus(value, NINETY * deviation) if deviation > 0.0 else f"{value:.6g}, exact"
 
 
-def parameters_table(investigation: Investigation) -> TitledTable:
+def parameters_table(investigation: Investigation) -> Table:
     """Return the table of the model's parameters as calibrated, without and with the effect."""
     columns = [
         PageColumn("parameter"),
@@ -115,8 +119,9 @@ def parameters_table(investigation: Investigation) -> TitledTable:
         columns = columns[: len(rows[0])]  # without an effect there is no last column
     label = added_label(investigation)
     fits = f"without and with {label}" if label else "without any effect"
-    return TitledTable(
-        Table(columns, rows),
+    return Table(
+        columns,
+        rows,
         title="Calibrated parameters before and after",
         caption=(
             "Values with the half-width of their 90 % intervals: as the calibration states them, "
@@ -143,7 +148,7 @@ def _score_cells(scores: Scores) -> dict[str, str]:
     }
 
 
-def proof_table(investigation: Investigation, proof: Proof) -> TitledTable:
+def proof_table(investigation: Investigation, proof: Proof) -> Table:
     """Return the table of the scores of fitted and held-out trials, without and with the effects.
 
     The last rows are the rms of the residuals of each channel, in the unit in which it is drawn.
@@ -158,8 +163,9 @@ def proof_table(investigation: Investigation, proof: Proof) -> TitledTable:
     columns = [PageColumn("score"), *(number_column(title) for title in scored)]
     rows = _score_rows([*scored.values()])
     rows += _rms_rows([*scored.values()], investigation.campaign.channels)
-    return TitledTable(
-        Table(columns, rows),
+    return Table(
+        columns,
+        rows,
         title="Before and after, at the same scale",
         caption=_proof_caption(investigation, proof),
     )
@@ -219,7 +225,7 @@ def _proof_caption(investigation: Investigation, proof: Proof) -> str:
     return " ".join(filter(None, sentences))
 
 
-def detectable_sizes_table(separability: Separability) -> TitledTable:
+def detectable_sizes_table(separability: Separability) -> Table:
     """Return the table of the least size at which each effect can be detected."""
     columns: list[RecordColumn[Detectability]] = [
         text_cells("effect", lambda row: row.effect.identifier.replace("_", " ")),
@@ -235,8 +241,9 @@ def detectable_sizes_table(separability: Separability) -> TitledTable:
             ),
         ),
     ]
-    return TitledTable(
-        table_of_records(columns, testable_effects(separability)),
+    return table_of_records(
+        columns,
+        testable_effects(separability),
         title="Detectable sizes",
         caption=(
             "Computed from the model, the inputs and the noise, without the readings. Detectable "
@@ -274,7 +281,7 @@ def _self_calibration_rows(self_calibration: SelfCalibration) -> list[tuple[str,
     return rows
 
 
-def self_calibration_table(self_calibration: SelfCalibration) -> TitledTable:
+def self_calibration_table(self_calibration: SelfCalibration) -> Table:
     """Return the table of verdicts on campaigns that were simulated with known effects."""
     columns: list[RecordColumn[tuple[str, str, Proportion]]] = [
         text_cells("campaigns", lambda row: row[0]),
@@ -288,8 +295,9 @@ def self_calibration_table(self_calibration: SelfCalibration) -> TitledTable:
     if self_calibration.not_detectable:
         names = ", ".join(self_calibration.not_detectable)
         caption += f" Never detectable in draws of their priors, so not hidden: {names}."
-    return TitledTable(
-        table_of_records(columns, _self_calibration_rows(self_calibration)),
+    return table_of_records(
+        columns,
+        _self_calibration_rows(self_calibration),
         title="Verdicts on simulated campaigns of this geometry",
         caption=f"{caption} self_calibration.json has every case.",
     )
@@ -303,7 +311,7 @@ def _proportion_text(proportion: Proportion) -> str:
     return f"{proportion.count} of {proportion.total}: {percent} % ({low} to {high} %)"
 
 
-def trials_table(campaign: Campaign) -> TitledTable:
+def trials_table(campaign: Campaign) -> Table:
     """Return the table of the trials of a campaign."""
     columns: list[RecordColumn[Trial]] = [
         text_cells("trial", lambda trial: trial.name),
@@ -314,8 +322,9 @@ def trials_table(campaign: Campaign) -> TitledTable:
         text_cells("role", lambda trial: "held out" if trial.held_out else "fitted"),
         number_cells("left out", lambda trial: str(trial.used.size - trial.used.sum())),
     ]
-    return TitledTable(
-        table_of_records(columns, campaign.trials),
+    return table_of_records(
+        columns,
+        campaign.trials,
         title="Trials",
         caption="Left out: single samples that were marked as outliers or empty.",
     )
@@ -329,32 +338,18 @@ def _channels_text(trial: Trial) -> str:
     return f"{', '.join(trial.channels[:MOST_SHOWN_CHANNELS])} and {others} more"
 
 
-def origin_table(origin: Origin) -> TitledTable:
-    """Return the table of the data, model, command and software from which a verdict was computed.
-
-    Rows without a value are left out.
-    """
-    provenance = origin.provenance
-    versions = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
-    # the first 12 digits of the hash of each package's source text
-    sources = ", ".join(
-        f"{name} {digest[:12]}" for name, digest in provenance.source_hashes.items()
-    )
-    plug_ins = ", ".join(f"{name} {version}" for name, version in provenance.plug_ins.items())
-    items = {
-        "campaign": f"{origin.campaign}, SHA-256 {origin.data_hash}",
-        "model": f"{origin.model}, SHA-256 {origin.model_hash}",
-        "command": origin.short_command,
-        "seed": str(provenance.seed),
-        "software": versions,
-        "plug-ins": plug_ins,
-        "sources": sources,
-    }
-    for name, digest in provenance.input_hashes.items():
-        items[f"input {name}"] = f"SHA-256 {digest}"
-    rows = [[item, value] for item, value in items.items() if value]
-    return TitledTable(
-        Table([PageColumn("item"), PageColumn("value")], rows),
-        title="Provenance",
-        caption="verdict.json, patch.json and residuals.nc beside this page contain every number.",
+def origin_table(origin: Origin) -> Table:
+    """Return the table of data, model, command and software from which a verdict was computed."""
+    items = [
+        ("campaign", f"{origin.campaign}, SHA-256 {origin.data_hash}"),
+        ("model", f"{origin.model}, SHA-256 {origin.model_hash}"),
+        ("command", origin.short_command),
+        ("seed", str(origin.provenance.seed)),
+        *provenance_items(origin.provenance.as_dict()),
+    ]
+    return item_table(
+        items,
+        "Provenance",
+        "verdict.json, patch.json and residuals.nc beside this page contain every number, and the "
+        "hashes in full.",
     )

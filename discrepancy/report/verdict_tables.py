@@ -27,10 +27,10 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
-from reporting.page import PageColumn, Table
-from reporting.record_table import (
+from reporting.table import (
+    PageColumn,
     RecordColumn,
-    TitledTable,
+    Table,
     number_cells,
     table_of_records,
     text_cells,
@@ -110,7 +110,7 @@ CAPTION_OF_SIZES = {
 """Whose values the table of parameters holds, by the kind of the verdict."""
 
 
-def effects_table(content: ReportInput) -> TitledTable:
+def effects_table(content: ReportInput) -> Table:
     """Return the table of the effects that are added to the model, or could be added."""
     verdict = content.investigation.verdict
     is_named = verdict.kind in NAMING
@@ -140,8 +140,8 @@ def effects_table(content: ReportInput) -> TitledTable:
         title = "The members of the group"
     else:
         title = "What is added" if is_named else "Effects that could be added"
-    table = table_of_records(columns, effect_rows(verdict))
-    return TitledTable(table, title, " ".join(sentences).rstrip())
+    caption = " ".join(sentences).rstrip()
+    return table_of_records(columns, effect_rows(verdict), title, caption)
 
 
 def printed_effects_table(verdict: Verdict) -> Table:
@@ -162,7 +162,7 @@ def _parameter_name(row: EffectRow) -> str:
     return "" if row.parameter is None else row.parameter.name.replace("_", " ")
 
 
-def next_experiments_table(verdict: Verdict) -> TitledTable:
+def next_experiments_table(verdict: Verdict) -> Table:
     """Return the table of the tests that would decide most for their cost."""
     columns: list[RecordColumn[Experiment]] = [
         text_cells("test", lambda experiment: experiment.description),
@@ -170,14 +170,15 @@ def next_experiments_table(verdict: Verdict) -> TitledTable:
         number_cells("information", lambda experiment: f"{experiment.information:.2f}", "nat"),
         number_cells("cost", lambda experiment: f"{experiment.cost:g}", "trials"),
     ]
-    return TitledTable(
-        table_of_records(columns, verdict.next_experiments),
+    return table_of_records(
+        columns,
+        verdict.next_experiments,
         title="Proposed tests, best first",
         caption="Cost is relative to one more trial of a kind that was done already.",
     )
 
 
-def gates_table(verdict: Verdict) -> TitledTable:
+def gates_table(verdict: Verdict) -> Table:
     """Return the table of the gates that a name has to pass."""
     columns: list[RecordColumn[Gate]] = [
         text_cells("gate", lambda gate: gate.name),
@@ -189,8 +190,9 @@ def gates_table(verdict: Verdict) -> TitledTable:
         text_cells("passes if", _passing_limit),
         text_cells("reason", lambda gate: gate.reason),
     ]
-    return TitledTable(
-        table_of_records(columns, verdict.gates),
+    return table_of_records(
+        columns,
+        verdict.gates,
         title="Gates",
         caption=(
             "A name must fit the noise record (absolute fit), freeing its shape must not gain more "
@@ -250,7 +252,7 @@ def _rank_hypotheses(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
     return ranked[:MOST_SHOWN_HYPOTHESES] + without_effects
 
 
-def evidence_table(verdict: Verdict) -> TitledTable:
+def evidence_table(verdict: Verdict) -> Table:
     """Return the table of the best hypotheses with their probabilities and evidence.
 
     A hypothesis is a set of effects. The evidence is stated as a log Bayes factor against the
@@ -276,8 +278,9 @@ def evidence_table(verdict: Verdict) -> TitledTable:
         "motion, a force of unknown cause may be missing beside each hypothesis, and beside no "
         "effect."
     )
-    return TitledTable(
-        table_of_records(columns, _rank_hypotheses(verdict)),
+    return table_of_records(
+        columns,
+        _rank_hypotheses(verdict),
         title="Evidence",
         caption=f"{caption} {_inclusion_sentence(verdict.inclusion)}".rstrip(),
     )
@@ -300,7 +303,7 @@ def _inclusion_sentence(inclusion: Mapping[str, float]) -> str:
     return f"Probability that an effect takes part: {listing(phrases)}."
 
 
-def not_compared_table(verdict: Verdict) -> TitledTable:
+def not_compared_table(verdict: Verdict) -> Table:
     """Return the table of effects that were not fitted: each reason with its effects."""
     names_by_reason: dict[str, list[str]] = {}
     for omitted in verdict.not_fitted:
@@ -313,8 +316,9 @@ def not_compared_table(verdict: Verdict) -> TitledTable:
     rows = []
     for reason, names in names_by_reason.items():
         rows.append((f"{reason[:1].upper()}{reason[1:]}", listing(names)))
-    return TitledTable(
-        Table([PageColumn("why"), PageColumn("effects")], rows),
+    return Table(
+        [PageColumn("why"), PageColumn("effects")],
+        rows,
         title="Not compared",
         caption=(
             "Effects that are not in this table were fitted and compared. Numbers in brackets are "

@@ -4,7 +4,8 @@ import itertools
 from collections.abc import Sequence
 
 from reporting.figures import to_svg
-from reporting.page import Page, PageColumn, Table
+from reporting.page import Block, Highlights, Notice, Page, PageFigure, Section, render_page
+from reporting.table import PageColumn, Table, number_column
 
 from .comparison import PERCENT, Comparison
 from .figures import gauge_figure, identifiability_figure, profile_figure
@@ -28,102 +29,83 @@ WEAK_DIRECTIONS = 6
 def report_page(result: Identification) -> str:
     """Return the report as HTML."""
     fit = result.fit
-    page = Page(
-        "Identification of the wing design",
-        f"{len(fit.parameters)} numbers of '{fit.design.name}' fitted to outputs of the published "
-        "model",
-        footer=(SOURCE, f"Design {fit.design.hash[:16]}."),
-    )
-    page.add_section("Result")
-    _add_result(page, result)
-    page.add_section("Free numbers")
-    page.add_table(
-        _parameter_table(result),
-        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths "
-        "follow "
-        "from the weights and are to be compared with each other.",
-        title="Free numbers before and after",
-    )
-    page.add_section("What the data tell")
-    _add_identifiability(page, result)
-    page.add_section("Way of the fit")
-    page.add_table(
-        _iteration_table(result),
-        "Each model is the full one, factorised and differentiated at that point.",
-        title="Iterations",
-    )
-    return page.render()
-
-
-def _add_result(page: Page, result: Identification) -> None:
-    """Add the outputs beside the published ones, in figures, by gauge and on other meshes."""
-    fit = result.fit
+    not_converged = None
     if not fit.converged:
-        page.add_notice(
+        not_converged = Notice(
             "The fit has not converged: its next step is larger than the stated tolerance."
         )
     rows_with_limits = [row for row in result.comparison if row.reached is not None]
     reached_count = sum(bool(row.reached) for row in rows_with_limits)
     last = fit.iterations[-1]
-    page.add_highlights(
-        (
-            (f"{reached_count} of {len(rows_with_limits)}", "wanted limits kept"),
+    values = Highlights(
+        [
             (f"{last.objective:.1f}", "objective (half the sum of squares)"),
             (
                 f"{result.analysis.effective_count:.1f} of {len(fit.parameters)}",
                 "numbers the data determine",
             ),
             (f"{last.largest_step:.3f}", "next step, in prior standard deviations"),
-        )
+        ]
     )
-    page.add_table(
-        comparison_table(result.comparison, result.before),
-        "Differences, model less published. Fitted: the numbers of the design were fitted to it. "
-        "Where "
-        "levels are mixed, the lines below say which were held out.",
-        title="Every output beside the published one",
-    )
-    page.add_figure(
-        to_svg(gauge_figure(result.outputs, result.outputs_before, result.targets)),
-        "Model less published: (a) relative, (b) of d ln strain / d ln e, (c), (d) of strain over "
-        "healthy strain.",
-        title="Residuals by gauge",
-    )
-    if result.remeshed:
-        page.add_table(
-            remeshed_table(result.remeshed),
-            "Nothing is fitted again. Each cell: rms / largest.",
-            title="The same wing on other meshes",
-        )
-
-
-def _add_identifiability(page: Page, result: Identification) -> None:
-    """Add what the data determine, what the prior does, and the objective about the fit."""
-    page.add_figure(
-        to_svg(identifiability_figure(result.fit, result.analysis)),
-        "(a) Below one, the prior decides along a direction. (b) One: the data tell nothing of the "
-        "number.",
-        title="Identifiability",
-    )
-    page.add_table(
-        _direction_table(result), "The six that the data tell least of.", title="Weak directions"
-    )
-    if result.analysis.fixed:
-        page.add_table(
-            Table(
-                (PageColumn("number"), PageColumn("imitated", "%", numeric=True)),
-                [(name, f"{PERCENT * fraction:.1f}") for name, fraction in result.analysis.fixed],
+    gauges = gauge_figure(result.outputs, result.outputs_before, result.targets)
+    page = Page(
+        "Identification of the wing design",
+        f"{len(fit.parameters)} numbers of '{fit.design.name}' fitted to outputs of the published "
+        "model",
+        sentence=f"{reached_count} of {len(rows_with_limits)} wanted limits are kept.",
+        picture=PageFigure(
+            "gauges",
+            to_svg(gauges),
+            "Residuals by gauge",
+            "Model less published: (a) relative, (b) of d ln strain / d ln e, (c), (d) of strain "
+            "over healthy strain.",
+        ),
+        outcome=[not_converged, values],
+        sections=[
+            Section(
+                "Outputs",
+                [
+                    comparison_table(result.comparison, result.before),
+                    remeshed_table(result.remeshed) if result.remeshed else None,
+                ],
             ),
-            "Which share of the effect of a number that was not free the free ones can imitate.",
-            title="Numbers that were held",
-        )
+            Section("Free numbers", [_parameter_table(result)]),
+            Section("What the data tell", _identifiability(result)),
+            Section("Way of the fit", [_iteration_table(result)]),
+        ],
+        footer=(SOURCE, f"Design {fit.design.hash[:16]}."),
+    )
+    return render_page(page)
+
+
+def _identifiability(result: Identification) -> list[Block]:
+    """Return what the data determine, what the prior does, and the objective about the fit."""
+    profiles = None
     if result.profiles:
-        page.add_figure(
+        profiles = PageFigure(
+            "profiles",
             to_svg(profile_figure(result.profiles)),
+            "Profiles",
             "Objective along one number with all others fitted again, on the reduced model of the "
             "last step.",
-            title="Profiles",
         )
+    return [
+        PageFigure(
+            "identifiability",
+            to_svg(identifiability_figure(result.fit, result.analysis)),
+            "Identifiability",
+            "(a) Below one, the prior decides along a direction. (b) One: the data tell nothing of "
+            "the number.",
+        ),
+        _direction_table(result),
+        Table(
+            (PageColumn("number"), number_column("imitated", "%")),
+            [(name, f"{PERCENT * fraction:.1f}") for name, fraction in result.analysis.fixed],
+            "Numbers that were held",
+            "Which share of the effect of a number that was not free the free ones can imitate.",
+        ),
+        profiles,
+    ]
 
 
 def comparison_table(
@@ -135,8 +117,8 @@ def comparison_table(
         PageColumn("unit"),
         PageColumn("wanted rms"),
         PageColumn("wanted largest"),
-        PageColumn("start", "rms / largest", numeric=True),
-        PageColumn("identified", "rms / largest", numeric=True),
+        number_column("start", "rms / largest"),
+        number_column("identified", "rms / largest"),
         PageColumn("where"),
         PageColumn("kept"),
         PageColumn("fitted"),
@@ -156,20 +138,31 @@ def comparison_table(
                 "yes" if row.fitted else "held out",
             )
         )
-    return Table(columns, rows)
+    return Table(
+        columns,
+        rows,
+        "Every output beside the published one",
+        "Differences, model less published. Fitted: the numbers of the design were fitted to it. "
+        "Where levels are mixed, the lines below say which were held out.",
+    )
 
 
 def remeshed_table(remeshed: Sequence[RemeshedComparison]) -> Table:
     """Return the comparison on several meshes as a table."""
     columns = [PageColumn("output"), PageColumn("unit")]
     for mesh in remeshed:
-        columns.append(PageColumn(f"x{mesh.refinement:g}", f"{mesh.unknowns:,}", numeric=True))
+        columns.append(number_column(f"x{mesh.refinement:g}", f"{mesh.unknowns:,}"))
     rows = []
     for rows_of_output in zip(*(mesh.comparison for mesh in remeshed), strict=True):
         output = rows_of_output[0]
         differences = [_difference_text(row) for row in rows_of_output]
         rows.append((output.name, _unit_text(output.unit), *differences))
-    return Table(columns, rows)
+    return Table(
+        columns,
+        rows,
+        "The same wing on other meshes",
+        "Nothing is fitted again. Each cell: rms / largest.",
+    )
 
 
 def _unit_text(unit: str) -> str:
@@ -199,10 +192,10 @@ def _parameter_table(result: Identification) -> Table:
     columns = (
         PageColumn("number"),
         PageColumn("unit"),
-        PageColumn("before", numeric=True),
-        PageColumn("after", numeric=True),
-        PageColumn("shift", "prior deviations", numeric=True),
-        PageColumn("width after / before", numeric=True),
+        number_column("before"),
+        number_column("after"),
+        number_column("shift", "prior deviations"),
+        number_column("width after / before"),
         PageColumn("why it is free"),
     )
     rows = []
@@ -219,7 +212,13 @@ def _parameter_table(result: Identification) -> Table:
                 parameter.why,
             )
         )
-    return Table(columns, rows)
+    return Table(
+        columns,
+        rows,
+        "Free numbers before and after",
+        "Before: normal distribution. After: the fit, and its width by the linear analysis; widths "
+        "follow from the weights and are to be compared with each other.",
+    )
 
 
 def _direction_table(result: Identification) -> Table:
@@ -227,23 +226,28 @@ def _direction_table(result: Identification) -> Table:
     analysis = result.analysis
     weakest_first = reversed(range(len(analysis.singular_values)))
     columns = (
-        PageColumn("singular value", numeric=True),
+        number_column("singular value"),
         PageColumn("direction, in prior deviations"),
     )
     rows = []
     for number in itertools.islice(weakest_first, WEAK_DIRECTIONS):
         singular_value = analysis.singular_values[number]
         rows.append((f"{singular_value:.3g}", analysis.describe(number)))
-    return Table(columns, rows)
+    return Table(
+        columns,
+        rows,
+        "Weak directions",
+        "The six that the data tell least of.",
+    )
 
 
 def _iteration_table(result: Identification) -> Table:
     """Return the iterations of the fit as a table."""
     columns = (
         PageColumn("model"),
-        PageColumn("objective", numeric=True),
-        PageColumn("of it misfit", numeric=True),
-        PageColumn("next step", "prior deviations", numeric=True),
+        number_column("objective"),
+        number_column("of it misfit"),
+        number_column("next step", "prior deviations"),
     )
     rows = []
     for number, iteration in enumerate(result.fit.iterations, start=1):
@@ -255,4 +259,9 @@ def _iteration_table(result: Identification) -> Table:
                 f"{iteration.largest_step:.4f}",
             )
         )
-    return Table(columns, rows)
+    return Table(
+        columns,
+        rows,
+        "Iterations",
+        "Each model is the full one, factorised and differentiated at that point.",
+    )

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
 from reporting import figures
-from reporting.page import Page
+from reporting.page import Page, PageFigure, render_page
 
 X = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
 Y = np.array([12.0, 13.5, 11.25, 14.0, 15.0])
@@ -224,10 +224,9 @@ READING = "document.querySelector('.reading')"
 
 @pytest.fixture(scope="module")
 def page_file(svg, tmp_path_factory):
-    page = Page("Values")
-    page.add_figure(svg, "Caption.", title="Figure")
+    page = Page("Values", picture=PageFigure("values", svg, "Figure", "Caption."))
     file = tmp_path_factory.mktemp("page") / "page.html"
-    file.write_text(page.render(), encoding="utf-8")
+    file.write_text(render_page(page), encoding="utf-8")
     return file
 
 

@@ -9,10 +9,22 @@ import pytest
 
 from reporting import figures
 from reporting.errors import InvalidFigureError
-from reporting.page import Page, PageColumn, Table, Words, script_source
-from reporting.record_table import (
-    TitledTable,
-    add_titled_table,
+from reporting.inline_svg import inline_svg
+from reporting.page import (
+    Fold,
+    Highlights,
+    Notice,
+    Page,
+    PageFigure,
+    Section,
+    render_page,
+    script_source,
+)
+from reporting.page_words import Words
+from reporting.table import (
+    PageColumn,
+    Table,
+    item_table,
     number_cells,
     table_of_records,
     text_cells,
@@ -60,27 +72,33 @@ def draw_line() -> bytes:
 
 
 TABLE = Table(
-    (PageColumn("quantity"), PageColumn("value", unit="N/mm", numeric=True)), [("<k>", "0.677")]
+    (PageColumn("quantity"), PageColumn("value", unit="N/mm", numeric=True)),
+    [("<k>", "0.677")],
+    "Stiffness",
+    "A caption.",
 )
 
 
 def make_page() -> Page:
     """Return a page with one of everything, and with texts that must be escaped."""
-    page = Page("Title <img src=x>", subtitle="one <b>line</b>", footer=["A source & its year."])
-    page.add_section("First <section>")
-    page.add_paragraph("if a < b & b > c")
-    page.add_highlights([("3.5 %", "damage <1>")])
-    page.add_notice("<script>alert('x')</script>")
-    page.add_figure(draw_line(), "What is seen, in µε.", title='What & "whose" <size>')
-    page.add_section("Second")
-    page.add_figure(draw_line(), "The same.", title="Another")
-    page.add_table(TABLE, "A caption.", title="Stiffness")
-    return page
+    picture = PageFigure("line", draw_line(), 'What & "whose" <size>', "What is seen, in µε.")
+    return Page(
+        "Title <img src=x>",
+        subtitle="one <b>line</b>",
+        sentence="The <wing> holds.",
+        picture=picture,
+        outcome=[Highlights([("3.5 %", "damage <1>")]), Notice("<script>alert('x')</script>")],
+        sections=[
+            Section("First <section>", ["if a < b & b > c"]),
+            Section("Second", [picture._replace(title="Another"), Fold("More", [TABLE])]),
+        ],
+        footer=["A source & its year."],
+    )
 
 
 @pytest.fixture(scope="module")
 def text() -> str:
-    return make_page().render()
+    return render_page(make_page())
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +125,15 @@ def script_of(text: str) -> str:
 # ---------------------------------------------------------------- numbers, escapes, units
 
 
-def test_figures_and_tables_are_numbered():
-    page = Page("Title")
+def test_figures_and_tables_are_numbered_in_the_order_of_the_page(text):
+    assert re.findall(r"<b>((?:Figure|Table) \d)\.", text) == ["Figure 1", "Figure 2", "Table 1"]
 
-    figure_numbers = [page.add_figure(draw_line(), "It.", title=title) for title in ("a", "b")]
-    table_number = page.add_table(TABLE, "A caption.", title="Stiffness")
 
-    assert figure_numbers == [1, 2]
-    assert table_number == 1
+def test_the_first_screen_is_sentence_picture_and_outcome_and_the_contents_follow(text):
+    marks = ('class="card"', 'id="figure-1"', 'class="highlights"', 'class="notice"', "<nav>")
+    places = [text.index(mark) for mark in (*marks, 'id="section-1"')]
+
+    assert places == sorted(places)
 
 
 def test_a_page_has_its_sections_and_figures(tags):
@@ -177,7 +196,7 @@ def test_a_server_can_allow_the_script_of_a_page_and_no_other(text):
 
 
 def test_an_empty_page_has_no_contents_and_no_script():
-    text = Page("Empty").render()
+    text = render_page(Page("Empty"))
 
     parse(text)
     assert "<nav>" not in text
@@ -192,7 +211,7 @@ def test_an_empty_page_has_no_contents_and_no_script():
 )
 def test_a_text_that_is_no_drawing_is_refused(data):
     with pytest.raises(InvalidFigureError):
-        figures.inline_svg(data, "f1", "x")
+        inline_svg(data, "f1", "x")
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan")])
@@ -218,12 +237,27 @@ def test_a_table_of_records_has_a_row_for_each_and_units_of_numbers():
     assert table.rows == [["rod 1", "1"], ["rod 2", "2"]]
 
 
-def test_a_table_without_rows_is_left_out_of_a_page():
-    page = Page("Empty table")
+EMPTY_BLOCKS = {
+    "nothing": None,
+    "blanks": " ",
+    "a notice without text": Notice(""),
+    "no values": Highlights([]),
+    "a table without rows": Table([PageColumn("name")], [], "Rods", "None was found."),
+    "an empty fold": Fold("Rods", [None, ""]),
+}
 
-    add_titled_table(page, TitledTable(Table([PageColumn("name")], []), "Rods", "None was found."))
 
-    assert "Rods" not in page.render()
+@pytest.mark.parametrize("block", EMPTY_BLOCKS.values(), ids=EMPTY_BLOCKS)
+def test_a_section_with_nothing_but_empty_blocks_is_left_out(block):
+    text = render_page(Page("Rods of a frame", sections=[Section("Rods", [block])]))
+
+    assert text == render_page(Page("Rods of a frame"))
+
+
+def test_a_table_of_items_leaves_out_those_without_a_value():
+    table = item_table([("seed", "3"), ("plug-ins", " ")], "Run", "")
+
+    assert table.rows == [("seed", "3")]
 
 
 def test_words_fill_the_fields_of_headings_and_captions():
@@ -237,12 +271,10 @@ def test_words_fill_the_fields_of_headings_and_captions():
             }
         }
     }
-    page = Page("Rods")
 
-    words.add_table(
-        page, "rods", [["a", "0.5", "x"]], more=[PageColumn("mark")], asset="frame", what="length"
+    table = words.table(
+        "rods", [["a", "0.5", "x"]], columns=[PageColumn("mark")], asset="frame", what="length"
     )
 
-    text = page.render()
-    assert "Rods of frame" in text
-    assert re.findall(r"<th[^>]*>([^<]+)<", text) == ["name", "length", "mark"]
+    assert table.title == "Rods of frame"
+    assert [column.name for column in table.columns] == ["name", "length", "mark"]

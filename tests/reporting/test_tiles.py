@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks.browser import CHROMIUM, Tab, open_browser
 from reporting import figures
-from reporting.page import Page
+from reporting.inline_svg import inline_svg
+from reporting.page import Fold, Page, ReportFigure, Section, render_page
 from reporting.tiles import Tile, tiles_of_figure
 from tests.costs import once
 from tests.reporting.test_page import parse
@@ -99,14 +100,14 @@ DRAWING = b'<svg viewBox="0 0 9 9" font-size="11" text-anchor="middle"><text id=
 
 
 def test_a_drawing_keeps_the_look_that_its_file_states_for_all_letters():
-    drawn = figures.inline_svg(DRAWING, "f1", "A drawing")
+    drawn = inline_svg(DRAWING, "f1", "A drawing")
     parse(drawn.full)
     assert 'font-size="11"' in drawn.full
     assert 'text-anchor="middle"' in drawn.full
 
 
 def test_a_drawing_has_one_box_and_no_tiles():
-    drawn = figures.inline_svg(DRAWING, "f1", "A drawing")
+    drawn = inline_svg(DRAWING, "f1", "A drawing")
     assert drawn.full.count("viewBox") == 1
     assert drawn.tiles == ()
 
@@ -114,14 +115,8 @@ def test_a_drawing_has_one_box_and_no_tiles():
 @pytest.fixture(scope="module")
 def page_with_a_fold() -> str:
     """The text of a page with a card, a fold and a paragraph after it."""
-    page = Page("Title")
-    page.add_section("Verdict")
-    page.add_card("Friction at the joint < 3 N")
-    page.begin_fold("Why & how")
-    page.add_paragraph("Because.")
-    page.end_fold()
-    page.add_paragraph("After.")
-    return page.render()
+    verdict = Section("Verdict", [Fold("Why & how", ["Because."]), "After."])
+    return render_page(Page("Title", sentence="Friction at the joint < 3 N", sections=[verdict]))
 
 
 def test_a_card_stands_open(page_with_a_fold):
@@ -160,10 +155,10 @@ THIRD_POINT_OF_THE_FIRST_LINE = """(() => { const line = document.querySelector(
 @pytest.fixture(scope="module")
 def page_with_panels(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The address of a page with a figure of two by two panels."""
-    page = Page("Narrow")
-    page.add_figure(figures.to_svg(several_panels(2, 2)), "Caption.", title="Figure")
+    panels = ReportFigure("panels", several_panels(2, 2), "Figure", "Caption.")
+    page = Page("Narrow", picture=figures.page_figure(panels))
     file = tmp_path_factory.mktemp("panels") / "page.html"
-    file.write_text(page.render(), encoding="utf-8")
+    file.write_text(render_page(page), encoding="utf-8")
     return f"file://{file}"
 
 

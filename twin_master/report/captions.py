@@ -3,11 +3,14 @@
 Their texts are templates in `words.toml`; the functions here fill in the fields of the templates.
 """
 
+from importlib import resources
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from reporting.arrays import Float
-from reporting.page import ReportFigure, Words
+from reporting.page import PageFigure, ReportFigure
+from reporting.page_words import Words
 from reporting.words import capital, number, parameter_title, small
 from twin_master.report.calibration import load_test, parameter_unit, true_value
 from twin_master.report.check import PredictiveCheck
@@ -258,15 +261,12 @@ def caption_planform(run: Run, figure: Figure) -> ReportFigure:
     return report_figure._replace(name="structure")
 
 
-def caption_network(run: Run) -> ReportFigure:
-    """Return the title and the caption of the decision network, whose drawing is a file."""
+def network_figure(run: Run) -> PageFigure:
+    """Return the decision network, whose drawing is a file, with its title and caption."""
     if run.decides_on_prediction:
         deciding_belief = "the belief predicted from its observation"
     else:
         deciding_belief = "the belief that its observation updated"
-    return WORDS.figure(
-        NETWORK,
-        None,  # type: ignore[arg-type]  # its drawing is a file
-        step=run.step_word,
-        deciding_belief=deciding_belief,
-    )
+    texts = WORDS.words("figures", NETWORK, step=run.step_word, deciding_belief=deciding_belief)
+    drawing = resources.files(__package__).joinpath("network.svg").read_bytes()
+    return PageFigure(NETWORK, drawing, **texts)

@@ -1,16 +1,23 @@
 """The report of a run: one self-contained page and its figures, made from the run folder alone."""
 
 from collections.abc import Iterator, Mapping
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.figures import to_png, to_svg
+from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.page import Page, ReportFigure
-from reporting.words import in_one_line
+from reporting.page import (
+    Block,
+    Fold,
+    Notice,
+    Page,
+    PageFigure,
+    ReportFigure,
+    Section,
+    render_page,
+)
 from twin_master.assets.asset_source import calibration_sentence
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError
@@ -29,8 +36,6 @@ from twin_master.store.writing import REPORT_NAME
 
 FIGURE_FOLDER = "figures"
 """The folder of the figures in a run folder."""
-_MISSION_PICTURES = (MISSION_NOW, MISSION_WHOLE)
-"""The pictures of the mission at one step, and as a whole."""
 
 
 def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
@@ -62,21 +67,14 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     """
     folder = Path(run_folder)
     run = read_run(folder)
-    drawings = {}
     figures = {}
     # Only the drawing of each figure is kept, because figures of a long mission need much memory.
-    for report_figure in _figures(run, now, folder):
-        name = report_figure.name
-        drawings[name] = to_svg(report_figure.figure)
-        if name == MISSION_NOW:
-            drawing = to_png(report_figure.figure)
-            atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.png", drawing)
-        figures[name] = report_figure._replace(figure=None)  # type: ignore[arg-type]
-    figures[NETWORK] = captions.caption_network(run)
-    drawings[NETWORK] = resources.files(__package__).joinpath("network.svg").read_bytes()
-    for name, drawing in drawings.items():
-        atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.svg", drawing)
-    return atomic_write_text(folder / REPORT_NAME, render_page(run, drawings, figures))
+    for figure in _figures(run, now, folder):
+        has_png = figure.name == MISSION_NOW
+        figures[figure.name] = save_figure(figure, folder / FIGURE_FOLDER, png=has_png)
+    figures[NETWORK] = captions.network_figure(run)
+    atomic_write_bytes(folder / FIGURE_FOLDER / f"{NETWORK}.svg", figures[NETWORK].svg)
+    return atomic_write_text(folder / REPORT_NAME, render_page(run_page(run, figures)))
 
 
 def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[ReportFigure]:
@@ -157,21 +155,14 @@ def _structure_figure(run: Run, folder: Path, check: PredictiveCheck) -> Iterato
         yield captions.caption_planform(run, figure)
 
 
-def render_page(
-    run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, ReportFigure]
-) -> str:
-    """Return the page of a report as HTML.
-
-    Parameters
-    ----------
-    drawings : mapping of str to bytes
-        The figures as SVG, by name.
-    figures : mapping of str to ReportFigure
-        Title and caption of each figure, by name.
-    """
+def run_page(run: Run, figures: Mapping[str, PageFigure]) -> Page:
+    """Return the page of a run with these figures by name; those that are missing are left out."""
     mission = run.scenario.mission
     seed = run.config.get("seed", run.tree.attrs.get("seed", "unknown"))
-    page = Page(
+    picture = "structure" if "structure" in figures else MISSION_NOW
+    sentence, *further_sentences = opening_sentences(run)
+    pictures_of_mission = [name for name in (MISSION_NOW, MISSION_WHOLE) if name != picture]
+    return Page(
         mission.title or mission.name,
         WORDS.say(
             "subtitle",
@@ -180,109 +171,89 @@ def render_page(
             step=run.step_word,
             seed=seed,
         ),
+        sentence=sentence,
+        picture=figures.get(picture),
+        outcome=[*_notices(run), " ".join(further_sentences), _sentence_on_silence(run)],
+        sections=[
+            Section("Results", [tables.summary_table(run)]),
+            Section("The mission", [figures.get(name) for name in pictures_of_mission]),
+            Section("What the twin believes", [figures.get("belief")]),
+            Section(
+                "What the twin learnt",
+                [
+                    figures.get("learnt"),
+                    tables.learnt_asset_table(run),
+                    tables.learnt_sensors_table(run),
+                ],
+            ),
+            Section("What the twin decides", [figures.get("policy")]),
+            Section("Whether the data agree", [figures.get("check")]),
+            Section(
+                "The model",
+                [
+                    figures.get("calibration"),
+                    tables.calibrated_table(run),
+                    *_calibration_sentences(run),
+                    figures.get(NETWORK),
+                ],
+            ),
+            Section(
+                "The run",
+                [
+                    tables.run_table(run, seed),
+                    Fold(
+                        "Versions of the software and hashes of the inputs",
+                        [
+                            "Wall-clock times are only in timing.json, so that equal runs give "
+                            "equal reports.",
+                            tables.provenance_table(run),
+                        ],
+                    ),
+                ],
+            ),
+        ],
         footer=(WORDS.say("sources"), WORDS.say("colours")),
     )
-    pictures = _Pictures(page, drawings, figures)
-    _add_outcome(page, run)
-    pictures_of_outcome = ["structure" if "structure" in figures else MISSION_NOW]
-    pictures.add(*pictures_of_outcome)
-    tables.add_summary_table(page, run)
-    page.add_section("The mission")
-    pictures.add(*(name for name in _MISSION_PICTURES if name not in pictures_of_outcome))
-    page.add_section("What the twin believes")
-    pictures.add("belief")
-    if run.learnt_quantities:
-        page.add_section("What the twin learnt")
-        pictures.add("learnt")
-        tables.add_learnt_asset_table(page, run)
-        tables.add_learnt_sensors_table(page, run)
-    if "policy" in figures:
-        page.add_section("What the twin decides")
-        pictures.add("policy")
-    page.add_section("Whether the data agree")
-    pictures.add("check")
-    page.add_section("The model")
-    pictures.add("calibration")
-    _add_calibration(page, run)
-    pictures.add(NETWORK)
-    page.add_section("The run")
-    tables.add_run_table(page, run, seed)
-    page.begin_fold("Versions of the software and hashes of the inputs")
-    page.add_paragraph(
-        "Wall-clock times are only in timing.json, so that equal runs give equal reports."
-    )
-    tables.add_provenance_table(page, run)
-    page.end_fold()
-    return page.render()
 
 
-class _Pictures:
-    """Adds drawn figures to a page.
-
-    Parameters
-    ----------
-    drawings : mapping of str to bytes
-        The figures as SVG, by name.
-    figures : mapping of str to ReportFigure
-        Title and caption of each figure, by name.
-    """
-
-    def __init__(
-        self, page: Page, drawings: Mapping[str, bytes], figures: Mapping[str, ReportFigure]
-    ) -> None:
-        self._page = page
-        self._drawings = drawings
-        self._figures = figures
-
-    def add(self, *names: str) -> None:
-        """Add the figures with the given names to the page, except those that the report lacks."""
-        for name in names:
-            if name in self._figures:
-                figure = self._figures[name]
-                self._page.add_figure(self._drawings[name], figure.caption, title=figure.title)
-
-
-def _add_outcome(page: Page, run: Run) -> None:
-    """Begin the section "Outcome" with the opening sentences and the notices."""
-    page.add_section("Outcome")
-    page.add_paragraph(in_one_line(" ".join(opening_sentences(run))))
+def _notices(run: Run) -> list[Block]:
+    """Return what a reader must not overlook: differences of asset and model, notices, losses."""
+    notices: list[Block] = []
     if run.summary.get("asset_and_model_differ"):
-        _add_notice(
-            page,
+        sentence = (
             f"The asset and the twin's model differ: the asset was the {run.summary['asset']}, and "
             f"the twin believes the {run.summary['twin_model']}. Its intervals hold as far as that "
-            "model holds.",
+            "model holds."
         )
-    notices = [notice["sentence"] for notice in run.summary.get("notices", [])]
-    for notice in notices:
-        _add_notice(page, notice)
-    if any(" DIR" in notice for notice in notices):
-        page.add_paragraph("DIR is the folder of this page.")
-    if not notices and run.get("notice/none_of_these") is not None:
-        page.add_paragraph(
-            f"No notice was given. That does not prove the {run.sensors.word}s right: a fault that "
-            "moves all of them towards what another state would show is taken for that state."
-        )
-    _add_notice(page, _true_parameter_sentence(run))
+        notices.append(Notice(sentence))
+    sentences = [notice["sentence"] for notice in run.summary.get("notices", [])]
+    notices += [Notice(sentence) for sentence in sentences]
+    if any(" DIR" in sentence for sentence in sentences):
+        notices.append("DIR is the folder of this page.")
+    notices.append(Notice(_true_parameter_sentence(run)))
     is_lost = np.isnan(run.observations)
     if is_lost.any():
         percentage = 100.0 * is_lost.mean()
-        _add_notice(page, f"Observations lost ({percentage:.1f} %): {lost_ranges(run)}.")
+        notices.append(Notice(f"Observations lost ({percentage:.1f} %): {lost_ranges(run)}."))
     steps_without_observation = run.first_step + np.flatnonzero(is_lost.all(axis=1))
     if len(steps_without_observation):
         steps = step_ranges(steps_without_observation, run.step_word)
-        _add_notice(
-            page,
-            f"No {run.sensors.word} reported at {steps}: "
-            "there the belief followed the dynamics alone.",
+        sentence = (
+            f"No {run.sensors.word} reported at {steps}: there the belief followed the dynamics "
+            "alone."
         )
+        notices.append(Notice(sentence))
+    return notices
 
 
-def _add_notice(page: Page, sentence: str) -> None:
-    """Add a sentence to the page as a highlighted notice, unless it is empty."""
-    text = in_one_line(sentence)
-    if text:
-        page.add_notice(text)
+def _sentence_on_silence(run: Run) -> str:
+    """Return what it means that a run with watched sensors gave no notice; empty if it gave one."""
+    if run.summary.get("notices") or run.get("notice/none_of_these") is None:
+        return ""
+    return (
+        f"No notice was given. That does not prove the {run.sensors.word}s right: a fault that "
+        "moves all of them towards what another state would show is taken for that state."
+    )
 
 
 def _true_parameter_sentence(run: Run) -> str:
@@ -300,9 +271,8 @@ def _true_parameter_sentence(run: Run) -> str:
     return truth_mismatch(parameter, truth, mean, deviation) or ""
 
 
-def _add_calibration(page: Page, run: Run) -> None:
-    """Add the calibrated values, the findings, and which model was calibrated."""
-    tables.add_calibrated_table(page, run)
+def _calibration_sentences(run: Run) -> list[str]:
+    """Return the findings of the calibration, and the sentence on which model was calibrated."""
     sentences: list[str] = []
     if tables.calibrated_values(run.calibration):
         sentences += run.calibration.get("findings", [])
@@ -311,10 +281,7 @@ def _add_calibration(page: Page, run: Run) -> None:
     if asset and twin_model:
         inputs = run.config.get("inputs", {})
         sentences.append(calibration_sentence(run.calibration, asset, twin_model, inputs) or "")
-    for sentence in sentences:
-        text = in_one_line(sentence)
-        if text:
-            page.add_paragraph(text)
+    return sentences
 
 
 def step_ranges(steps: ArrayLike, step_word: str = "step") -> str:

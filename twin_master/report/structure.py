@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.figure import Figure
 
 from fe.elements.cells import CellMesh
@@ -148,30 +148,30 @@ def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
     residual : (G,) array
         The residuals of the last observations, in standard deviations; NaN where one was lost.
     """
-    figure, ((upper_axes,), (lower_axes,)) = style.panels(
-        2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25
+    figure, ((left_axes, right_axes),) = style.panels(
+        1, 2, 1.85, 0.3, 0.65, left=0.02, right=0.98, wspace=0.08
     )
     sensors = run.sensors
     _draw_wing(
         figure,
-        upper_axes,
+        left_axes,
         run,
         planform,
         values=sensors.scale * run.observations[-1],
         value_label=f"{sensors.quantity} ({sensors.unit})",
         look={"cmap": style.LEVELS},
     )
-    style.panel_label(upper_axes, "a", f"Measured {sensors.quantity}")
+    style.panel_label(left_axes, "a", f"Measured {sensors.quantity}")
     _draw_wing(
         figure,
-        lower_axes,
+        right_axes,
         run,
         planform,
         values=residual,
         value_label="standard deviations",
         look=style.RESIDUALS,
     )
-    style.panel_label(lower_axes, "b", "Measured less expected")
+    style.panel_label(right_axes, "b", "Measured less expected")
     return figure
 
 
@@ -185,7 +185,11 @@ def _draw_wing(
     value_label: str,
     look: style.ColorScale,
 ) -> None:
-    """Draw a wing from above: its regions coloured by expected loss, its gauges by values (G,)."""
+    """Draw a wing from above: its regions coloured by expected loss, its gauges by values (G,).
+
+    The scales of the colours lie below the wing: of the losses on the left, of the values on the
+    right.
+    """
     x, y = planform.outline.T
     axes.fill(x, y, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
     expected_loss = run.factor_scales * run["filtered/mean"][-1]
@@ -200,23 +204,21 @@ def _draw_wing(
         clim=(lowest_level, highest_level),
     )
     axes.add_collection(regions)
-    _draw_gauges(figure, axes, planform.gauges, values, value_label, look)
+    dots = _draw_gauges(axes, planform.gauges, values, look)
     axes.set_aspect("equal")
     axes.axis("off")
+    scale = axes.inset_axes((0.56, -0.22, 0.4, 0.07))
+    style.color_bar(figure, dots, value_label, cax=scale, location="bottom")
     if planform.regions:
+        scale = axes.inset_axes((0.04, -0.22, 0.4, 0.07))
         label = f"expected loss ({run.factors[0].unit})"
-        style.color_bar(figure, regions, label, ax=axes, location="left", **_COLOR_BAR)
+        style.color_bar(figure, regions, label, cax=scale, location="bottom")
 
 
 def _draw_gauges(
-    figure: Figure,
-    axes: Axes,
-    positions: Float,
-    values: Float,
-    value_label: str,
-    look: style.ColorScale,
-) -> None:
-    """Draw gauges at positions (G, 2) as dots coloured by values (G,).
+    axes: Axes, positions: Float, values: Float, look: style.ColorScale
+) -> PathCollection:
+    """Draw gauges at positions (G, 2) as dots coloured by values (G,), and return the dots.
 
     A gauge whose value is NaN, because its reading was lost, is a cross.
 
@@ -225,11 +227,11 @@ def _draw_gauges(
     is_known = np.isfinite(values)
     x, y = positions[is_known].T
     dots = axes.scatter(
-        x, y, c=values[is_known], s=36.0, edgecolors="black", linewidths=0.5, **look
+        x, y, c=values[is_known], s=20.0, edgecolors="black", linewidths=0.5, **look
     )
     x, y = positions[~is_known].T
     axes.scatter(x, y, marker="x", s=30.0, color=style.TRUTH, label="lost")
-    style.color_bar(figure, dots, value_label, ax=axes, **_COLOR_BAR)
+    return dots
 
 
 class StructurePicture(NamedTuple):
@@ -345,8 +347,8 @@ def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
         # A gauge is drawn with the displacement of the node nearest to it.
         displaced_gauges = gauges + scale * field.displacement[nearest_node]
         gauges_in_picture = displaced_gauges @ camera.picture_axes
-        label = "gauges: standard deviations"
-        _draw_gauges(figure, axes, gauges_in_picture, residual, label, style.RESIDUALS)
+        dots = _draw_gauges(axes, gauges_in_picture, residual, style.RESIDUALS)
+        style.color_bar(figure, dots, "gauges: standard deviations", ax=axes, **_COLOR_BAR)
     axes.autoscale_view()
     axes.set_aspect("equal")
     axes.axis("off")

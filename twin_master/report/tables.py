@@ -1,14 +1,15 @@
 """The tables of a report: columns, cells, and the fields of titles and captions in `words.toml`."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
-from reporting.page import Page, PageColumn, Table, number_column
-from reporting.words import between, in_one_line, listing, number
+from reporting.provenance import provenance_items
+from reporting.table import PageColumn, Table, item_table, number_column
+from reporting.words import between, listing, number
 from twin_master.report.captions import WORDS
 from twin_master.report.learnt import (
     mean_and_interval,
@@ -21,35 +22,12 @@ from twin_master.store.mission_result import LearntQuantity
 from twin_master.store.summary import SummaryEntry
 from twin_master.store.writing import printed_values
 
-_HASH_DIGITS = 12
 _MICROSTRAIN = 1.0e6
 """Factor from strain to microstrain."""
 
 
-def _add_table(
-    page: Page,
-    name: str,
-    columns: Sequence[PageColumn],
-    rows: Iterable[Sequence[str]],
-    **fields: object,
-) -> None:
-    """Add a table to a page, unless it has no rows.
-
-    Parameters
-    ----------
-    name : str
-        The name of its title and caption in `words.toml`.
-    rows : iterable of sequence of str
-        The cells. They may come from files of users: line breaks and repeated blanks become one
-        blank.
-    """
-    cells = [[in_one_line(cell) for cell in row] for row in rows]
-    if cells:
-        page.add_table(Table(columns, cells), **WORDS.words("tables", name, **fields))
-
-
-def add_summary_table(page: Page, run: Run) -> None:
-    """Add the table of the run's results, with reference values if the scenario has any."""
+def summary_table(run: Run) -> Table:
+    """Return the table of the run's results, with reference values if the scenario has any."""
     entries = [SummaryEntry(**record) for record in run.summary.get("figures", [])]
     has_references = any(entry.reference is not None for entry in entries)
     columns = [PageColumn("result"), number_column("this run"), PageColumn("unit")]
@@ -64,11 +42,11 @@ def add_summary_table(page: Page, run: Run) -> None:
             row += [reference, entry.reference_source]
         rows.append(row)
     references = ", beside their references" if has_references else ""
-    _add_table(page, "figures", columns, rows, references=references)
+    return WORDS.table("figures", rows, columns, references=references)
 
 
-def add_learnt_asset_table(page: Page, run: Run) -> None:
-    """Add the table of the whole asset's learnt quantities: prior, last posterior, true value."""
+def learnt_asset_table(run: Run) -> Table:
+    """Return the table of what was learnt of the asset: prior, last posterior, true value."""
     quantities = quantities_of_asset(run)
     has_truth = any(quantity.truth is not None for quantity in quantities)
     columns = [
@@ -97,11 +75,10 @@ def add_learnt_asset_table(page: Page, run: Run) -> None:
             truth = None if quantity.truth is None else float(quantity.truth)
             row.append(number(truth))
         rows.append(row)
-    _add_table(
-        page,
+    return WORDS.table(
         "learnt_asset",
-        columns,
         rows,
+        columns,
         step=run.step_word,
         transition_factor=_transition_factor_sentence(run, quantities),
     )
@@ -121,8 +98,8 @@ def _transition_factor_sentence(run: Run, quantities: Sequence[LearntQuantity]) 
     return f"{sentence}."
 
 
-def add_learnt_sensors_table(page: Page, run: Run) -> None:
-    """Add the table of the quantities that were learnt of each sensor, after the last step."""
+def learnt_sensors_table(run: Run) -> Table:
+    """Return the table of the quantities that were learnt of each sensor, after the last step."""
     quantities = quantities_of_sensors(run)
     columns = [PageColumn(run.sensors.word)]
     columns += [number_column(quantity.label) for quantity in quantities]
@@ -131,19 +108,18 @@ def add_learnt_sensors_table(page: Page, run: Run) -> None:
         # All sensors have the same prior unless the scenario gives each its own.
         typical_prior: Float = np.nanmedian(quantity.prior, axis=0)
         priors.append(f"{quantity.title.lower()} {mean_and_interval(typical_prior)}")
-    _add_table(
-        page,
+    return WORDS.table(
         "learnt_sensors",
-        columns,
         sensor_rows(run),
+        columns,
         sensor=run.sensors.word,
         step=run.step_word,
         prior="; ".join(priors),
     )
 
 
-def add_calibrated_table(page: Page, run: Run) -> None:
-    """Add the table of calibrated parameters, or of the quantities of a healthy wing."""
+def calibrated_table(run: Run) -> Table:
+    """Return the table of calibrated parameters, or of the quantities of a healthy wing."""
     record = run.calibration
     columns = [
         PageColumn("figure"),
@@ -162,15 +138,14 @@ def add_calibrated_table(page: Page, run: Run) -> None:
             "" if quantity["unit"] == "1" else quantity["unit"],
         ]
         rows.append(row)
-    if not rows:
-        return
     if "campaign" in record:
         kind = "parameters"
         origin = f"from the campaign {record['campaign']}"
     else:
         kind = "wing"
         origin = "of the healthy wing"
-    _add_table(page, "calibrated", columns, rows, kind=kind, asset=record["asset"], origin=origin)
+    asset = record.get("asset", "")
+    return WORDS.table("calibrated", rows, columns, kind=kind, asset=asset, origin=origin)
 
 
 def calibrated_values(record: JsonRecord) -> list[JsonRecord]:
@@ -192,8 +167,8 @@ def calibrated_values(record: JsonRecord) -> list[JsonRecord]:
     return values
 
 
-def add_run_table(page: Page, run: Run, seed: object) -> None:
-    """Add the table of the run: numbers of steps and states, controls, sensors, seed and models."""
+def run_table(run: Run, seed: object) -> Table:
+    """Return the table of the run: numbers of steps and states, controls, sensors and models."""
     sensors = f"{len(run.sensors.titles)}"
     if run.sensors.named:
         sensors += f": {', '.join(run.sensors.titles)}"
@@ -214,12 +189,7 @@ def add_run_table(page: Page, run: Run, seed: object) -> None:
         ("log evidence of the observations", f"{run['filtered/log_evidence'].sum():.0f} nat"),
         *_monitor_rows(run),
     ]
-    _add_table(page, "run", [PageColumn("item"), PageColumn("value")], _with_value(rows))
-
-
-def _with_value(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Return the (item, value) rows whose value is not empty."""
-    return [(item, value) for item, value in rows if value.strip()]
+    return item_table(rows, **WORDS.words("tables", "run"))
 
 
 class _Monitor(NamedTuple):
@@ -271,25 +241,8 @@ def _monitor_rows(run: Run) -> list[tuple[str, str]]:
     return rows
 
 
-def add_provenance_table(page: Page, run: Run) -> None:
-    """Add the table of software versions and of hashes of sources and inputs."""
-    provenance = run.config.get("provenance", {})
-    rows = [
-        ("software", _sorted_pairs(provenance.get("versions", {}))),
-        ("plug-ins", _sorted_pairs(provenance.get("plug_ins", {}))),
-        ("sources", _sorted_hashes(provenance.get("source_hashes", {}))),
-        ("inputs", _sorted_hashes(provenance.get("input_hashes", {}))),
-        ("inputs", _sorted_hashes(run.config.get("inputs", {}))),
-    ]
-    columns = [PageColumn("item"), PageColumn("value")]
-    _add_table(page, "provenance", columns, _with_value(rows))
-
-
-def _sorted_pairs(values: Mapping[str, str]) -> str:
-    """Return names with their values, sorted by name, as one text."""
-    return ", ".join(f"{name} {value}" for name, value in sorted(values.items()))
-
-
-def _sorted_hashes(hashes: Mapping[str, str]) -> str:
-    """Return names with the first digits of their hashes, sorted by name, as one text."""
-    return _sorted_pairs({name: value[:_HASH_DIGITS] for name, value in hashes.items()})
+def provenance_table(run: Run) -> Table:
+    """Return the table of software versions and of hashes of sources and inputs."""
+    items = provenance_items(run.config.get("provenance", {}))
+    items += provenance_items({"input_hashes": run.config.get("inputs", {})})
+    return item_table(items, **WORDS.words("tables", "provenance"))

@@ -17,12 +17,13 @@ from discrepancy.judgement.moved_unknowns import (
 )
 from discrepancy.judgement.sensor_estimates import sensor_estimates
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.page import render_report, verdict_card
+from discrepancy.report.page import verdict_card, verdict_page
 from discrepancy.report.printed import verdict_lines
 from discrepancy.report.sensor_table import printed_sensor_table
 from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
-from reporting.page import Table
+from reporting.page import render_page
+from reporting.table import Table
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import ORIGIN, chosen, simulated
 
@@ -108,7 +109,7 @@ def gains_of(verdict):
 
 def printed_gain(content, channel):
     """Return the row of a gain in the printed table."""
-    (table,) = [item for item in verdict_lines(content) if isinstance(item, Table)]
+    (table,) = [item for item in verdict_lines(content) if isinstance(item, Table) and item.rows]
     (row,) = [row for row in table.rows if list(row[:2]) == [channel, "gain error"]]
     return row
 
@@ -137,7 +138,7 @@ def test_fitted_gains_are_in_the_file(wide_gain, tmp_path):
 
 def test_a_fitted_gain_is_on_the_page(wide_gain):
     content = ReportInput(wide_gain, ORIGIN)
-    page = render_report(content, {}, {})
+    page = render_page(verdict_page(content, {}))
     assert "Gains and zeros of the channels" in page
     assert printed_gain(content, "g2")[2] in page
 

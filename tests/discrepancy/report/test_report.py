@@ -37,7 +37,7 @@ from discrepancy.report.decidability_text import (
     group_lines,
 )
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import missing_effects_text, render_report, verdict_card
+from discrepancy.report.page import missing_effects_text, verdict_card, verdict_page
 from discrepancy.report.printed import check_lines
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.sizes import si_sizes
@@ -51,8 +51,9 @@ from fe.runtime import patch as patches
 from fe.runtime.patch import PowerDamping, SensorDrift
 from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
-from reporting.figures import to_svg
+from reporting.figures import page_figure
 from reporting.operating_system import lock_folder
+from reporting.page import render_page
 from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import FEW, INPUTS, ORIGIN, drag_found, model_of
@@ -99,7 +100,7 @@ def test_the_file_of_a_verdict_states_the_record_of_the_errors(drag, tmp_path):
 def page_of(investigation, **verdict):
     """Return the page of an investigation without its figures, its verdict changed, as a browser shows it."""
     changed = replace(investigation, verdict=replace(investigation.verdict, **verdict))
-    page = render_report(ReportInput(changed, ORIGIN), {}, {})
+    page = render_page(verdict_page(ReportInput(changed, ORIGIN), {}))
     return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
 
 
@@ -113,10 +114,9 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag, 
     """Without intervals the size is told by its parameters."""
     closed, force = percent_with_interval(drag.proof.closed), drag.verdict.force
     opening = (
-        f">Quadratic aerodynamic damping at {force.port}<",
-        f">{number(force.rms)} N<",
+        f">Quadratic aerodynamic damping at {force.port} is missing; {number(force.rms)} N (rms)",
+        f"probability {probability_text(drag.verdict.probability)}.<",
         f">{closed}<",
-        f">{probability_text(drag.verdict.probability)}<",
         f">{headline(drag.verdict)}<",
         "Its size: ",
         f"It explains {closed} of the mean square error in ",
@@ -130,9 +130,9 @@ def test_the_card_of_a_verdict_says_what_is_missing_where_how_large_and_how_sure
     force, probability = drag.verdict.force, probability_text(drag.verdict.probability)
     missing = f"Quadratic aerodynamic damping at {force.port} is missing"
     card = f"{missing}; {number(force.rms)} N (rms) at {force.port}"
-    first_of_table = page.index(f">Quadratic aerodynamic damping at {force.port}<")
+    places = [page.index(mark) for mark in ('class="card"', 'class="highlights"', "<details>", "<table")]
     assert f'class="card">{card}; probability {probability}.<' in page
-    assert page.index('class="card"') < page.index("<details>") < first_of_table
+    assert places == sorted(places)
 
 
 def test_a_verdict_has_the_scores_of_its_held_out_trials(drag, page):
@@ -276,7 +276,7 @@ def needs(drag, able):
 
 
 def test_detectable_sizes_are_listed_of_effects_that_the_campaign_can_test(able):
-    rows = {row[0].replace(" ", "_"): row for row in detectable_sizes_table(able).table.rows}
+    rows = {row[0].replace(" ", "_"): row for row in detectable_sizes_table(able).rows}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
 
@@ -582,7 +582,7 @@ def test_the_page_of_a_verdict_contains_all_that_it_shows(folder_of_drag, page_o
 
 
 @pytest.mark.parametrize(
-    "title", ["Verdict", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"]
+    "title", ["Effects", "Where the gap is", "Proof on held-out trials", "What this campaign can decide"]
 )
 def test_the_page_of_a_verdict_has_its_sections(page_of_drag, title):
     assert f">{title}<" in page_of_drag
@@ -618,7 +618,7 @@ def test_the_report_of_a_verdict_repeats_to_the_bit(drag, able, folder_of_drag, 
     patch = read_patch(folder_of_drag / "patch.json")
     content = ReportInput(drag, ORIGIN, able, intervals=[effect.intervals for effect in patch.effects])
     figures = report_figures(content)
-    drawings = {name: to_svg(figure.figure) for name, figure in figures.items()}
+    drawn = {name: page_figure(figure) for name, figure in figures.items()}
     held_out = listing(trial.name for trial in drag.campaign.held_out)
     assert f"Held out: {held_out};" in figures["residual_table"].caption
-    assert render_report(content, drawings, figures) == page_of_drag
+    assert render_page(verdict_page(content, drawn)) == page_of_drag

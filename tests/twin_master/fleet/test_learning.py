@@ -12,6 +12,7 @@ import pytest
 from scipy.special import expit, logit
 from scipy.stats import beta, betabinom, norm, t
 
+from reporting.page import render_page
 from reporting.progress import Progress
 from tests.refusals import refused
 from tests.twin_master.network.decision_oracles import precise_forward_backward
@@ -612,10 +613,11 @@ def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
     worst_off = grown_group.plan.members[int(np.argmax(grown_group.loss))].name
     opening = (
         f"60 of 60 assets have flown. In {len(delays)} assets the damage called for another control; the "
-        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%. The asset "
-        f"with the most damage is {worst_off} of growing_damage: "
+        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%.</p>"
     )
-    for words in (opening, "60 assets in 1 group", "The assets by health", "Assets that need attention next"):
+    worst = f"<p>The asset with the most damage is {worst_off} of growing_damage: "
+    map_title = "The assets of group growing_damage by health"
+    for words in (opening, worst, "60 assets in 1 group", map_title, "Assets that need attention next"):
         assert words in text
 
 
@@ -653,7 +655,7 @@ def test_the_figures_of_a_large_fleet_show_some_of_its_assets_and_say_so(grown_g
     overview = overview_of_group(grown_group.folder, record, grown_group.store, 5)
     expected = grown_group.store["filtered/mean"].values[::3]
     np.testing.assert_array_equal(np.concatenate(overview.drawn.mean), expected)
-    assert "Of 60 assets, one in 3 is drawn." in fleet_page(grown_group.folder, 5)
+    assert "Of 60 assets, one in 3 is drawn." in render_page(fleet_page(grown_group.folder, 5))
 
 
 def test_a_policy_of_one_control_is_never_left_or_at_once(grown_group):
@@ -695,7 +697,7 @@ def test_the_report_names_who_needs_attention(grown_group):
     ]
     percentage = np.rint(100.0 * np.maximum(leaving, 0.0))
     order = np.lexsort((-grown_group.loss, -percentage, -alarms))
-    page = fleet_page(grown_group.folder, ATTENTION_ROWS)
+    page = render_page(fleet_page(grown_group.folder, ATTENTION_ROWS))
     table = page.partition("Assets that need attention next")[2]
     assert max(leaving) > min(leaving) + 0.1
     assert len(set(percentage)) < len(set(leaving))

@@ -14,11 +14,11 @@ from scipy.stats import invgamma
 from scenarios import scenario_files
 from tests.command_line import said
 from tests.refusals import Inputs
+from tests.twin_master.report.conftest import page_of
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.command import printed_value
 from twin_master.errors import TwinMasterError
 from twin_master.report.learnt import sensor_rows
-from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.tables import Noticing
@@ -227,8 +227,7 @@ def test_the_report_lists_what_was_learnt_of_each_gauge(report_of_run):
 
 @pytest.fixture(scope="module")
 def page(report_of_run: Any, drawn: dict[str, Any]) -> str:
-    drawing = b'<svg viewBox="0 0 1 1"></svg>'
-    return render_page(report_of_run, dict.fromkeys(drawn, drawing), drawn)
+    return page_of(report_of_run, *drawn)
 
 
 def test_the_report_lists_what_was_learnt_of_parameter_and_transitions(page):
@@ -499,7 +498,7 @@ def test_the_journal_has_the_probability_of_each_hypothesis(noticed):
 
 
 def test_the_report_says_what_was_noticed(noticed):
-    report = render_page(read_run(noticed.folder), {}, {})
+    report = page_of(read_run(noticed.folder))
     assert "gauge 5 shows too much" in report
     assert f"what decides its control is: {noticed.figures['decided_by']}" in report
     assert "gauge 12 shows 1e+14 microstrain" in report

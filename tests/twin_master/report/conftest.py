@@ -11,7 +11,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reporting.page import ReportFigure
+from reporting import figures
+from reporting.page import PageFigure, ReportFigure, render_page
 from tests.twin_master.runs import changed_scenario
 from twin_master.report import page as report
 from twin_master.report.reading import Run, read_run
@@ -93,8 +94,15 @@ def figures_of_unwritten(run: Run, now: int) -> dict[str, ReportFigure]:
         return {figure.name: figure for figure in report.report_figures(Path("unwritten"), now)}
 
 
+def page_of(run: Run, *figures: str) -> str:
+    """Return the page of a run as HTML; the named figures are empty drawings."""
+    drawing = b'<svg viewBox="0 0 1 1"></svg>'
+    drawn = {name: PageFigure(name, drawing, name, "") for name in figures}
+    return render_page(report.run_page(run, drawn))
+
+
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make figures and page, but do not render the figures, which takes most of the time."""
-    monkeypatch.setattr(report, "to_svg", lambda figure: b'<svg viewBox="0 0 1 1"></svg>')
-    monkeypatch.setattr(report, "to_png", lambda figure: b"")
+    monkeypatch.setattr(figures, "to_svg", lambda figure: b'<svg viewBox="0 0 1 1"></svg>')
+    monkeypatch.setattr(figures, "to_png", lambda figure: b"")

@@ -18,7 +18,15 @@ from calibration.result.file import run_record
 from reporting.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs, refused
-from tests.twin_master.report.conftest import altered, figures_of_unwritten, flown, line, panel, rescripted
+from tests.twin_master.report.conftest import (
+    altered,
+    figures_of_unwritten,
+    flown,
+    line,
+    page_of,
+    panel,
+    rescripted,
+)
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
 from twin_master.report.calibration import true_value
@@ -32,7 +40,6 @@ from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import LearntQuantity
 
 INPUTS = Inputs(__file__)
-DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 
 # ------------------------------------------------------------------------- the sentences at its head
@@ -58,8 +65,10 @@ def test_a_policy_of_both_regions_left_a_control(run):
 
 
 def test_the_page_has_its_opening_sentences(run):
-    page = html.unescape(report.render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
-    assert " ".join(opening_sentences(run)) in " ".join(page.split())
+    page = html.unescape(page_of(run)).replace("\N{NO-BREAK SPACE}", " ")
+    decided, *others = opening_sentences(run)
+    assert f'<p class="card">{decided}</p>' in page
+    assert " ".join(others) in " ".join(page.split())
 
 
 def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | None) -> str:
@@ -161,16 +170,16 @@ def test_smoothing_up_to_a_step_equals_a_mission_that_ended_there(run, library_f
 
 def test_references_have_a_column_where_there_are_any(run):
     without = [figure | {"reference": None} for figure in run.summary["figures"]]
-    page = report.render_page(run, {}, {})
-    page_without = report.render_page(replace(run, summary={**run.summary, "figures": without}), {}, {})
+    page = page_of(run)
+    page_without = page_of(replace(run, summary={**run.summary, "figures": without}))
     assert "source of the reference" in page
     assert "reference</th>" not in page_without
 
 
 def test_an_asset_that_differs_from_the_model_is_told(run):
     origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
-    page = report.render_page(run, {}, {})
-    page_of_other = report.render_page(replace(run, summary={**run.summary, **origin}), {}, {})
+    page = page_of(run)
+    page_of_other = page_of(replace(run, summary={**run.summary, **origin}))
     sentence = "differ: the asset was the strain library, and the twin believes the reduced model."
     assert "model differ" not in page
     assert sentence in page_of_other
@@ -259,7 +268,7 @@ def run_of_lost_gauges(run: Run) -> Run:
 
 
 def test_lost_gauges_are_told(run_of_lost_gauges):
-    page = report.render_page(run_of_lost_gauges, {}, {})
+    page = page_of(run_of_lost_gauges)
     ranges = "gauges 17, 18, 19, 20 at steps 12–18; all gauges at steps 3–4"
     assert lost_ranges(run_of_lost_gauges) == ranges
     assert "the belief followed the dynamics alone" in page
@@ -302,8 +311,7 @@ def test_a_calibrated_wing_flies_at_the_mean(run_of_calibrated_wing, wing):
 
 
 def test_a_calibration_file_shows_its_wing(run_of_calibrated_wing, wing):
-    figures = {"calibration": ReportFigure("calibration", None, "", "")}
-    page = report.render_page(run_of_calibrated_wing, {"calibration": DRAWING}, figures)
+    page = page_of(run_of_calibrated_wing, "calibration")
     without_headings = re.sub(' data-of="[^"]*"', "", page)  # those for narrow screens
     mean, deviation = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
     assert "The calibrated wing: Wing 7 (é)" in page
@@ -313,7 +321,7 @@ def test_a_calibration_file_shows_its_wing(run_of_calibrated_wing, wing):
 
 def test_a_wing_that_flies_beside_its_calibration_is_told(run_of_calibrated_wing, wing):
     other = rescripted(run_of_calibrated_wing, asset={"parameters": {"young_modulus_factor": 1.0}})
-    page = " ".join(report.render_page(other, {}, {}).split())
+    page = " ".join(page_of(other).split())
     mean, deviation = (
         wing.mean("young_modulus_factor"),
         wing.standard_deviation("young_modulus_factor"),
@@ -409,7 +417,6 @@ def test_a_present_outside_the_last_steps_is_refused(last_steps, hold, tmp_path,
 
 @pytest.mark.usefixtures("no_drawing")
 def test_the_page_of_a_watch_leaves_out_what_nobody_knows(last_steps, figures_of_last_steps):
-    drawings = dict.fromkeys(figures_of_last_steps, DRAWING)
-    page = report.render_page(last_steps, drawings, figures_of_last_steps)
+    page = page_of(last_steps, *figures_of_last_steps)
     assert page.count("<figure") == 6
     assert "truth" not in page.replace("the truth, which", "")

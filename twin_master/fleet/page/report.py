@@ -8,15 +8,27 @@ most, and the tables have few rows.
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.figures import page_figure
 from reporting.files import atomic_write_text
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.page import Page, PageColumn, Words, number_column
-from reporting.words import counted, in_one_line
+from reporting.page import (
+    Block,
+    Highlights,
+    Notice,
+    Page,
+    PageFigure,
+    Section,
+    render_page,
+)
+from reporting.page_words import Words
+from reporting.table import PageColumn, Table, number_column
+from reporting.words import counted
 from twin_master.errors import FleetError
 from twin_master.fleet.comparison import group_statistics, returns_of_group, statistic_rows
 from twin_master.fleet.configuration import KIND, REPORT_NAME, WATCHED_KIND, fleet_config
@@ -63,11 +75,12 @@ def write_fleet_report(folder: Path | str) -> Path:
         If the disk is full or the folder cannot be written.
     """
     folder = Path(folder)
-    return atomic_write_text(folder / REPORT_NAME, fleet_page(folder, ATTENTION_ROWS))
+    page = fleet_page(folder, ATTENTION_ROWS)
+    return atomic_write_text(folder / REPORT_NAME, render_page(page))
 
 
-def fleet_page(folder: Path, most_assets: int) -> str:
-    """Return the report of a fleet, flown or watched, as HTML.
+def fleet_page(folder: Path, most_assets: int) -> Page:
+    """Return the page of a fleet, flown or watched.
 
     Parameters
     ----------
@@ -86,16 +99,11 @@ def fleet_page(folder: Path, most_assets: int) -> str:
     config = fleet_config(folder, KIND, WATCHED_KIND)
     is_watched = config["kind"] == WATCHED_KIND
     fleet = config["fleet"]
-    groups = fleet["groups"]
-    page = Page(fleet["title"] or fleet["name"], _subtitle(fleet, is_watched=is_watched))
-    page.add_section("The fleet")
+    add_content = _watched_fleet_page if is_watched else _flown_fleet_page
     before = f"{folder} is damaged or of another version ("
     with FleetError.instead_of(KeyError, TypeError, AttributeError, before=before, after=")."):
-        if is_watched:
-            _add_watched_fleet(page, folder, groups, most_assets)
-        else:
-            _add_flown_fleet(page, folder, groups, most_assets)
-    return page.render()
+        page = Page(fleet["title"] or fleet["name"], _subtitle(fleet, is_watched=is_watched))
+        return add_content(page, folder, fleet["groups"], most_assets)
 
 
 def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
@@ -107,70 +115,102 @@ def _subtitle(fleet: JsonRecord, *, is_watched: bool) -> str:
     return f"{counted(asset_count, 'asset')} in {group_count}, seed {fleet['seed']}, flown"
 
 
-def _add_flown_fleet(
+def _flown_fleet_page(
     page: Page, folder: Path, records: Sequence[JsonObject], most_assets: int
-) -> None:
-    """Add the sections of a flown fleet, given the records of its groups in `config.json`."""
+) -> Page:
+    """Return the page of a flown fleet, given the records of its groups in `config.json`."""
     groups = open_groups(folder)
     overviews = [
         overview_of_group(folder, record, groups[record["name"]], most_assets) for record in records
     ]
-    page.add_paragraph(_opening(overviews))
     asset_count = sum(overview.twin_count for overview in overviews)
     failures, _ = endings_of(folder)
-    if failures:
-        page.add_notice(
-            f"{len(failures)} of {asset_count} assets failed in flight; their twins end there."
-        )
-    _add_failures(page, failures, "fleet.json lists all of them once the fleet has flown.")
     ended_early = sum(overview.ended_count for overview in overviews)
-    if ended_early:
-        page.add_notice(
-            f"{ended_early} of {asset_count} assets ended their simulation before the mission "
-            "was over; what they have flown counts."
-        )
-    for overview in overviews:
-        _add_flown_group(page, overview)
-    page.add_section("Results of the twins")
-    returns = {name: returns_of_group(group) for name, group in groups.items()}
-    if any(len(values) for values in returns.values()):
-        page.add_report_figure(WORDS.figure("returns", returns_figure(returns)))
-    statistics = {name: group_statistics(group) for name, group in groups.items()}
-    WORDS.add_table(
-        page,
-        "fared",
-        statistic_rows(statistics),
-        more=[number_column(group) for group in statistics],
-    )
-    _add_lessons(page, folder)
-
-
-def _add_flown_group(page: Page, overview: GroupOverview) -> None:
-    """Add the section of a group of a flown fleet."""
-    page.add_section(f"Group {overview.record['name']}")
-    if overview.leaving_unknown_because:
-        page.add_paragraph(
-            in_one_line(
-                "It is not known which assets will soon change their control: "
-                f"{overview.leaving_unknown_because}"
+    notices: list[Block] = []
+    if failures:
+        notices.append(
+            Notice(
+                f"{len(failures)} of {asset_count} assets failed in flight; their twins end there."
             )
+        )
+    if ended_early:
+        notices.append(
+            Notice(
+                f"{ended_early} of {asset_count} assets ended their simulation before the mission "
+                "was over; what they have flown counts."
+            )
+        )
+    returns = {name: returns_of_group(group) for name, group in groups.items()}
+    returns_picture = None
+    if any(len(values) for values in returns.values()):
+        returns_picture = page_figure(WORDS.figure("returns", returns_figure(returns)))
+    statistics = {name: group_statistics(group) for name, group in groups.items()}
+    columns = [number_column(group) for group in statistics]
+    results = [returns_picture, WORDS.table("fared", statistic_rows(statistics), columns)]
+    failure_table = _failure_table(
+        failures, "fleet.json lists all of them once the fleet has flown."
+    )
+    sentences = _opening_sentences(overviews)
+    picture, sections = _first_map([_flown_group_section(overview) for overview in overviews])
+    return replace(
+        page,
+        sentence=" ".join(sentences[:2]),
+        picture=picture,
+        outcome=[*notices, " ".join(sentences[2:])],
+        sections=[
+            *sections,
+            Section("Results of the twins", results),
+            Section("Failures", [failure_table]),
+            _lessons_section(folder),
+        ],
+    )
+
+
+def _first_map(sections: Sequence[Section]) -> tuple[PageFigure | None, list[Section]]:
+    """Take the map of the first group that has one out of its section, for the first screen."""
+    for number, section in enumerate(sections):
+        map_of_group, *others = section.blocks
+        if isinstance(map_of_group, PageFigure):
+            remaining = list(sections)
+            remaining[number] = Section(section.title, others)
+            return map_of_group, remaining
+    return None, list(sections)
+
+
+def _flown_group_section(overview: GroupOverview) -> Section:
+    """Return the section of a group of a flown fleet; its map is the first block."""
+    reason = ""
+    if overview.leaving_unknown_because:
+        reason = (
+            "It is not known which assets will soon change their control: "
+            f"{overview.leaving_unknown_because}"
         )
     scenario = overview.urgent.scenario
     drawn = overview.drawn
     sample = ""
     if drawn.distance > 1:
         sample = f"Of {overview.twin_count} assets, one in {drawn.distance} is drawn."
-    _add_map(page, scenario, np.concatenate(drawn.last_mean), drawn.failed_count, sample)
     mean = np.concatenate(drawn.mean)
+    course = None
     if not np.isnan(mean).all():
         figure = course_figure(scenario, mean, np.concatenate(drawn.state))
-        page.add_report_figure(WORDS.figure("course", figure, more=sample))
-    has_alarms = overview.alarmed_count > 0
-    _add_attention_table(page, overview.urgent, overview.flown_count, has_alarms=has_alarms)
+        course = page_figure(WORDS.figure("course", figure, more=sample))
+    name = overview.record["name"]
+    return Section(
+        f"Group {name}",
+        [
+            _map(scenario, name, np.concatenate(drawn.last_mean), drawn.failed_count, sample),
+            reason,
+            course,
+            _attention(
+                overview.urgent, overview.flown_count, has_alarms=overview.alarmed_count > 0
+            ),
+        ],
+    )
 
 
-def _opening(overviews: Sequence[GroupOverview]) -> str:
-    """Return the opening sentences: on flights, alarms, fallbacks and the most severe damage."""
+def _opening_sentences(overviews: Sequence[GroupOverview]) -> list[str]:
+    """Return the sentences on flights, alarms, fallbacks and the most severe damage."""
     asset_count = sum(overview.twin_count for overview in overviews)
     flown_count = sum(overview.flown_count for overview in overviews)
     step_word = overviews[0].urgent.scenario.mission.step_name
@@ -180,7 +220,7 @@ def _opening(overviews: Sequence[GroupOverview]) -> str:
         _fallback_sentence(step_word, overviews),
         _damage_sentence(overviews),
     ]
-    return " ".join(sentence for sentence in sentences if sentence)
+    return [sentence for sentence in sentences if sentence]
 
 
 def _alarm_sentence(step_word: str, overviews: Sequence[GroupOverview]) -> str:
@@ -219,39 +259,49 @@ def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
     return f"The asset with the most damage is {name} of {worst.group}: {', '.join(states)}."
 
 
-def _add_watched_fleet(
+def _watched_fleet_page(
     page: Page, folder: Path, groups: Sequence[JsonObject], most_assets: int
-) -> None:
-    """Add the sections of a fleet that is watched, given the records of its groups."""
+) -> Page:
+    """Return the page of a fleet that is watched, given the records of its groups."""
     standing = read_standing(folder)
     assets = standing["assets"]
     failures = standing["failures"]
     decided = {name: asset for name, asset in assets.items() if asset["last"] is not None}
     counts = watched_fleet_counts(standing)
-    page.add_highlights([(str(count), title) for title, count in counts.items()])
+    asset_count = counted(len(assets | failures), "asset")
+    notices: list[Block] = []
     if failures:
-        asset_count = counted(len(assets | failures), "asset")
-        page.add_notice(f"{len(failures)} of {asset_count} are not watched.")
-    _add_failures(page, failures, "watched.json lists them.")
+        notices.append(Notice(f"{len(failures)} of {asset_count} are not watched."))
     without_step = sorted(assets.keys() - decided.keys() - failures.keys())
     if without_step:
         names = ", ".join(without_step[:most_assets])
         more = ", ..." if len(without_step) > most_assets else ""
         count = counted(len(without_step), "asset")
-        page.add_notice(f"Without a step yet: {count} ({names}{more}).")
-    _add_lessons(page, folder)
+        notices.append(Notice(f"Without a step yet: {count} ({names}{more})."))
+    group_sections = []
     for record in groups:
-        page.add_section(f"Group {record['name']}")
-        group_standing = states_of_watched_assets(record, decided)
-        _add_map(page, group_standing.scenario, group_standing.mean, failed=0)
-        urgent = group_standing.of_assets(group_standing.attention_order[:most_assets])
-        has_alarms = bool(group_standing.alarms.any())
-        known_count = len(group_standing.names)
-        _add_attention_table(page, urgent, known_count, has_alarms=has_alarms)
+        states = states_of_watched_assets(record, decided)
+        urgent = states.of_assets(states.attention_order[:most_assets])
+        attention = _attention(urgent, len(states.names), has_alarms=bool(states.alarms.any()))
+        name = record["name"]
+        blocks = [_map(states.scenario, name, states.mean, failed=0), attention]
+        group_sections.append(Section(f"Group {name}", blocks))
+    picture, sections = _first_map(group_sections)
+    return replace(
+        page,
+        sentence=f"{len(decided)} of {asset_count} have taken a step.",
+        picture=picture,
+        outcome=[Highlights([(str(count), title) for title, count in counts.items()]), *notices],
+        sections=[
+            Section("Failures", [_failure_table(failures, "watched.json lists them.")]),
+            *sections,
+            _lessons_section(folder),
+        ],
+    )
 
 
-def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None:
-    """Add a table of the errors that ended flights or watches, most frequent first.
+def _failure_table(failures: Mapping[str, str], caption: str) -> Table:
+    """Return a table of the errors that ended flights or watches, most frequent first.
 
     `failures` has the error of each asset, and the caption names the file with all of them.
     """
@@ -262,45 +312,45 @@ def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None
         if count > _FAILURE_EXAMPLES:
             examples += ", ..."
         rows.append([reason, str(count), examples])
-    WORDS.add_table(page, "failures", rows, caption=caption)
+    return WORDS.table("failures", rows, caption=caption)
 
 
-def _add_lessons(page: Page, folder: Path) -> None:
-    """Add a table of learnt and assumed values, if `fleet learn` has been run on the fleet."""
+def _lessons_section(folder: Path) -> Section:
+    """Return the learnt and the assumed values, if `fleet learn` has been run on the fleet."""
     path = folder / LESSONS_NAME
-    if path.is_file():
-        page.add_section("Learnt across the fleet")
-        WORDS.add_table(page, "lessons", lesson_rows(json.loads(path.read_text())))
+    rows = lesson_rows(json.loads(path.read_text())) if path.is_file() else []
+    return Section("Learnt across the fleet", [WORDS.table("lessons", rows)])
 
 
-def _add_map(page: Page, scenario: Scenario, mean: Float, failed: int, sample: str = "") -> None:
-    """Add the map of the states (B, F) of a group's assets, in SI units.
+def _map(
+    scenario: Scenario, group: str, mean: Float, failed: int, sample: str = ""
+) -> PageFigure | str:
+    """Return the map of the states (B, F) of a group's assets, in SI units.
 
     Assets that failed in flight are grey; `sample` says which assets are drawn if not all are.
     """
     if not len(mean):
-        page.add_paragraph("Nothing is known of its assets yet.")
-        return
+        return "Nothing is known of its assets yet."
     figure = map_figure(scenario, mean, failed)
     failed_sentence = f"Grey: {failed} that failed in flight." if failed else ""
     more = f"{failed_sentence} {sample}".strip()
-    page.add_report_figure(WORDS.figure("map", figure, more=more))
+    return page_figure(WORDS.figure("map", figure, group=group, more=more))
 
 
-def _add_attention_table(
-    page: Page, urgent: AssetStates, asset_count: int, *, has_alarms: bool
-) -> None:
-    """Add the table of the assets that need attention first, of a number of known assets."""
+def _attention(urgent: AssetStates, asset_count: int, *, has_alarms: bool) -> Table | str:
+    """Return the table of the assets that need attention first, of a number of known assets.
+
+    If no asset needs attention, the result is a sentence that says so.
+    """
     if not urgent.names:
-        return
+        return ""
     urgent = urgent.of_assets(np.flatnonzero(urgent.needs_attention))
     mission = urgent.scenario.mission
     if not urgent.names:
-        page.add_paragraph(
+        return (
             "No asset raised an alarm, and none will probably change its control within "
             f"{mission.prediction_steps} {mission.step_name}s."
         )
-        return
     factors = printed_factors(urgent.scenario)
     columns = [number_column(factor.title, factor.unit) for factor in factors]
     columns += [PageColumn("control"), number_column("probability of a change of control", "%")]
@@ -320,11 +370,10 @@ def _add_attention_table(
         if has_alarms:
             row.append(str(urgent.alarms[number] or ""))
         rows.append(row)
-    WORDS.add_table(
-        page,
+    return WORDS.table(
         "next",
         rows,
-        more=columns,
+        columns,
         shown=len(rows),
         assets=counted(asset_count, "asset"),
         alarms="alarms, then by " if has_alarms else "",

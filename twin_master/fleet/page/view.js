@@ -1,6 +1,6 @@
 // Puts the page of the fleet in the place of the old one when it has changed, and stays where it was scrolled to.
 "use strict";
-let version = document.currentScript.dataset.version;
+let version = new URL(document.currentScript.src).searchParams.get("version");
 
 async function look() {
   try {

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from reporting.errors import ReportingError
+from reporting.page import render_page
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.configuration import KIND, WATCHED_KIND
 from twin_master.fleet.learning.lessons import LESSONS_NAME
@@ -66,8 +68,13 @@ class _CurrentPage:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._stamps = _file_stamps(folder)
-        self._html = fleet_page(folder, ATTENTION_ROWS)
         self._version = 0
+        self._html = self._render(self._version)
+
+    def _render(self, version: int) -> str:
+        """Render the page with a script that asks the server for newer versions."""
+        page = fleet_page(self._folder, ATTENTION_ROWS)
+        return render_page(replace(page, script=f"/view.js?version={version}"))
 
     def version(self) -> str:
         """Render the page again if the fleet's files have changed, and return its version number.
@@ -77,15 +84,15 @@ class _CurrentPage:
         with suppress(TwinMasterError, ReportingError, OSError, ValueError):
             stamps = _file_stamps(self._folder)
             if stamps != self._stamps:
-                self._html = fleet_page(self._folder, ATTENTION_ROWS)
+                self._html = self._render(self._version + 1)
                 self._stamps = stamps
                 self._version += 1
         return str(self._version)
 
     def html(self) -> str:
-        """Return the current page, with a script that asks the server for newer versions."""
-        script = f'<script src="/view.js" data-version="{self.version()}"></script>'
-        return self._html.replace("</body>", f"{script}</body>")
+        """Return the current page."""
+        self.version()
+        return self._html
 
 
 def _file_stamps(folder: Path) -> list[tuple[str, int, int]]:
