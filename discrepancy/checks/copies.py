@@ -19,7 +19,7 @@ _MOST_SHIFTED_SAMPLES = 2**14
 
 
 class _Copy(NamedTuple):
-    """A pair of channels of which one is a copy, and how, as a phrase for a message."""
+    """Two channels of which one is a copy of the other, with a phrase such as "times 1.5"."""
 
     original: str
     copy: str
@@ -29,24 +29,25 @@ class _Copy(NamedTuple):
 def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
     """Yield one fault for each pair of channels in which one channel is a copy of the other.
 
-    The fault names the first trial in which the copy shows, and counts the other trials.
+    Only dynamic trials are searched. The fault names the first trial in which the copy shows, and
+    says in how many others it does.
     """
     trials_of_pairs: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
     for trial in campaign.trials:
         if not trial.is_dynamic:
             continue
-        for original, copy, how in _copied_pairs(trial):
-            trials_of_pairs.setdefault((original, copy), []).append((trial, how))
+        for original, copy, relation in _copied_pairs(trial):
+            trials_of_pairs.setdefault((original, copy), []).append((trial, relation))
     for (original, copy), trials in trials_of_pairs.items():
-        trial, how = trials[0]
+        trial, relation = trials[0]
         further_trials = ""
         if len(trials) > 1:
             further_trials = f", and so in {len(trials) - 1} more of its trials"
         place = samples_text(campaign.channels[copy], trial)
         sentence = (
-            f"The channel {copy!r} is the channel {original!r} {how} in {place}{further_trials}: "
-            "two sensors never share their noise, so correct `column` or the table, or leave one "
-            "of them out."
+            f"The channel {copy!r} is the channel {original!r} {relation} in "
+            f"{place}{further_trials}: two sensors never share their noise, so correct `column` "
+            "or the table, or leave one of them out."
         )
         yield DataFault(FaultKind.COPIED, sentence, copy, trial.name)
 
@@ -56,39 +57,40 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
 
     Different sensors have independent noise, copies have the same. Sixth differences separate the
     noise from the motion. The shift in time between two channels is the lag of the largest
-    cross-correlation of their noise. Channels without noise are copies only if they are equal digit
-    for digit.
+    cross-correlation of their noise, which must be at least 0.5 in magnitude. Channels without
+    noise are copies only if they are equal digit for digit and move.
     """
     if len(trial.time) < LEAST_COPIED:
         return
-    noise = _noise_by_differences(trial.values[:_MOST_SHIFTED_SAMPLES])
+    noise = _noise_by_differences(trial.values[:_MOST_SHIFTED_SAMPLES])  # (samples, channels)
     power = np.sum(noise**2, axis=0)
     # Sixth differences of white noise have the lag-one correlation -6/7; those of a smooth motion
     # without noise have a correlation near 1.
     has_noise = np.sum(noise[1:] * noise[:-1], axis=0) < -0.5 * power
-    spectra = np.fft.rfft(noise, 2 * len(noise), axis=0)
-    changes = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
+    spectra = np.fft.rfft(noise, 2 * len(noise), axis=0)  # padded, so that it does not wrap around
+    change_counts = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
     for i, j in combinations(range(len(trial.channels)), 2):
-        how = ""
+        relation = ""
         if not (has_noise[i] and has_noise[j]):
-            moves = changes[i] >= 2 * LEAST_COPIED
+            moves = change_counts[i] >= 2 * LEAST_COPIED
             if moves and np.array_equal(trial.values[:, i], trial.values[:, j]):
-                how = "digit for digit"
+                relation = "digit for digit"
         else:
+            # cross-correlation at all lags, by the fast Fourier transform (Wiener-Khinchin)
             correlation = np.fft.irfft(spectra[:, j] * np.conj(spectra[:, i]))
             peak = int(np.argmax(np.abs(correlation)))
             if abs(correlation[peak]) >= 0.5 * np.sqrt(power[i] * power[j]):
                 # the second half of the inverse transform holds the negative lags
                 shift = peak if peak < len(noise) else peak - len(correlation)
-                how = _describe_copy(
+                relation = _describe_copy(
                     trial.values[:, i],
                     trial.values[:, j],
                     trial.used[:, i],
                     trial.used[:, j],
                     shift,
                 )
-        if how:
-            yield _Copy(trial.channels[i], trial.channels[j], how)
+        if relation:
+            yield _Copy(trial.channels[i], trial.channels[j], relation)
 
 
 def _noise_by_differences(values: FloatArray) -> FloatArray:
@@ -112,6 +114,8 @@ def _describe_copy(
 ) -> str:
     """Describe how one record is a copy of another: equal or scaled, and shifted in time.
 
+    A scaled copy leaves less than `COPIED_SHARE` of its noise unexplained (standard deviations).
+
     Parameters
     ----------
     original, copy : (N,) ndarrays
@@ -124,7 +128,8 @@ def _describe_copy(
     Returns
     -------
     str
-        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is not a copy.
+        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is not a copy, or
+        if too few samples or different readings overlap.
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)
@@ -137,7 +142,8 @@ def _describe_copy(
     y = copy[in_copy][both_used]
     if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
         return ""
-    # the robust estimate is zero if most readings repeat; 924 is explained in `estimate_roughness`
+    # The robust estimate is zero if most readings repeat. Sixth differences of white noise have 924
+    # times its variance, see `estimate_roughness`.
     noise = estimate_roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
     if noise == 0.0:
         return ""

@@ -75,10 +75,10 @@ class DataFault:
 
 
 def mark_accepted(faults: Iterable[DataFault], campaign: Campaign) -> tuple[DataFault, ...]:
-    """Return faults of the data, marked as accepted where the campaign's key `accept` says so.
+    """Return faults of the data, marked as accepted where a key `accept` of the campaign says so.
 
-    The sentence of an accepted fault says that it is accepted. That of any other fault that can be
-    accepted ends with the key that would do so.
+    The sentence of an accepted fault then begins with this. The sentence of a fatal fault that is
+    not accepted, but can be, ends with the key that would accept it.
     """
     marked = []
     for fault in faults:

@@ -39,21 +39,14 @@ class _FrequencyRange(NamedTuple):
 def frequency_faults(
     campaign: Campaign, model_name: str, model_frequency: float
 ) -> Iterator[DataFault]:
-    """Yield a fault if ring-downs oscillate far below or above the model's first frequency.
+    """Yield a fault if ring-downs oscillate far below or above the model's first frequency [Hz].
 
-    The frequency of a channel is that of the largest peak of its spectrum, if most of the power
-    lies there. Channels of one trial may show different modes: all of them must lie below the
-    model's first frequency, or all above it. Times in milliseconds look alike, and are left to the
-    check of the samples in a period.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    model_name : str
-        The name of the model, for the message.
-    model_frequency : float
-        The frequency of the model's first mode [Hz].
+    At most two faults are yielded: one for all trials that are too slow, and one for all that are
+    too fast, by more than `LARGEST_FREQUENCY_RATIO`. The frequency of a channel is that of the
+    largest peak of its spectrum, if most of the power lies there. Channels of one trial may show
+    different modes: the one nearest to the model's frequency decides. Times that were written in
+    milliseconds look like a trial that is too slow; they are left to the check of the samples in a
+    period.
     """
     for is_model_high in (True, False):
         trials: list[str] = []
@@ -93,15 +86,15 @@ def _sentence(trials: list[str], frequency: float, model_name: str, model_freque
 
 def _may_be_milliseconds(ratio: float) -> bool:
     """Return whether times in milliseconds, read as seconds, explain a ratio of frequencies."""
-    doubt = ratio / _MILLISECONDS
-    return 1.0 / _LARGEST_DOUBT < doubt < _LARGEST_DOUBT
+    ratio_to_milliseconds = ratio / _MILLISECONDS
+    return 1.0 / _LARGEST_DOUBT < ratio_to_milliseconds < _LARGEST_DOUBT
 
 
 def _frequency_range(trial: Trial) -> _FrequencyRange | None:
-    """Return the frequencies at which the channels of a free vibration oscillate.
+    """Return the lowest and the highest frequency of the channels of a free vibration.
 
-    None if the trial is neither a ring-down nor driven by nothing, or if no channel oscillates
-    clearly.
+    A driven trial without inputs is a free vibration, too. The result is None for other trials, or
+    if no channel oscillates clearly.
     """
     is_free = trial.kind is TrialKind.DRIVEN and not trial.inputs
     if trial.kind is not TrialKind.RINGDOWN and not is_free:
@@ -120,10 +113,10 @@ def _frequency_range(trial: Trial) -> _FrequencyRange | None:
 
 
 def dominant_frequency(time: FloatArray, values: FloatArray) -> float | None:
-    """Return the frequency [Hz] at which a record oscillates.
+    """Return the frequency [Hz] at which a record oscillates; None if it does not clearly.
 
-    It is the peak of the periodogram with a Hann window. None if less than half of the power lies
-    around the peak, or if the record has fewer than three periods, or four samples in a period.
+    It is the peak of the periodogram with a Hann window. At least half of the power must lie around
+    the peak, and the record must have three periods, with four samples in each.
 
     Parameters
     ----------
@@ -150,7 +143,7 @@ def dominant_frequency(time: FloatArray, values: FloatArray) -> float | None:
     is_resolved = duration * frequency >= _LEAST_PERIODS and samples_per_period >= _LEAST_SAMPLES
     if total_power == 0.0 or not is_resolved:
         return None
-    # a main lobe of the Hann window is two periods of the record wide on either side
+    # the main lobe of the Hann window reaches 2 / duration to either side
     half_width = max(_HALF_BAND * frequency, 2.0 / duration)
     is_near = np.abs(frequencies - frequency) <= half_width
     share = float(power[is_near].sum()) / total_power

@@ -78,13 +78,14 @@ def stuck_sensor_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]
     """Yield a fault for each span of a dynamic trial in which a sensor or its logger was stuck.
 
     `stuck_spans` distinguishes such a span of equal readings from a true standstill of the
-    structure and from a coarse digital converter.
+    structure and from a coarse digital converter. For this it compares the channel with all other
+    channels and inputs of the trial.
     """
     series = [trial.values]
     series += [recorded_input.values[:, np.newaxis] for recorded_input in trial.inputs]
     if trial.kind is TrialKind.FORCED:
         series.append(trial.force[:, np.newaxis])
-    recorded_values = np.concatenate(series, axis=1)
+    recorded_values = np.concatenate(series, axis=1)  # (N, channels and then inputs)
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
         spans = stuck_spans(
@@ -112,7 +113,7 @@ class _RunsOfRecord(NamedTuple):
     changes : (N + 1,) ndarray
         Absolute change into each sample; the last entry is zero.
     quantum : float
-        The least difference between two values of the record, which is its last digit.
+        The least difference between two readings of the sensor, such as its last digit.
     bounds : (R, 2) ndarray of int
         The first sample of each run, and the one after its last.
     lengths : (R,) ndarray of int
@@ -131,12 +132,14 @@ def stuck_spans(
 ) -> list[tuple[int, int]]:
     """Return the runs of equal readings that show a failure of a sensor or logger.
 
-    A digit is the quantum of the readings here. The rules are:
+    A quantum is the least difference between two readings. Runs of fewer than `LEAST_RUN_LENGTH`
+    readings, and those at the largest or smallest reading (which are clipped), are not judged. The
+    rules for the others are:
 
-    - If the noise exceeds two digits, it makes readings differ even at rest. Any run longer than
+    - If the noise exceeds two quanta, it makes readings differ even at rest. Any run of at least
       four updates of the sensor (which may be slower than its logger) is then a failure.
     - Otherwise a run may be a true standstill. A structure slows down before it stands still, so
-      that the readings change by single digits just before and after the run. The run is a failure
+      that the readings change by single quanta just before and after the run. The run is a failure
       if the readings jump on both sides of it. If they jump on one side only, it is a failure if
       another record moves during the run and no other run is of comparable length.
     - A run is not a failure if the other records rest during it, if there is a second run at the
@@ -159,7 +162,8 @@ def stuck_spans(
     list of (int, int)
         The first sample of each run, and the one after its last.
     """
-    is_equal_to_next = (np.diff(values) == 0.0) & is_used[1:] & is_used[:-1]
+    is_equal_to_next = (np.diff(values) == 0.0) & is_used[1:] & is_used[:-1]  # (N - 1,)
+    # a run of k equal pairs has k + 1 readings
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     starts, stops = bounds_of_runs.T
     lengths = stops - starts
@@ -186,18 +190,11 @@ def stuck_spans(
 def _is_sensor_failure(
     start: int, stop: int, runs: _RunsOfRecord, other_records: FloatArray
 ) -> bool:
-    """Return whether a run in a record without much noise is a failure and not a rest.
+    """Return whether a run in a record without much noise is a failure and not a standstill.
 
-    `stuck_spans` states the rules.
-
-    Parameters
-    ----------
-    start, stop : int
-        The first sample of the run, and the one after its last.
-    runs : _RunsOfRecord
-        The record and all its runs.
-    other_records : (N, K) ndarray
-        The K other records of the same trial, for comparison.
+    The run goes from the sample `start` to the one before `stop`. `runs` holds the record and all
+    its runs, and `other_records` (N, K) the other channels and inputs. `stuck_spans` states the
+    rules.
     """
     length = stop - start
     least_jump = _LEAST_JUMP * runs.quantum
@@ -215,7 +212,7 @@ def _is_sensor_failure(
     )
     values_of_comparable = runs.values[run_starts[is_comparable]]
     is_dead_zone = np.count_nonzero(values_of_comparable == runs.values[start]) > 1
-    window_starts = [
+    window_starts = [  # of windows as long as the run, which fill the surroundings without it
         *range(start - length, begin_of_surroundings - 1, -length),
         *range(stop, end_of_surroundings - length + 1, length),
     ]
@@ -228,18 +225,18 @@ def _is_sensor_failure(
     ):
         return False
 
-    # does the record go in and out at speed?
+    # on how many sides of the run does the record jump?
     changes_around = np.r_[
         runs.changes[begin_of_surroundings : start + 1], runs.changes[stop:end_of_surroundings]
     ]
-    speed = max(least_jump, _LEAST_RELATIVE_JUMP * float(np.mean(changes_around)))
-    sides_at_speed = np.count_nonzero(runs.changes[[start, stop]] >= speed)
+    jump = max(least_jump, _LEAST_RELATIVE_JUMP * float(np.mean(changes_around)))
+    sides_with_jump = np.count_nonzero(runs.changes[[start, stop]] >= jump)
 
     movement = _other_movement(start, stop, window_starts, other_records)
-    if sides_at_speed == 2:
+    if sides_with_jump == 2:
         return not movement.another_rests
-    is_only_one = np.count_nonzero(is_comparable) == 1
-    return sides_at_speed == 1 and movement.another_moves and is_only_one
+    is_only_comparable_run = np.count_nonzero(is_comparable) == 1
+    return sides_with_jump == 1 and movement.another_moves and is_only_comparable_run
 
 
 class _OtherMovement(NamedTuple):
@@ -252,16 +249,11 @@ class _OtherMovement(NamedTuple):
 def _other_movement(
     start: int, stop: int, window_starts: Sequence[int], other_records: FloatArray
 ) -> _OtherMovement:
-    """Return whether other records move during a run, compared with windows around the run.
+    """Return whether other records (N, K) move during a run, compared with windows around the run.
 
-    Parameters
-    ----------
-    start, stop : int
-        The first sample of the run, and the one after its last.
-    window_starts : sequence of int
-        The first samples of the windows, which are as long as the run.
-    other_records : (N, K) ndarray
-        The K other records of the same trial, for comparison.
+    A record moves if its range within the run exceeds `_RANGE_OF_MOVING_RECORD` times its median
+    range within the windows, which are as long as the run and begin at `window_starts`. It rests if
+    its range is less than `_RANGE_OF_RESTING_RECORD` times that.
     """
     length = stop - start
     ranges = [
@@ -270,17 +262,18 @@ def _other_movement(
     ]
     usual_range = np.median(ranges, axis=0)
     range_in_run = np.ptp(other_records[start:stop], axis=0)
-    record_moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
-    another_moves = bool(np.any(record_moves))
-    record_rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
-    return _OtherMovement(another_moves, not another_moves and bool(np.any(record_rests)))
+    moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)  # (K,)
+    another_moves = bool(np.any(moves))
+    rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range  # (K,)
+    return _OtherMovement(another_moves, not another_moves and bool(np.any(rests)))
 
 
 def _quantum_in_time(values: FloatArray) -> float:
-    """Return the quantum of the readings (N,) of a record in time.
+    """Return the quantum of a record in time (N,): the least difference between two readings.
 
     Readings that rise steadily may differ by several quanta at every step. Their second differences
-    are then still as small as one quantum, and are tried as well.
+    are then still as small as one quantum. So the smaller of both is returned, unless the readings
+    show the output levels of the sensor (`lattice_step`).
     """
     step_between_levels = lattice_step(values)
     if step_between_levels is not None:

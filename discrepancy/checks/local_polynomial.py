@@ -13,20 +13,20 @@ from discrepancy.campaign.sampling import is_even
 LOW_DEGREE = 5
 """Lowest degree of the local polynomials, and the only degree for unevenly spaced samples."""
 Weights = Callable[[int, int], FloatArray]
-"""Function from half width and degree of a local polynomial to the weights of its residual.
+"""Function that returns the weights of a residual for a half width and degree of the polynomial.
 
-The weights are (2 width + 1,) for evenly spaced samples, the same for all of them, and
-(N - 2 width, 2 width + 1) for unevenly spaced ones."""
+The residual of a sample is the weighted sum of the sample and its neighbours. Evenly spaced samples
+have the same weights (2 width + 1,), unevenly spaced ones a row each (N - 2 width, 2 width + 1)."""
 
 
 @lru_cache(maxsize=32)
 def event_patterns(width: int, degree: int) -> FloatArray:
-    """Return the residuals that typical signals leave after the local polynomial is subtracted.
+    """Return the residuals that a local polynomial leaves of four typical signals.
 
     Parameters
     ----------
     width, degree : int
-        The half width of the neighbourhood in samples, and degree of the polynomial.
+        The half width of the neighbourhood in samples, and the degree of the polynomial.
 
     Returns
     -------
@@ -96,11 +96,11 @@ class LocalPolynomial:
 
 @lru_cache(maxsize=32)
 def even_weights(width: int, degree: int) -> FloatArray:
-    """Return the weights (2 width + 1,) that give a sample's residual from its neighbourhood.
+    """Return the weights (2 width + 1,) of a sample's neighbourhood in the residual of the sample.
 
     The residual is the sample minus a polynomial of least squares through its neighbours, without
-    the sample itself. It equals the residual of the Savitzky-Golay filter, which includes the
-    sample, divided by the weight of the sample in that residual (one minus its leverage).
+    the sample itself. It equals the residual of the Savitzky-Golay filter, whose polynomial also
+    fits the sample, divided by the weight of the sample in that residual (one minus its leverage).
     """
     weights = -savgol_coeffs(2 * width + 1, degree)
     weights[width] += 1.0
@@ -108,7 +108,10 @@ def even_weights(width: int, degree: int) -> FloatArray:
 
 
 def weights_for_times(time: FloatArray) -> Weights:
-    """Return the function of weights for records at times (N,); it caches what it has computed."""
+    """Return the function of weights for records at times (N,); it keeps what it has computed.
+
+    For evenly spaced times it is `even_weights`.
+    """
     return even_weights if is_even(time) else cache(partial(uneven_weights, time))
 
 
@@ -130,10 +133,12 @@ def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
     (N - 2 width, 2 width + 1) ndarray
         The weights of each sample that has all its neighbours.
     """
+    # times of each neighbourhood, from -1 to 1 about the sample itself (samples, 2 width + 1)
     inner_times = time[width : len(time) - width, np.newaxis]
     relative_times = sliding_window_view(time, 2 * width + 1) - inner_times
     relative_times /= np.max(np.abs(relative_times), axis=1, keepdims=True)
     times_of_neighbours = np.delete(relative_times, width, axis=1)
+    # least squares by the normal equations; basis (samples, 2 width, degree + 1)
     basis = np.polynomial.polynomial.polyvander(times_of_neighbours, degree)
     # a ridge, because next to a wide gap the samples may not determine the whole polynomial
     ridge = 1e-10 * np.eye(degree + 1)

@@ -37,14 +37,14 @@ LARGEST_DEVIATION_RATIO = 0.9
 
 
 def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, float]:
-    """Return how much the records determine each calibrated parameter.
+    """Return the posterior over the prior standard deviation of each calibrated parameter.
 
-    The measure is the posterior standard deviation over the prior one, from the information matrix
-    of the fitted trials at the prior mean: 0 if a parameter is determined exactly, 1 if the records
-    do not depend on it. Gains, zeros, initial states, constants of inputs and all parameters are
-    unknown at the same time, so that a parameter counts as undetermined if others can explain the
-    same readings. Unknown initial states are fitted first, because a model at rest does not depend
-    on any parameter.
+    It is 0 if the records determine a parameter exactly, and 1 if they do not depend on it. The
+    posterior is that of the linearised model, from the information matrix of the fitted trials at
+    the prior mean. Gains, zeros, initial states, constants of inputs and all parameters are unknown
+    at the same time, so that a parameter counts as undetermined if others can explain the same
+    readings. Unknown initial states are fitted first, because a model at rest does not depend on
+    any parameter.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, flo
     at_prior = fit(problem, Candidate(), prior_point_with_initial_states(problem), iterations=0)
     information = normal_equations(problem, at_prior, Candidate(), channel_weights).matrix
     covariance = np.linalg.pinv(information, hermitian=True)
-    count = problem.shared.parameter_count
+    count = problem.shared.parameter_count  # parameters come first among the unknowns
     # the unknowns are scaled by their prior standard deviations, so that these are ratios already
     ratios = np.sqrt(np.diag(covariance)[:count])
     prior_deviations = problem.shared.scale[:count]
@@ -101,10 +101,12 @@ LEAST_REPORTED_CHANGE = 0.3
 def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ...]:
     """Return the faults of the data that a comparison with the model at its prior mean shows.
 
-    The scale is the ratio of data to prediction for each channel and trial. The checks are:
+    If a channel has no matching output of the model, only this is reported. The scale of a channel
+    in a trial is the ratio of data to prediction. The checks are:
 
     - Frequency: ring-downs oscillate more than four times slower or faster than the model's first
-      mode. The other checks are then left out, because they would only repeat it.
+      mode. Unless this is accepted, the other checks are left out, because they would only repeat
+      it.
     - Unit slip: two units of the channel's quantity differ by the scale in all its trials (within a
       factor of 3 for slips from 200 on, 2 from 20 on, 1.35 from 7 on, 1.1 below). If all channels
       of a trial have the same slip, the input of that trial has it.
@@ -114,14 +116,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     - Limits of what can be concluded: a noise record with a spectral line at the first mode, an
       input whose course between samples matters, and a parameter that the records do not determine.
 
-    Signals of unknown scale are not checked.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    model : Model
-        The model without a patch.
+    Signals of unknown scale have no scale to check. The model must have no patch.
     """
     missing_outputs = tuple(_output_faults(campaign, model))
     if missing_outputs:
@@ -141,11 +136,15 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
         conditions = prior_conditions(campaign, model, trial)
         predictions[trial.name] = observe(model, campaign, trial, ModelPatch(), conditions).values
     faults += _dead_faults(campaign, predictions)
-    scales = data_scales(campaign, predictions)
+    scales = data_scales(campaign, predictions)  # by channel and trial
     swaps = swapped_channels(campaign, predictions)
-    exchanged = {name for swap in swaps for name in swap}
+    swapped_names = {name for swap in swaps for name in swap}
     # what an exchange of channels explains is neither a unit slip nor a reversed sign
-    scales = {key: scale for key, scale in scales.items() if key[0] not in exchanged}
+    scales = {
+        (channel, trial): scale
+        for (channel, trial), scale in scales.items()
+        if channel not in swapped_names
+    }
     faults += unit_slips(campaign, scales)
     faults += _sign_faults(campaign, scales)
     for trial in campaign.trials:
@@ -182,16 +181,7 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     samples. For inputs without this key, the model's response to straight lines is compared with
     its response to smooth curves. The fault is reported if the two differ by more than
     `LEAST_REPORTED_CHANGE` times the noise (rms) in any channel with a noise record. It limits the
-    conclusions, but does not make the data wrong.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign, for channels and noise.
-    model : Model
-        The model without a patch.
-    trial : Trial
-        The trial; only forced and driven trials have such inputs.
+    conclusions, but does not make the data wrong. Only forced and driven trials have such inputs.
     """
     if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or len(trial.time) < 4:
         return
@@ -217,6 +207,7 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     response_to_curves = observe(model, campaign, smooth_trial, ModelPatch(), conditions).values
     # infinite without a noise record, so that the difference counts as zero
     noise = [trial.noise_deviation(campaign.channels[name]) or np.inf for name in trial.channels]
+    # (channels,), in standard deviations of the noise
     differences = np.sqrt(np.mean((response_to_lines - response_to_curves) ** 2, axis=0)) / noise
     largest = differences.max()
     if largest > LEAST_REPORTED_CHANGE:
@@ -257,15 +248,8 @@ def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     """Yield a fault for each record that is too short, or sampled too slowly, for the first mode.
 
-    A driven trial is long enough if the parameters are observable in it; see
-    `unobservable_parameter_faults`.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    frequency : float
-        The frequency of the first mode [Hz].
+    `frequency` is that of the first mode [Hz]. Driven trials are left out: they are long enough if
+    they determine the parameters; see `unobservable_parameter_faults`.
     """
     for trial in campaign.trials:
         if not trial.is_dynamic or trial.kind is TrialKind.DRIVEN:
@@ -286,22 +270,17 @@ def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
 def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> str:
     """Return the message that a trial has too few samples in a period of the first mode.
 
-    Parameters
-    ----------
-    trial : Trial
-        The trial with its readings, inputs and sample times.
-    frequency : float
-        The frequency of the first mode [Hz].
-    samples : float
-        The number of samples in a period.
+    `frequency` is that of the first mode [Hz], and `samples` the number of samples in its period.
+    If it is less than a tenth of what is needed, and enough if times are milliseconds, the message
+    says that they look like milliseconds.
     """
-    in_milliseconds = 1e3 * samples
-    if samples < LEAST_SAMPLES / 10.0 and in_milliseconds >= LEAST_SAMPLES:
+    samples_if_milliseconds = 1e3 * samples
+    if samples < LEAST_SAMPLES / 10.0 and samples_if_milliseconds >= LEAST_SAMPLES:
         return (
             f"The time of the trial {trial.name!r} looks like milliseconds: taken as seconds it "
             f"gives {samples:.2g} samples per period of the first mode ({frequency:.3g} Hz), as "
-            f"milliseconds {in_milliseconds:.3g}; write it in seconds, as `uav-twin discrepancy "
-            "import` does."
+            f"milliseconds {samples_if_milliseconds:.3g}; write it in seconds, as `uav-twin "
+            "discrepancy import` does."
         )
     return (
         f"The trial {trial.name!r} has {samples:.2g} samples per period of the first mode "
@@ -310,18 +289,11 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
 
 
 def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> Iterator[DataFault]:
-    """Yield a fault for each channel with constant readings in a static trial that should change.
+    """Yield a fault for each channel that is constant in a trial at rest, but should change.
 
-    By the prediction they would change by more than `CLEAR_NOISE_DEVIATIONS` times the noise or the
-    sensor's quantum. `check_data` reports, without a model, the channels that are constant in a
-    dynamic trial or in all their trials.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    predictions : mapping of str to (N, C) ndarray
-        The predicted readings by the name of the trial.
+    Its prediction, (N, C) by the name of the trial, changes by more than `CLEAR_NOISE_DEVIATIONS`
+    times the noise or the sensor's quantum. `check_data` reports, without a model, the channels
+    that are constant in a dynamic trial or in all their trials.
     """
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
@@ -340,14 +312,8 @@ def _sign_faults(
 ) -> Iterator[DataFault]:
     """Yield a fault for each channel whose sign is opposite to the model's in all its trials.
 
-    If that holds for all of several channels, one fault reports the sign of the forces instead.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    scales : mapping of (str, str) to float
-        The signed ratio of data to prediction by channel and trial; see `data_scales`.
+    `scales` holds the signed ratio of data to prediction by channel and trial (`data_scales`). If
+    it is negative for all of several channels, one fault reports the sign of the forces instead.
     """
     dynamic_trials = {trial.name for trial in campaign.trials if trial.is_dynamic}
     channels_at_rest = {name for name, trial in scales if trial not in dynamic_trials}

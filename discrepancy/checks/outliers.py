@@ -71,7 +71,7 @@ def mark_outliers(campaign: Campaign) -> Campaign:
     if a parabola through the others scatters by less than twice the noise and misses this row by
     more than eight standard deviations. Both rules need a noise record.
     """
-    is_used = {trial.name: trial.used.copy() for trial in campaign.trials}
+    is_used = {trial.name: trial.used.copy() for trial in campaign.trials}  # (N, C) by trial
     remarks = list(campaign.remarks)
     for trial, channel, is_outlier in find_outliers(campaign):
         count = int(is_outlier.sum())
@@ -95,11 +95,11 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     Yields
     ------
     trial : Trial
-        The trial with its readings, inputs and sample times.
+        A trial.
     channel : str
-        The name of the channel.
+        The name of one of its channels.
     is_outlier : (N,) ndarray of bool
-        Whether each reading of the channel is an outlier.
+        Whether each reading of this channel is an outlier; at least one is.
     """
     # all channels of a trial have its times
     weights = {
@@ -148,7 +148,7 @@ def sample_outliers(
         is_used = np.ones(count, dtype=bool)
     if count < 4 * _EDGE_SAMPLES + 4 or is_used.sum() < 0.5 * count or largest_reading == 0.0:
         return np.zeros(count, dtype=bool)
-    # scaled, so that squares of readings of any size stay in range
+    # the record (N,), scaled so that squares of readings of any size stay in range
     indices = np.arange(count)
     record = np.where(
         is_used,
@@ -156,15 +156,16 @@ def sample_outliers(
         np.interp(indices, indices[is_used], values[is_used] / largest_reading),
     )
     polynomial = _best_polynomial(record, weights or even_weights)
-    # Rounding to a quantum q has the standard deviation q / sqrt(12). A record at rest may show no
-    # rounding at all, so that this is the least scatter that residuals are compared with.
+    # Rounding to a quantum q has the standard deviation q / sqrt(12), and residuals that of this
+    # times the norm of their weights. A record at rest may show no rounding at all, so that this is
+    # the least scatter that residuals are compared with.
     weight_norm = float(np.linalg.norm(even_weights(polynomial.width, polynomial.degree)))
     rounding = quantum_of(values[is_used] / largest_reading) * 12.0**-0.5 * weight_norm
 
     # readings within the noise are not outliers
     noise_limit = OUTLIER_DEVIATIONS * noise / largest_reading
     is_suspect, cleaned_record = _find_suspects(record, polynomial, rounding, noise_limit)
-    # judge the suspects again, now with clean neighbours
+    # judge the suspects again: the residual of the original sample among clean neighbours
     residual = polynomial.residual(cleaned_record)
     weight_of_sample = polynomial.weight_of_sample(count)
     deviation = np.abs((record - cleaned_record) * weight_of_sample + residual)
@@ -179,7 +180,11 @@ def sample_outliers(
 
 
 def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
-    """Return the local polynomial that predicts the samples of a record (N,) best."""
+    """Return the local polynomial that predicts the samples of a record (N,) best.
+
+    It has the least robust scatter of residuals among `_WIDTHS_AND_DEGREES`, of which those are
+    tried that the record is long enough for. Uneven samples have weights for `LOW_DEGREE` alone.
+    """
     polynomials = []
     for width, degree in _WIDTHS_AND_DEGREES:
         has_weights = weights is even_weights or degree == LOW_DEGREE
@@ -191,10 +196,10 @@ def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
 def _find_suspects(
     record: FloatArray, polynomial: LocalPolynomial, rounding: float, noise_limit: float
 ) -> tuple[BoolArray, FloatArray]:
-    """Find the samples that may be outliers, and replace them by their predictions.
+    """Find the samples that may be outliers, and replace them by their predictions in a copy.
 
     In each pass the worst sample of each neighbourhood is replaced, because a wrong reading spoils
-    the predictions of the samples around it.
+    the predictions of the samples around it. The passes end when nothing new is found.
 
     Parameters
     ----------
@@ -235,7 +240,8 @@ def _find_suspects(
         is_at_event[new_indices[at_event]] = True
         new_suspects = new_indices[~at_event]
         is_suspect[new_suspects] = True
-        # for unevenly spaced samples the weight of a sample in its own residual is not one
+        # A sample minus its correction equals its prediction. For unevenly spaced samples the
+        # weight of a sample in its own residual is not one.
         correction = residual / polynomial.weight_of_sample(count)
         cleaned_record[new_suspects] -= correction[new_suspects]
     return is_suspect, cleaned_record
@@ -319,17 +325,8 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
 def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> bool:
     """Return whether a kink or a step explains residuals better than a single wrong reading does.
 
-    Each pattern of `event_patterns` is fitted to the residuals around the sample; the pattern that
-    explains the largest sum of squares decides.
-
-    Parameters
-    ----------
-    residual : (N,) ndarray
-        Residuals of the local polynomial.
-    index : int
-        The index of the sample.
-    polynomial : LocalPolynomial
-        The local polynomial that smooths a record.
+    Each pattern of `event_patterns` is fitted to the residuals of the local polynomial (N,) around
+    the sample at `index`; the pattern that explains the largest sum of squares decides.
     """
     width = polynomial.width
     low = max(index - width, 0)
@@ -352,8 +349,8 @@ def _robust_scatter(residual: FloatArray) -> float:
 def _comparison_deviation(residual: FloatArray, least_deviation: float) -> FloatArray:
     """Return the robust standard deviation (N,) that each residual (N,) is compared with.
 
-    It is that of the whole record or that of the samples around it, whichever is larger, and at
-    least `least_deviation`.
+    It is that of the whole record or that of the `_HALF_WINDOW` samples on either side, whichever
+    is larger, and at least `least_deviation`. The unjudged edges do not count.
     """
     scatter_of_record = max(_robust_scatter(residual), least_deviation, LEAST_DIVISOR)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])

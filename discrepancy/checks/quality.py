@@ -84,7 +84,12 @@ def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
 
 
 def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
-    """Yield a fault if a channel has no noise record, or if its readings contradict the record."""
+    """Yield a fault if a channel has no noise record, or if its readings contradict the record.
+
+    The record is contradicted by dynamic readings that are too smooth, or by repeated trials whose
+    scatter differs significantly (F test) and by a factor of two. One made from repeats is not
+    tested.
+    """
     record = channel.noise
     if record is None:
         sentence = (
@@ -107,9 +112,9 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         variance_ratio = (repeats.standard_deviation / stated_deviation) ** 2
         freedom = repeats.degrees_of_freedom
         record_freedom = min(record.degrees_of_freedom, 1e9)
-        larger = f_distribution.sf(variance_ratio, freedom, record_freedom)
-        smaller = f_distribution.cdf(variance_ratio, freedom, record_freedom)
-        p_value = 2.0 * min(larger, smaller)
+        probability_of_larger = f_distribution.sf(variance_ratio, freedom, record_freedom)
+        probability_of_smaller = f_distribution.cdf(variance_ratio, freedom, record_freedom)
+        p_value = 2.0 * min(probability_of_larger, probability_of_smaller)
         is_similar = _NOISE_FACTOR**-2 < variance_ratio < _NOISE_FACTOR**2
         if p_value < _LEVEL and not is_similar:
             contradiction = f"repeated trials scatter by {repeats.standard_deviation:.3g}"
@@ -125,9 +130,11 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 def _contradicting_roughness(campaign: Campaign, record: NoiseRecord, name: str) -> Iterator[float]:
     """Yield the roughness of each dynamic record of a channel that is too smooth for its noise.
 
-    Slow noise is smooth as well, and as smooth as its own record at the same interval. At another
-    interval, or without samples, the noise may be as slow as `SLOW_NOISE_ROUGHNESS` says. The test
-    is one-sided: a fast motion may make a record rougher than its noise.
+    It is too smooth if its roughness (`estimate_roughness`) is less than half of the one expected.
+    At the sampling interval of the noise record, this is the roughness of the noise record. At
+    another interval, or without samples of noise, the noise may be slow, and is taken as smooth as
+    `SLOW_NOISE_ROUGHNESS` says. The test is one-sided: a fast motion may make a record rougher than
+    its noise.
     """
     slow_roughness = SLOW_NOISE_ROUGHNESS * record.standard_deviation
     recorded_roughness = slow_roughness
@@ -148,12 +155,15 @@ def _contradicting_roughness(campaign: Campaign, record: NoiseRecord, name: str)
 
 
 def _dead_faults(campaign: Campaign, name: str) -> Iterator[DataFault]:
-    """Yield a fault for each trial in which a channel is constant although it should change."""
+    """Yield a fault for each trial in which a channel is constant although it should change.
+
+    A trial at rest counts only if the channel is constant in all its trials: a load may have no
+    effect on a channel that works in other trials, which only the model can tell.
+    """
     trials = [trial for trial, *_ in campaign.records(name)]
-    still = [trial for trial in trials if is_still(trial, name)]
-    for trial in still:
-        # a load may have no effect at a channel: if it moves elsewhere, only the model can tell
-        if trial.is_dynamic or len(still) == len(trials):
+    still_trials = [trial for trial in trials if is_still(trial, name)]
+    for trial in still_trials:
+        if trial.is_dynamic or len(still_trials) == len(trials):
             yield dead_fault(trial, name)
 
 
@@ -167,7 +177,11 @@ def dead_fault(trial: Trial, name: str) -> DataFault:
 
 
 def is_still(trial: Trial, name: str) -> bool:
-    """Return whether a channel shows one value throughout a trial that excites the structure."""
+    """Return whether a channel shows one value throughout a trial that excites the structure.
+
+    A trial at rest does so if its load changes. With fewer than `LEAST_CLIPPED_RUN` used readings
+    the answer is no.
+    """
     column = trial.channels.index(name)
     is_used = trial.used[:, column]
     if is_used.sum() < LEAST_CLIPPED_RUN or np.ptp(trial.values[is_used, column]) > 0.0:
@@ -178,7 +192,10 @@ def is_still(trial: Trial, name: str) -> bool:
 def _clipped_faults(
     trial: Trial, name: str, values: FloatArray, is_used: BoolArray
 ) -> Iterator[DataFault]:
-    """Yield a fault for each side at which a channel's readings (N,) in a trial are clipped."""
+    """Yield a fault if a channel's readings (N,) in a trial are clipped at their largest value.
+
+    Another fault is for the smallest value. Readings at rest are put in the order of their loads.
+    """
     readings = values[is_used]
     if len(readings) < LEAST_CLIPPED_RUN:
         return
@@ -217,36 +234,30 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     load : (N,) ndarray, optional
         The loads of readings at rest; without them the readings are samples in time.
     """
-    digit = quantum_of(values)
+    quantum = quantum_of(values)
+    # a logger that is faster than its sensor repeats each reading
     least_length = LEAST_CLIPPED_RUN * (update_length(values) if load is None else 1.0)
     longest = 0
     for start, stop in runs_of_true(values == extreme).tolist():
         if stop - start < max(least_length, longest + 1):
             continue
         if load is None:
-            is_clipped = _is_clipped_in_time(values, start, stop, digit)
+            is_clipped = _is_clipped_in_time(values, start, stop, quantum)
         else:
-            is_clipped = _is_clipped_over_load(values, start, stop, digit, load)
+            is_clipped = _is_clipped_over_load(values, start, stop, quantum, load)
         if is_clipped:
             longest = stop - start
     return longest
 
 
 def _is_clipped_over_load(
-    values: FloatArray, start: int, stop: int, digit: float, load: FloatArray
+    values: FloatArray, start: int, stop: int, quantum: float, load: FloatArray
 ) -> bool:
-    """Return whether a line through all other readings at rest goes beyond a run.
+    """Return whether a line through all other readings at rest exceeds a run of equal readings.
 
-    It must do so by one and a half digits, and the run must span three loads.
-
-    Parameters
-    ----------
-    values, load : (N,) ndarrays
-        Readings and loads, in the order of load.
-    start, stop : int
-        The first reading of the run, and the one after its last.
-    digit : float
-        The least difference between two readings, which is their last digit.
+    It must do so by 1.5 quanta plus six standard deviations of the scatter about the line, and the
+    run must span three different loads. Readings and loads (N,) are in the order of load, and the
+    run goes from the index `start` to the one before `stop`.
     """
     run = slice(start, stop)
     loads_of_run = load[run]
@@ -259,32 +270,26 @@ def _is_clipped_over_load(
     line = np.polynomial.Polynomial.fit(other_loads, other_values, 1)
     excess = float(np.max(np.abs(line(loads_of_run) - values[start])))
     scatter = float(np.std(other_values - line(other_loads)))
-    return excess > 1.5 * digit + 6.0 * scatter
+    return excess > 1.5 * quantum + 6.0 * scatter
 
 
-def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float) -> bool:
-    """Return whether a parabola through three samples on either side of a run goes beyond it.
+def _is_clipped_in_time(values: FloatArray, start: int, stop: int, quantum: float) -> bool:
+    """Return whether a parabola through three samples on either side of a run exceeds the run.
 
-    It must do so by three digits at the middle of the run, and beyond its own error there, which
-    grows with the length of the run.
-
-    Parameters
-    ----------
-    values : (N,) ndarray
-        Readings in the order of time.
-    start, stop : int
-        The first sample of the run, and the one after its last.
-    digit : float
-        The least difference between two readings, which is their last digit.
+    At the middle of the run it must do so by half of the largest error that the parabola has there
+    if each of the six samples is wrong by three quanta plus six standard deviations of the noise.
+    This error grows with the length of the run. Readings (N,) are in the order of time, and the run
+    of equal readings goes from the sample `start` to the one before `stop`. A run with fewer than
+    three samples on one side is not judged, and the answer is no.
     """
     neighbours = np.r_[start - 3 : start, stop : stop + 3]
     if neighbours[0] < 0 or neighbours[-1] >= len(values):
         return False
-    # the parabola at the middle of the run (sample 0) is a weighted sum of the six neighbours
+    # The parabola of least squares has a value at the middle of the run (sample 0) that is a
+    # weighted sum of the six neighbours: the last row of the pseudo-inverse, for its constant.
     relative_samples = neighbours - 0.5 * (start + stop - 1)
     _, _, weights_at_middle = np.linalg.pinv(np.vander(relative_samples, 3))
     excess = abs(weights_at_middle @ values[neighbours] - values[start])
-    # each neighbour may be wrong by this error; half of the largest sum of such errors is allowed
-    error = 3.0 * digit + 6.0 * estimate_roughness(values)
+    error = 3.0 * quantum + 6.0 * estimate_roughness(values)
     sum_of_weights = np.abs(weights_at_middle).sum()
     return bool(excess > 0.5 * sum_of_weights * error)

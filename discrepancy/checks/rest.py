@@ -30,14 +30,8 @@ _LEVEL = 1e-5
 def noise_record_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
     """Yield a fault for each channel whose noise record contains more than stationary noise.
 
-    Such a record overestimates the noise, which limits what can be concluded.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    frequency : float, optional
-        The frequency of a mode [Hz] at which a vibration is looked for; see `disturbance_phrase`.
+    Such a record overestimates the noise, which limits what can be concluded. Without a frequency
+    of a mode [Hz], drift and changing scatter are looked for; with it, only a vibration at it.
     """
     for name, channel in campaign.channels.items():
         if channel.noise is None:
@@ -72,8 +66,8 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     Returns
     -------
     str or None
-        The verb phrase for a message, such as "drifts by ...". None if nothing else was found, or
-        if the record has too few samples for the tests.
+        The verb phrase for a message, such as "drifts by ...". None if nothing was found, or if
+        the record has fewer than `SHORTEST_RECORD` samples or no sampling interval.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
@@ -92,7 +86,8 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
     """Return the phrase about a vibration at a mode's frequency in a noise record, or None.
 
     A vibration is a spectral line within `RELATIVE_HALF_BAND` of the frequency that has more than
-    `LARGEST_LINE_SHARE` of the variance.
+    `LARGEST_LINE_SHARE` of the variance. It is not looked for if the record has fewer than
+    `LEAST_PERIODS` periods, or if the frequency is near one of the mains.
 
     Parameters
     ----------
@@ -129,7 +124,7 @@ def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | Non
         The interval between successive samples [s].
     """
     quarters = np.array_split(residual, 4)
-    # mean absolute values, which single spikes change less than the standard deviation
+    # mean absolute values (4,), which single spikes change less than the standard deviation
     scatter = np.array([np.mean(np.abs(quarter)) for quarter in quarters])
     loudest = int(scatter.argmax())
     quietest = int(scatter.argmin())
@@ -154,9 +149,9 @@ def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | Non
 
 
 def _effective_sample_count(series: FloatArray) -> float:
-    """Return the effective number of independent samples in a series (n,) correlated in time.
+    """Return how many independent samples would determine the variance as well as a series (n,).
 
-    It is the degrees of freedom of the variance of the series.
+    Samples that are correlated in time count less; see `statistical_inefficiency`.
     """
     rho, chance = autocorrelation([series])
     return len(series) / statistical_inefficiency(rho, chance)

@@ -25,17 +25,11 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
     `OUTLYING_ROW_DEVIATIONS` standard deviations, and if it is the only such row of its trial: a
     trial with several has another zero or gain.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    channel : Channel
-        The channel; without a noise record there is no outlier.
-
     Returns
     -------
     dict of str to (N,) ndarray of bool
-        Which rows are outliers, by the name of the trial.
+        Which rows are outliers, by the name of the trial. Trials that were done less often are not
+        in it. It is empty if the channel has no noise record.
     """
     outliers: dict[str, BoolArray] = {}
     if channel.noise is None:
@@ -54,32 +48,21 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
 def _outliers_among_repeats(
     readings: FloatArray, noise: float, *, has_free_zero: bool
 ) -> BoolArray:
-    """Return which readings of a channel in R trials that repeat each other are outliers.
+    """Return which readings (R, N) of N rows in R repeated trials are outliers, of the same shape.
 
-    Parameters
-    ----------
-    readings : (R, N) ndarray
-        Readings of the N rows of each trial.
-    noise : float
-        The standard deviation of the channel's noise.
-    has_free_zero : bool
-        Whether each trial may have a zero of its own, which is removed first: the median over the
-        rows of what the readings differ from the median over the trials.
-
-    Returns
-    -------
-    (R, N) ndarray of bool
-        True for an outlier.
+    `noise` is the standard deviation of the channel's noise. If each trial has a zero of its own
+    (`has_free_zero`), it is subtracted first: the median, over the rows of a trial, of the
+    differences between its readings and the medians over the trials.
     """
     if has_free_zero:
-        from_median_of_trials = readings - np.median(readings, axis=0)
-        zeros = np.median(from_median_of_trials, axis=1, keepdims=True)
+        differences = readings - np.median(readings, axis=0)
+        zeros = np.median(differences, axis=1, keepdims=True)  # (R, 1)
         readings = readings - zeros
     residual = readings - np.median(readings, axis=0)
     scale = max(noise, NORMAL_OVER_MAD * float(np.median(np.abs(residual))))
     is_significant = np.abs(residual) > OUTLYING_ROW_DEVIATIONS * scale
     significant_count = is_significant.sum(axis=1, keepdims=True)
-    # in a trial of one row, an outlier and another zero look the same, so nothing is left out
+    # in a trial of one row, an outlier looks the same as another zero, so nothing is left out
     row_count = is_significant.shape[1]
     is_single: BoolArray = (significant_count == 1) & (row_count > 1)
     return is_significant & is_single
@@ -109,21 +92,23 @@ def row_outlier(
     Returns
     -------
     (N,) ndarray of bool
-        True for the outlier; False everywhere if there is none.
+        True for the outlier; False everywhere if there is none, or if the trial has fewer than
+        `LEAST_ROWS` used rows or a single load.
     """
     outlier = np.zeros(len(values), dtype=bool)
     rows = np.flatnonzero(is_used)
     load = trial.load[rows]
     if channel.noise is None or len(rows) < LEAST_ROWS or np.ptp(load) == 0.0:
         return outlier
-    # residuals of a parabola in the load through all rows, by an orthonormal basis
+    # residuals (M,) of a parabola in the load through all M rows, by an orthonormal basis (M, 3);
+    # with fewer than three different loads the basis has fewer columns
     powers = np.vander(load / np.max(np.abs(load)), 3)
     basis, singular_values, _ = np.linalg.svd(powers, full_matrices=False)
     basis = basis[:, singular_values > 1e-12 * singular_values[0]]
     residual = values[rows] - basis @ (basis.T @ values[rows])
     one_minus_leverage = np.maximum(1.0 - np.sum(basis**2, axis=1), 1e-12)
-    # Leave-one-out residual: the residual r of the fit to all rows over one minus the leverage h.
-    # The sum of squares of the other rows about their own parabola is sum(r^2) - r^2 / (1 - h).
+    # If row i is left out, its residual is r_i / (1 - h_i), with the leverage h_i, and the other
+    # rows have the sum of squares sum(r^2) - r_i^2 / (1 - h_i) about their own parabola.
     left_out_residual = np.abs(residual / one_minus_leverage)
     degrees = len(rows) - 1 - basis.shape[1]
     squares_of_others = residual @ residual - residual**2 / one_minus_leverage

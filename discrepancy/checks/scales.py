@@ -32,14 +32,14 @@ def data_scales(
 
     A ratio has a sign. For readings at rest (static and flight trials) it is the robust slope of
     the readings over the prediction. For records in time it is the ratio of their amplitudes,
-    because the model need not predict their phase. A channel without a known scale is left out. In
-    a trial, a channel is also left out if its predicted amplitude is too small to determine the
-    ratio, or if the ratio is zero or so large that the prediction can only be a rounding error.
+    because the model need not predict their phase. A signal, or a channel with a free gain, is left
+    out. In a trial, a channel is also left out if its predicted amplitude is too small to determine
+    the ratio, or if the ratio is zero or so large that the prediction can only be a rounding error.
 
     Parameters
     ----------
     campaign : Campaign
-        The campaign: its trials, channels and noise records.
+        The trials and channels.
     predictions : mapping of str to (N, C) ndarray
         The predicted readings by the name of the trial.
 
@@ -117,14 +117,14 @@ def _static_scale(
     noise, zero_deviation : float
         The standard deviations of the noise and of the channel's zero [channel's unit].
     """
-    # all pairs of at most 400 rows
+    # all P pairs of at most 400 rows
     row_count = min(len(readings), 400)
     rows = np.linspace(0, len(readings) - 1, row_count).round().astype(int)
     first_of_pair, second_of_pair = np.triu_indices(row_count, 1)
     first_rows = rows[first_of_pair]
     second_rows = rows[second_of_pair]
-    data_steps = readings[first_rows] - readings[second_rows]
-    model_steps = predicted_readings[first_rows] - predicted_readings[second_rows]
+    data_steps = readings[first_rows] - readings[second_rows]  # (P,)
+    model_steps = predicted_readings[first_rows] - predicted_readings[second_rows]  # (P,)
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
     is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(predicted_readings))
@@ -134,7 +134,7 @@ def _static_scale(
         is_visible = abs(median_reading) > CLEAR_NOISE_DEVIATIONS * max(noise, zero_deviation)
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
     slopes = data_steps[is_clear_step] / model_steps[is_clear_step]
-    slope = float(np.median(slopes))
+    slope = float(np.median(slopes))  # Theil-Sen estimate
     usual_model_step = np.median(np.abs(model_steps[is_clear_step]))
     usual_step = max(abs(slope), 1.0) * usual_model_step
     is_above_noise = usual_step > CLEAR_NOISE_DEVIATIONS * noise
@@ -148,18 +148,9 @@ def _static_scale(
 def _dynamic_scale(
     readings: FloatArray, predicted_readings: FloatArray, trial: Trial, channel: Channel
 ) -> float:
-    """Return the ratio of the amplitudes of a record in time and its prediction.
+    """Return the ratio of the amplitudes of a record in time (N,) and its prediction (N,).
 
     The sign is that of `sign_of_release`. The result is 0 if the record is within its noise.
-
-    Parameters
-    ----------
-    readings, predicted_readings : (N,) ndarrays
-        Readings, and their prediction by the model [channel's unit].
-    trial : Trial
-        The trial with its readings, inputs and sample times.
-    channel : Channel
-        The channel with its quantity and noise record.
     """
     # The 95 % quantile ignores outliers. Unlike the median it shows the motion of a record that
     # decays and is quiet for most of its length.
@@ -182,14 +173,17 @@ def _dynamic_scale(
 
 
 def sign_of_release(readings: FloatArray, predicted_readings: FloatArray, trial: Trial) -> float:
-    """Return -1 if a ring-down starts on the opposite side of its prediction, else 1.
+    """Return -1 if a channel's readings start on the opposite side of their prediction, else 1.
+
+    It is also 1 for a trial that is not a ring-down from rest, whose phase the model need not
+    predict.
 
     Parameters
     ----------
     readings, predicted_readings : (N,) ndarrays
         Readings and prediction of a channel.
     trial : Trial
-        The trial with its readings, inputs and sample times.
+        The trial, for its release.
     """
     if trial.release is None or not trial.release.at_rest:
         return 1.0
@@ -197,9 +191,9 @@ def sign_of_release(readings: FloatArray, predicted_readings: FloatArray, trial:
     crossings = np.flatnonzero(np.sign(predicted_readings) != np.sign(predicted_readings[0]))
     first_crossing = int(crossings[0]) if crossings.size else len(predicted_readings)
     count = max(first_crossing, 3)
-    # each sample votes with the weight of its prediction, so that a wrong reading does not decide
-    votes = np.sign(readings - np.median(readings))[:count]
-    return float(np.sign(votes @ predicted_readings[:count])) or 1.0
+    # signs are weighted by the predictions, so that a single wrong reading does not decide
+    signs = np.sign(readings - np.median(readings))[:count]
+    return float(np.sign(signs @ predicted_readings[:count])) or 1.0
 
 
 def swapped_channels(
@@ -208,12 +202,14 @@ def swapped_channels(
     """Return the pairs of channels that fit the model clearly better if they are exchanged.
 
     Channels of one quantity that occur in the same trials are assigned to the predictions of these
-    channels so that the sum of their misfits is least (linear assignment problem).
+    channels so that the sum of their misfits is least (linear assignment problem). A pair is
+    returned if each gets the prediction of the other, and `_exchange_is_better`. Signals, and
+    channels with a free gain, are not compared.
 
     Parameters
     ----------
     campaign : Campaign
-        The campaign: its trials, channels and noise records.
+        The trials and channels.
     predictions : mapping of str to (N, C) ndarray
         The predicted readings by the name of the trial.
     """
@@ -226,6 +222,7 @@ def swapped_channels(
     for (_, trial_names), channels in groups.items():
         if len(channels) < 2:
             continue
+        # (channels, channels): chi-squared of readings (row) to a prediction (column), all trials
         misfits = np.zeros((1, 1))
         for trial in campaign.trials:
             if trial.name in trial_names:
@@ -252,14 +249,9 @@ def swap_fault(first_channel: str, second_channel: str) -> DataFault:
 def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int) -> bool:
     """Return whether two channels fit clearly better if they are exchanged.
 
-    Each misfit must become less than half, and their sum must fall by more than 30.
-
-    Parameters
-    ----------
-    misfits : (C, C) ndarray
-        Chi-squared of each channel (row) to the prediction of each channel (column).
-    first_index, second_index : int
-        The indices of the two channels.
+    Each of their misfits (chi-squared) must become less than half, and their sum must fall by more
+    than 30. `misfits` (C, C) holds those of the readings of a channel (row) to the prediction of a
+    channel (column).
     """
     pair = [first_index, second_index]
     exchanged = [second_index, first_index]
@@ -272,21 +264,9 @@ def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int
 
 
 def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel]) -> FloatArray:
-    """Return how well the readings of each channel fit the prediction of each other channel.
+    """Return chi-squared (C, C) of each channel's readings (row) to each prediction (column).
 
-    Parameters
-    ----------
-    trial : Trial
-        The trial with its readings, inputs and sample times.
-    predictions : (N, M) ndarray
-        The predicted readings of all channels of the trial.
-    channels : sequence of Channel
-        The C channels.
-
-    Returns
-    -------
-    (C, C) ndarray
-        Chi-squared of the readings of a channel (row) to the prediction of a channel (column).
+    `predictions` (N, M) has a column for each of the M channels of the trial.
     """
     columns = [trial.channels.index(channel.name) for channel in channels]
     misfits = np.zeros((len(channels), len(channels)))
@@ -303,19 +283,10 @@ def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel])
 def _misfit(
     readings: FloatArray, predicted_readings: FloatArray, channel: Channel, trial: Trial
 ) -> float:
-    """Return chi-squared of a channel's readings to a prediction.
+    """Return chi-squared of a channel's readings (N,) to a prediction (N,).
 
     The standard deviation of a reading combines the noise with 2 % of the prediction, because any
-    model may be wrong by that much.
-
-    Parameters
-    ----------
-    readings, predicted_readings : (N,) ndarrays
-        Readings and prediction.
-    channel : Channel
-        The channel with its quantity and noise record.
-    trial : Trial
-        The trial with its readings, inputs and sample times.
+    model may be wrong by that much. For records in time, only their amplitudes are compared.
     """
     noise = trial.noise_deviation(channel)
     if trial.is_dynamic:

@@ -1,4 +1,7 @@
-"""Unit slips: factors between data and model that two units of a quantity explain."""
+"""Unit slips: data in one unit of a quantity that the file states in another.
+
+A slip shows as a factor between data and model that is the ratio of two units.
+"""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,12 +33,12 @@ LEAST_FACTOR = 2.0
 
 
 class Slip(NamedTuple):
-    """A factor of data over model that two units explain.
+    """Two units of a quantity that were mixed up.
 
     Attributes
     ----------
     factor : float
-        The factor of data over model if one unit was given as the other.
+        The ratio of data to model that the mix-up causes.
     meant : str
         The unit that the data have.
     stated : str
@@ -53,13 +56,14 @@ class Slip(NamedTuple):
 
     @property
     def tolerance_factor(self) -> float:
-        """The factor up to which physical effects may make the ratio differ from the slip.
+        """By which factor an observed ratio may differ from `factor` and still count as this slip.
 
-        A larger slip is distinct from other slips, and allows for a larger factor.
+        Physical effects change the ratio, too. A larger slip is farther from other slips, and
+        allows for a larger factor.
         """
-        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBTFUL_FACTOR, 1.35)):
-            if self.ratio >= least_size:
-                return width
+        for least_ratio, tolerance in ((200.0, 3.0), (20.0, 2.0), (DOUBTFUL_FACTOR, 1.35)):
+            if self.ratio >= least_ratio:
+                return tolerance
         return 1.1
 
     def log_distance(self, scale: float) -> float:
@@ -93,7 +97,8 @@ def find_slip(
     Returns
     -------
     Slip or None
-        The two units; None if no pair explains the ratio.
+        The slip nearest to the ratio; None if the ratio is beyond the tolerance of every slip, or
+        within a factor of about `LEAST_FACTOR` of 1.
     """
     if abs(log(abs(scale))) < log(LEAST_FACTOR / 1.1):
         return None
@@ -122,14 +127,14 @@ def find_slip(
 def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> Iterator[DataFault]:
     """Yield the unit slips of channels and of the inputs of trials.
 
-    A unit slip is a ratio of data to model that two units of a quantity explain. A channel with the
-    same slip in all its trials has a wrong unit itself. If all other channels of a trial have one
-    slip in common, the input of that trial has a wrong unit.
+    If all channels of all trials have one slip of the inputs in common, this alone is reported. A
+    channel with the same slip in all its trials has a wrong unit itself. If all other channels of a
+    trial have one slip in common, the input of that trial has a wrong unit.
 
     Parameters
     ----------
     campaign : Campaign
-        The campaign: its trials, channels and noise records.
+        The trials and channels, with the units that their files state.
     scales : mapping of (str, str) to float
         The ratio of data to model, by channel and trial.
     """
@@ -169,17 +174,9 @@ def _slips_in_trial(
 ) -> Iterator[DataFault]:
     """Yield the unit slip of a trial's input; without one, the slips of its channels alone.
 
-    The input has a slip if all channels of the trial have the same ratio of data to model.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    trial : Trial
-        The trial with its readings, inputs and sample times.
-    scale_of_channel : mapping of str to float
-        The ratio of data to model in this trial, for the channels whose unit is right in all
-        trials together.
+    `scale_of_channel` holds the ratio of data to model in this trial, without the channels that
+    have a wrong unit in all their trials. The input has a slip if the same slip explains all these
+    ratios. A slip of a channel in this trial alone is reported from `CERTAIN_FACTOR` on.
     """
     common_slip = _common_slip(
         [_slip_of_input(trial, scale) for scale in scale_of_channel.values()]
@@ -201,14 +198,17 @@ def _slips_in_trial(
 
 
 def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
-    """Return the slip that is common to all entries; None if they differ or there are none."""
+    """Return the slip that all entries have; None if they differ, or if there are no entries."""
     if not slips or any(slip != slips[0] for slip in slips):
         return None
     return slips[0]
 
 
 def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> Slip | None:
-    """Return the slip between a channel's units that explains all its scales; None if none does."""
+    """Return the slip of a channel's unit that explains its ratios of data to model, or None.
+
+    It explains their median, and each of them within twice its tolerance (of the logarithm).
+    """
     channel = campaign.channels[name]
     slip = find_slip(median(map(abs, scales)), channel.quantity, channel.unit)
     if slip is None:
@@ -219,10 +219,9 @@ def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> 
 
 
 def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
-    """Return the slip between units of a trial's inputs that explains a ratio of data to model.
+    """Return the first slip of a trial's inputs that explains a ratio of data to model, or None.
 
-    The inputs are what drives a trial of this kind, and the recorded inputs. The result is None if
-    no slip explains the ratio.
+    The inputs that are tried are what drives a trial of this kind, and then the recorded inputs.
     """
     drives = []
     if trial.kind in _DRIVES:
@@ -238,18 +237,9 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
 def _channel_faults(
     campaign: Campaign, name: str, slip: Slip, trials: Sequence[Trial]
 ) -> Iterator[DataFault]:
-    """Yield the fault of a channel whose readings have a wrong unit in some trials.
+    """Yield the fault of a channel whose readings have a wrong unit in the given trials.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign: its trials, channels and noise records.
-    name : str
-        The name of the channel.
-    slip : Slip
-        The unit that was stated, and the unit that was probably meant.
-    trials : sequence of Trial
-        The trials that show it.
+    It may be a doubt or nothing; see `_grade_slip`.
     """
     channel = campaign.channels[name]
     first_trial = trials[0]
@@ -273,17 +263,17 @@ def _channel_faults(
 def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
     """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
 
-    A large slip is a fault. A medium one is a fault if several records agree, else a doubt. A small
-    one is a doubt if several records agree, else it is not reported.
+    From `CERTAIN_FACTOR` on it is a fault. From `DOUBTFUL_FACTOR` on it is a fault if several
+    records show it, else a doubt. Below, it is a doubt if several records show it, else nothing.
 
     Parameters
     ----------
     fault : DataFault
         The fault, whose sentence has no full stop yet.
     slip : Slip
-        The slip of a unit that explains the scale.
+        The slip, whose ratio decides.
     agreeing : int
-        The number of records that show the same slip.
+        The number of records that show this slip.
     """
     sentence = fault.sentence
     if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):

@@ -137,7 +137,10 @@ def _residual_set(tree: xr.DataTree) -> ResidualSet:
 
 
 def _samples_at_rest(tree: xr.DataTree) -> dict[str, FloatArray]:
-    """Return the samples of the noise records in a file [channel's unit], by channel."""
+    """Return the samples (n,) of the noise records in a file [channel's unit], by channel.
+
+    The dictionary is empty if the file has no noise records.
+    """
     samples: dict[str, FloatArray] = {}
     if "noise" in tree.children:
         for group in tree["noise"].children.values():
@@ -149,7 +152,7 @@ def _samples_at_rest(tree: xr.DataTree) -> dict[str, FloatArray]:
 def _channel_row(channel: Channel) -> dict[str, object]:
     """Return the entries of a channel in the file's attribute `channels`, without its samples.
 
-    They may be infinite; Python's module `json` writes infinities and reads them.
+    Deviations may be infinite, which Python's module `json` writes as `Infinity` and reads again.
     """
     noise_row = None
     if channel.noise is not None:
@@ -165,15 +168,7 @@ def _channel_row(channel: Channel) -> dict[str, object]:
 
 
 def _channel_from_row(row: JsonRecord, samples: FloatArray | None) -> Channel:
-    """Return the channel that `_channel_row` wrote.
-
-    Parameters
-    ----------
-    row : mapping
-        The entries of the channel in the attribute `channels`.
-    samples : (n,) ndarray or None
-        The samples of the channel's noise record [channel's unit]; None if it has none.
-    """
+    """Return the channel that `_channel_row` wrote, with the samples (n,) of its noise record."""
     noise = None
     if row["noise"] is not None:
         deviation, freedom, interval, source = row["noise"]
@@ -191,12 +186,7 @@ def _channel_from_row(row: JsonRecord, samples: FloatArray | None) -> Channel:
 def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
     """Return a trial as a group of a residual file: readings, prediction, residuals, attributes.
 
-    Parameters
-    ----------
-    fitted_trial : FittedTrial
-        The trial with its prediction and residuals.
-    channels : mapping of str to Channel
-        Channels by name, for the units of the readings.
+    Arrays that are None or empty are left out, and so is the load place of a trial without force.
     """
     trial = fitted_trial.trial
     by_row_and_channel = ("row", "channel")
@@ -240,17 +230,9 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
 
 
 def _fitted_trial(group: xr.Dataset) -> FittedTrial:
-    """Read a trial with its prediction and residuals from its group of a residual file.
+    """Read a trial with its prediction and residuals from the group that `_dataset` wrote.
 
-    Parameters
-    ----------
-    group : Dataset
-        The group, as `_dataset` writes it.
-
-    Raises
-    ------
-    ValueError
-        If an array of the trial is not finite.
+    Raises `ValueError` if an array of the trial is not finite.
     """
     attributes = group.attrs
     arrays: dict[str, Any] = {
@@ -287,6 +269,6 @@ def _fitted_trial(group: xr.Dataset) -> FittedTrial:
     arrays_of_fit = {
         name: group[name].values
         for name in _ARRAYS["fit"]
-        if name != "standardised" and name in group
+        if name != "standardised" and name in group  # computed from the residuals
     }
     return FittedTrial(trial, **arrays_of_fit)

@@ -118,7 +118,10 @@ def read_verdict_file(path: Path) -> StoredVerdict:
 
 
 def _drop_old_definitions(content: JsonObject) -> None:
-    """Remove entries of an older file whose definition has changed: fractions and chi-squared."""
+    """Remove entries of an older file, in place, whose definition has changed since.
+
+    They are the explained fractions and chi-squared. The proof then says why it has no fraction.
+    """
     verdict = content["verdict"]
     proof = content["proof"]
     verdict.pop("explained", None)
@@ -141,12 +144,9 @@ def _drop_old_definitions(content: JsonObject) -> None:
 
 
 def read_verdict(folder: Path | str) -> VerdictFolder:
-    """Read the folder of a verdict.
+    """Read the folder of a verdict that `uav-twin discrepancy run --out` leaves.
 
-    Parameters
-    ----------
-    folder : path
-        The folder that `uav-twin discrepancy run --out` leaves.
+    If the folder was being replaced when a run was interrupted, it is restored first.
 
     Raises
     ------
@@ -247,12 +247,9 @@ class StoredPatch:
     def combine_with(self, earlier: "StoredPatch | None") -> "StoredPatch":
         """Return this patch combined with an earlier one that is already in its model.
 
-        The result applies to the model without either patch.
-
-        Parameters
-        ----------
-        earlier : StoredPatch or None
-            The earlier patch; None if the model has none.
+        The result applies to the model without either patch, and its origin names this model. The
+        verdict, the sentence and the parameters are those of this patch. Without an earlier patch
+        the result is this one.
         """
         if earlier is None:
             return self
@@ -307,20 +304,23 @@ def primitive_intervals(
 
 
 def _numbers_of(primitive: Primitive) -> dict[str, tuple[float, str]]:
-    """Return the real numbers of a primitive with their units, those of a table as `forces[0]`."""
+    """Return the real numbers of a primitive with their units, by name.
+
+    Those of a table are called `forces[0]`, `forces[1]` and so on.
+    """
     numbers: dict[str, tuple[float, str]] = {}
     for name, unit in primitive.units.items():
         value = getattr(primitive, name)
         if isinstance(value, tuple):
-            for index, item in enumerate(value):
-                numbers[f"{name}[{index}]"] = (item, unit)
+            for index, entry in enumerate(value):
+                numbers[f"{name}[{index}]"] = (entry, unit)
         else:
             numbers[name] = (float(value), unit)
     return numbers
 
 
 def _kinds_text(patch: ModelPatch) -> str:
-    """Return the kinds of a patch's primitives, for a message."""
+    """Return the kinds of a patch's primitives in order, for a message; "none" if it is empty."""
     return ", ".join(primitive.kind for primitive in patch) or "none"
 
 

@@ -61,5 +61,5 @@ class FmuExcitation(NamedTuple):
 
     @property
     def linearity_key(self) -> tuple[Hashable, ...]:
-        """Key under which it is remembered whether the FMU is linear: inputs and releases."""
+        """What decides whether the FMU counts as linear: inputs, releases and decay to rest."""
         return self.inputs, *self.releases, self.decays_to_rest

@@ -52,7 +52,10 @@ class FmuSimulator(FmuAtRest):
         readout: Readout,
         refinement: int = 1,
     ) -> SampledOutputs:
-        """Return outputs and their rates in a dynamic trial.
+        """Return outputs (N, C) and their rates in a dynamic trial.
+
+        The linear system of the FMU is solved if the FMU is linear and no force makes the speed of
+        a port jump. Otherwise the FMU itself is stepped, and splines lead to the samples.
 
         Parameters
         ----------
@@ -63,7 +66,7 @@ class FmuSimulator(FmuAtRest):
         laws : PortLaws
             Internal forces.
         readout : Readout
-            Outputs and times.
+            The C outputs, and the N times at which they are read.
         refinement : int
             Steps are this many times smaller.
 
@@ -82,13 +85,16 @@ class FmuSimulator(FmuAtRest):
                 system, excitation, trial, laws, ports, readout, end, refinement
             )
         if times[-1] != trial.time[-1]:
-            # slightly longer, so that another clock (in a fit) can use the same cached run
+            # A fit varies the clock: with one more interval, the same cached run serves them all.
             end += trial.interval
         stepped = self._stepped_motion(excitation, trial, end, laws, readout.columns, refinement)
         return sample_by_splines(stepped.values, stepped.step, readout, readout.derivatives)
 
     def _ports_of_laws(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
-        """Return the ports of the laws; positions count from the undisturbed outputs."""
+        """Return the displacement outputs and force inputs at which laws act.
+
+        The positions at rest are zero, as outputs count from those of the undisturbed FMU.
+        """
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
         input_indices = [excitation.inputs.index(self.port_inputs[port]) for port in ports]
@@ -111,31 +117,15 @@ class FmuSimulator(FmuAtRest):
         end: float,
         refinement: int,
     ) -> SampledOutputs:
-        """Return outputs and their rates, computed with the FMU's linear system until `end` [s].
+        """Return outputs (N, C) and their rates, computed with the linear system of the FMU.
 
-        Parameters
-        ----------
-        system : FmuStateSpace
-            The linear system.
-        excitation : FmuExcitation
-            The state, force, releases and inputs of the FMU.
-        trial : Trial
-            The trial, for the stamps of its force.
-        laws : PortLaws
-            Internal forces.
-        ports : LawPorts
-            Where they act.
-        readout : Readout
-            Outputs and times.
-        end : float
-            Time until which steps are made, if the samples are not even [s].
-        refinement : int
-            Steps are this many times smaller.
+        If the samples are not evenly spaced, the system is stepped evenly until `end` [s], and
+        splines lead to the samples. Before time zero the outputs rest.
         """
-        undisturbed = self._undisturbed_outputs(excitation)
+        undisturbed = self._undisturbed_outputs(excitation)  # of all outputs of the FMU
         release_values = self._release_values_of_system(excitation)
         columns = list(readout.columns)
-        is_derivative = np.array(readout.derivatives) > 0
+        is_derivative = np.array(readout.derivatives) > 0  # (C,)
         # Steps end at the samples if these are even. Otherwise steps of one length are made, since
         # each length of step costs a matrix exponential, and splines lead to the samples.
         times = readout.times
@@ -148,19 +138,22 @@ class FmuSimulator(FmuAtRest):
         loads = []
         if excitation.force is not None:
             loads.append(Load(excitation.force_factor_values, excitation.force))
-        at_undisturbed = LawPorts(ports.columns, ports.force_indices, undisturbed[ports.columns])
+        ports_from_undisturbed = LawPorts(
+            ports.columns, ports.force_indices, undisturbed[ports.columns]
+        )
         states, forces = system_motion(
             system,
             Excitation(trial.time, stamps, loads),
             start,
             laws,
-            at_undisturbed,
+            ports_from_undisturbed,
             refinement,
             memory,
         )
-        rows, direct_rows = system.output_rows(columns, readout.derivatives)
+        # matrices (C, n) and (C, E) from states and forces to the outputs or their derivatives
+        by_state, by_force = system.output_rows(columns, readout.derivatives)
         constant = np.where(is_derivative, 0.0, undisturbed[columns])
-        values = states @ rows.T + forces @ direct_rows.T + constant
+        values = states @ by_state.T + forces @ by_force.T + constant
         if excitation.releases:
             # the first sample is that of the held FMU: the holding force may act on outputs
             # directly
@@ -168,9 +161,9 @@ class FmuSimulator(FmuAtRest):
             values[0] = np.where(is_derivative, values[0], held_outputs[columns])
         if not is_even:
             return sample_by_splines(values, excitation.step, readout, [0] * len(columns))
-        rates = (states @ system.state_matrix.T + forces @ system.input_matrix.T) @ rows.T
-        if direct_rows.any():
-            rates += np.gradient(forces, stamps, axis=0) @ direct_rows.T
+        rates = (states @ system.state_matrix.T + forces @ system.input_matrix.T) @ by_state.T
+        if by_force.any():
+            rates += np.gradient(forces, stamps, axis=0) @ by_force.T
         # the last entry of `sample_rows` is time zero, which was added to the samples
         values = values[sample_rows[:-1]]
         rates = rates[sample_rows[:-1]]
@@ -182,9 +175,9 @@ class FmuSimulator(FmuAtRest):
     def _held_outputs(
         self, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FloatArray:
-        """Return the outputs (C,) of a linear FMU before its release, less the undisturbed ones.
+        """Return by how much the outputs (C,) of a held, linear FMU differ from undisturbed ones.
 
-        Responses to unit values of the release variables are added, as the FMU is linear.
+        The responses to unit values of the release variables are superposed.
         """
         return np.asarray(
             sum(
@@ -201,28 +194,15 @@ class FmuSimulator(FmuAtRest):
         ports: LawPorts,
         release_values: Mapping[str, float],
     ) -> "StartState":
-        """Return the state at the start of a trial with laws.
+        """Return the state of the linear system at the start of a trial, and the laws' memory.
 
-        Under a recorded force it is the equilibrium with the laws under the first force; otherwise
-        it is the released state.
-
-        Parameters
-        ----------
-        system : FmuStateSpace
-            The linear system.
-        excitation : FmuExcitation
-            The state, force, releases and inputs of the FMU.
-        laws : PortLaws
-            Internal forces.
-        ports : LawPorts
-            The ports at which the laws act.
-        release_values : mapping of str to float
-            The amounts of the variables that release the FMU.
+        Under a recorded force it is the equilibrium with the laws under the first force. Without
+        laws or without a recorded force it is the released state, and the laws have no memory.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, release_values), None)
-        first_forces = excitation.first_force * excitation.force_factor_values
-        gain = system.gain
+        first_forces = excitation.first_force * excitation.force_factor_values  # (E,)
+        gain = system.gain  # (C, E)
         outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
         positions_without_laws = outputs[ports.columns]
         compliance = gain[np.ix_(ports.columns, ports.force_indices)]
@@ -245,23 +225,8 @@ class FmuSimulator(FmuAtRest):
     ) -> "SteppedOutputs":
         """Return the outputs of the FMU, stepped until `end` [s] and coupled with the laws.
 
-        The steps are halved until the outputs that are read have converged, unless the FMU has a
-        fixed step or there are no laws.
-
-        Parameters
-        ----------
-        excitation : FmuExcitation
-            The state, force, releases and inputs of the FMU.
-        trial : Trial
-            The trial, for its kind and name.
-        end : float
-            Time of the last step [s].
-        laws : PortLaws
-            Internal forces.
-        columns : sequence of int
-            Columns of the outputs that are read.
-        refinement : int
-            Steps are this many times smaller than needed.
+        With laws, steps are halved until the outputs that are read have converged, and are then
+        `refinement` times smaller than that. An FMU with a fixed step is always stepped by it.
         """
         fixed_step = self.description.motion.step
         release_values = self._find_release_values(excitation)
@@ -307,8 +272,8 @@ class FmuSimulator(FmuAtRest):
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
         """Return a run that begins in equilibrium with laws under its first loads.
 
-        If no load acts, or no port of a law is displaced by the first loads, the run is returned as
-        it is.
+        If no load acts, or no port of a law is displaced at the start, the run is returned as it
+        is, and the laws have no memory.
         """
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
@@ -340,7 +305,8 @@ class FmuSimulator(FmuAtRest):
     def _outputs_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> FloatArray:
         """Return the outputs (K, C) at the K step boundaries of a run with laws at its ports.
 
-        All are NaN if the explicit coupling of FMU and laws is unstable.
+        All are NaN if the explicit coupling of FMU and laws is unstable. Raises `ModelError` if a
+        port of a law has no velocity output.
         """
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
@@ -357,12 +323,12 @@ class FmuSimulator(FmuAtRest):
             )
         first_step, speed_gain = self._probe_port_speeds(run, inputs, speed_columns)
         coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
-        # In each step the ports lose `speed_loss` to the laws, and a force that makes the same
-        # change, speed_gain^-1 speed_loss, is held over the step. Accelerations without laws are
-        # those of the last step, with the loss to the laws added again.
+        # In each step the ports lose the speed `speed_loss` to the laws. The FMU gets the constant
+        # force that makes the same change, speed_gain^-1 speed_loss. The accelerations that the
+        # ports have without laws are those of the last step, with the loss to the laws added again.
         asset, first_outputs, loads_by_input = self.start_run(run)
         outputs = [first_outputs]
-        forces = np.column_stack([*loads_by_input.values()])
+        forces = np.column_stack([*loads_by_input.values()])  # (steps, inputs)
         port_columns = [list(loads_by_input).index(name) for name in inputs]
         # speeds before the start, extrapolated from the first step without laws
         previous_speeds = 2.0 * first_step[0] - first_step[1]
@@ -373,7 +339,7 @@ class FmuSimulator(FmuAtRest):
             accelerations = (speeds - previous_speeds + speed_loss) / run.step
             speed_loss = coupling.speed_loss(positions, speeds, accelerations)
             previous_speeds = speeds
-            step_forces[port_columns] -= np.linalg.solve(speed_gain, speed_loss)
+            step_forces[port_columns] -= np.linalg.solve(speed_gain, speed_loss)  # a row of forces
             if not np.isfinite(step_forces).all():
                 return np.full((len(forces) + 1, len(first_outputs)), np.nan)
             load = dict(zip(loads_by_input, step_forces.tolist(), strict=True))
@@ -384,25 +350,26 @@ class FmuSimulator(FmuAtRest):
     def _probe_port_speeds(
         self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what the first step of a run tells of the speeds of the P ports.
+        """Return the speeds of the P ports in the first step of a run, and how forces change them.
 
-        The step is run without probing forces, and once more with a force at each port.
+        The step is run without probing forces, and then once for each port with a force there.
 
         Parameters
         ----------
         run : FmuRun
             The run without laws.
         inputs : sequence of str
-            Force input of each port.
+            Force input of each port (P,).
         speed_columns : list of int
-            Column of each port's speed.
+            Index of the output that is each port's speed (P,).
 
         Returns
         -------
         speeds : (2, P) array
             The speeds of the ports without probing forces, at the start and the end of the step.
         gains : (P, P) array
-            The changes of the speeds (rows) at its end by unit forces at the ports (columns).
+            The changes of the speeds (rows) at the end of the step by unit forces at the ports
+            (columns).
         """
         first_loads = {name: values[:1] for name, values in run.offsets.items()}
         one_step = run._replace(steps=1, offsets=first_loads)
@@ -411,8 +378,7 @@ class FmuSimulator(FmuAtRest):
         amplitudes = np.array([self.probing_amplitude(name) for name in inputs])
         speed_changes = []
         for name, amplitude in zip(inputs, amplitudes, strict=True):
-            # an input has one value for each step, and here there is one step
-            probing_load = first_loads.get(name, 0.0) + np.array([amplitude])
+            probing_load = first_loads.get(name, 0.0) + np.array([amplitude])  # (1,): one step
             probed_run = one_step._replace(offsets={**first_loads, name: probing_load})
             _, probed_speeds_at_end = self.outputs_of_run(probed_run)[:, speed_columns]
             speed_changes.append(probed_speeds_at_end - speeds_at_end)
@@ -428,14 +394,15 @@ class FmuSimulator(FmuAtRest):
         """Return the number of parts of a step at which a motion with laws has converged.
 
         Steps are halved until no output changes by more than `CONVERGENCE_TOLERANCE` of its largest
-        motion (rms). The number is kept for laws of the same kind that are at most twice as strong.
+        motion (rms). The number is kept, and returned at once for laws of the same kinds and
+        exponents at the same ports that are at most twice as strong.
 
         Parameters
         ----------
         laws : PortLaws
             Internal forces.
         motion_key : hashable
-            Key of everything else that the number depends on.
+            Everything else that the number depends on.
         step : float
             The whole step [s].
         outputs_by : callable
@@ -456,6 +423,7 @@ class FmuSimulator(FmuAtRest):
             return parts
         fine_outputs = outputs_by(parts)
         while parts <= MOST_REFINEMENT:
+            # the finer motion of the last pass is the coarser one of this pass
             coarse_outputs = fine_outputs
             fine_outputs = outputs_by(2 * parts)
             change = _relative_change(coarse_outputs, fine_outputs)
@@ -472,14 +440,17 @@ class FmuSimulator(FmuAtRest):
 
 
 class Refinement(NamedTuple):
-    """Number of parts of a step that is enough for laws up to a strength."""
+    """Number of parts of a step, and the strength of the laws for which they were enough."""
 
     parts: int
     strength: float
 
 
 class StartState(NamedTuple):
-    """State (n,) of a linear system at the start, and the memory of laws loaded before."""
+    """State (n,) of a linear system at the start, and the memory of the laws.
+
+    The memory is None if the laws were not loaded before.
+    """
 
     state: FloatArray
     memory: FloatArray | None
@@ -500,7 +471,11 @@ class SettledRun(NamedTuple):
 
 
 def _relative_change(coarse: FloatArray, fine: FloatArray) -> float:
-    """Return the largest rms difference of two motions (K, C), relative to the largest motion."""
+    """Return the largest rms difference of two motions (K, C), relative to the largest motion.
+
+    The motion of an output is its departure from its mean; an output that does not move counts as
+    equal. NaN in a motion makes the result NaN.
+    """
     rows = min(len(fine), len(coarse))
     with np.errstate(all="ignore"):
         largest = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)

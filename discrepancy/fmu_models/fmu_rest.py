@@ -27,7 +27,7 @@ STATIC_TOLERANCE = 1e-9
 
 
 class EquilibriumWithLaws(NamedTuple):
-    """Outputs (L, C) of an FMU in equilibrium with laws, and the forces of the laws there."""
+    """Outputs (L, C) of an FMU in equilibrium with laws, and the laws' forces and memory there."""
 
     outputs: FloatArray
     solution: StaticSolution
@@ -54,9 +54,9 @@ class FmuAtRest(IdentifiedFmu):
     ) -> FloatArray:
         """Return the outputs (L, C) at rest, for L states that differ in their inputs.
 
-        An FMU without a static solution is stepped until its motion has decayed (`static.settle`).
-        If it is linear, it is stepped without loads only, and the changes by the loads are computed
-        from its static gain.
+        An FMU that is not quasi-static (`static.settle`) is stepped until its motion has decayed.
+        If it is linear, it is stepped without loads, and the changes by the loads are computed from
+        its static gain.
 
         Parameters
         ----------
@@ -70,8 +70,8 @@ class FmuAtRest(IdentifiedFmu):
             return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         values_of_inputs = np.array([loads[name] for name in names])
-        load_values = values_of_inputs.reshape(-1, len(states)).T
-        # the test for linearity, made at the first row, is the strictest at the largest load
+        load_values = values_of_inputs.reshape(-1, len(states)).T  # (L, inputs), even without any
+        # the first row is tested for linearity, and the largest load is the strictest test
         total_load = np.abs(load_values).sum(axis=1)
         largest_first = np.argsort(-total_load, kind="stable")
         outputs = {}
@@ -82,19 +82,10 @@ class FmuAtRest(IdentifiedFmu):
     def _settled_outputs(
         self, state: OperatingPoint, load_values: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
-        """Return the outputs (C,) of the FMU at rest under constant loads on some inputs.
+        """Return the outputs (C,) of the FMU at rest under constant loads on E inputs.
 
-        If the FMU is linear in these inputs, the loads are not stepped: what they add is computed
-        from the static gain.
-
-        Parameters
-        ----------
-        state : OperatingPoint
-            Parameters and constant inputs.
-        load_values : (E,) array
-            The load that is added to each of E inputs.
-        names : tuple of str
-            The names of these inputs.
+        `load_values` (E,) are added to the inputs of these names. If the FMU is linear in them, it
+        is stepped without loads, and their effect is computed from the static gain.
         """
         if self._is_linear_at_rest(state, load_values, names):
             gain = self._static_gain(state, names)
@@ -108,30 +99,26 @@ class FmuAtRest(IdentifiedFmu):
     ) -> bool:
         """Return whether the outputs at rest are linear in the loads on some inputs.
 
-        For each set of inputs this is tested once, under the loads of the first call: what the
-        static gain adds is compared with what the FMU itself does. A linear FMU is stepped over a
-        long time, so that its error is relative to the loads and to the transients they cause.
-
-        Parameters
-        ----------
-        state, load_values, names
-            The arguments of `_settled_outputs`.
+        For each set of inputs this is tested once, under the loads of the first call, and kept: the
+        change of the outputs by the static gain is compared with that of the FMU itself. Since the
+        FMU is stepped over a long time, its errors may be as large as `LINEARITY_TOLERANCE` times
+        the change and the largest transient. The arguments are those of `_settled_outputs`.
         """
         if names in self._linear_at_rest:
             return self._linear_at_rest[names]
         gain = self._static_gain(state, names)
         if gain is None:
             return False  # not kept: there may be a gain at another operating point
-        added_by_gain = gain @ load_values
+        change_by_gain = gain @ load_values  # (C,)
         excitation = self._excitation_to_rest(state, names)
         responses = [self._response_to_force(excitation, name) for name in names]
-        largest_responses = [np.max(np.abs(response), axis=0) for response in responses]
+        largest_responses = [np.max(np.abs(response), axis=0) for response in responses]  # (E, C)
         tolerance = LINEARITY_TOLERANCE * (
-            np.abs(added_by_gain) + np.abs(load_values) @ largest_responses
+            np.abs(change_by_gain) + np.abs(load_values) @ largest_responses
         )
         unloaded_outputs = self._step_to_rest(state, np.zeros_like(load_values), names)
-        added_by_fmu = self._step_to_rest(state, load_values, names) - unloaded_outputs
-        is_linear = bool(np.all(np.abs(added_by_fmu - added_by_gain) <= tolerance))
+        change_of_fmu = self._step_to_rest(state, load_values, names) - unloaded_outputs
+        is_linear = bool(np.all(np.abs(change_of_fmu - change_by_gain) <= tolerance))
         self._linear_at_rest[names] = is_linear
         return is_linear
 
@@ -167,7 +154,10 @@ class FmuAtRest(IdentifiedFmu):
         return self.asset.input_range("load", variable)[1]
 
     def port_flexibility(self, state: OperatingPoint) -> FloatArray:
-        """Return the flexibility (P, P): displacement of each port (row) per force (column)."""
+        """Return the flexibility (P, P) at rest: displacement of a port (row) per force (column).
+
+        A force of the probing amplitude is applied at each port in turn.
+        """
         if not self.ports:
             # there is nothing to compute, and the FMU may not accept loads of zero
             return np.zeros((0, 0))
@@ -189,26 +179,24 @@ class FmuAtRest(IdentifiedFmu):
         laws: PortLaws,
         trial: str,
     ) -> FloatArray:
-        """Return the outputs (L, C) at rest along a load path, with the forces of laws.
-
-        The forces that solve the equations of the laws are applied to the FMU, whose outputs are
-        then the result.
+        """Return the outputs (L, C) at rest along a load path, in equilibrium with laws.
 
         Parameters
         ----------
         states : sequence of OperatingPoint
             Parameters and constant inputs of each of the L rows.
         loads : mapping of str to (L,) array
-            What is added to inputs in each row.
+            What is added to inputs in each row, by the FMU's names.
         laws : PortLaws
-            Internal forces.
+            Internal forces at the ports.
         trial : str
-            Name of the trial, for sentences.
+            Name of the trial, for messages.
 
         Raises
         ------
         ModelError
-            If the FMU refuses a row, a law has no solution, or the FMU does not confirm it.
+            If the FMU refuses a row, the equations of the laws have no solution, or the FMU does
+            not agree with it.
         """
         try:
             outputs = self.solve_rest(states, loads)
@@ -229,7 +217,10 @@ class FmuAtRest(IdentifiedFmu):
     def _raise_for_refused_row(
         self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray], trial: str
     ) -> None:
-        """Raise `ModelError` for the first row of a trial that the FMU refuses by itself."""
+        """Raise `ModelError` for the first row of a trial that the FMU refuses by itself.
+
+        Each row is computed alone. If the FMU accepts every one, nothing is raised.
+        """
         for row, state in enumerate(states):
             row_loads = {name: values[row : row + 1] for name, values in loads.items()}
             row_text = f"The trial {trial!r}, row {row + 1} of its table: "
@@ -264,11 +255,12 @@ class FmuAtRest(IdentifiedFmu):
         state: OperatingPoint,
         trial: str,
     ) -> EquilibriumWithLaws:
-        """Return the equilibrium of the FMU with laws, by Newton's method.
+        """Return the equilibrium of the FMU with laws, by a Newton iteration of fixed flexibility.
 
-        In each iteration the equations of the laws are solved for a linear FMU with the flexibility
-        of one state. The FMU is then loaded by the forces of the laws, and the linear FMU is
-        shifted so that it passes through the positions that the FMU reaches.
+        In each iteration the equations of the laws are solved for a linear structure, whose
+        flexibility is that of the FMU in one state. The FMU is then loaded by these forces of the
+        laws, and the linear structure is shifted so that it passes through the positions that the
+        FMU reaches. For a linear FMU the second iteration confirms the first.
 
         Parameters
         ----------
@@ -281,17 +273,17 @@ class FmuAtRest(IdentifiedFmu):
         state : OperatingPoint
             State whose flexibility is used in all iterations.
         trial : str
-            Name of the trial, for sentences.
+            Name of the trial, for messages.
 
         Raises
         ------
         ModelError
-            If laws and FMU do not agree.
+            If the positions still change after `STATIC_ITERATIONS`.
         """
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
         compliance = self.port_flexibility(state)[np.ix_(ports, ports)]
-        positions_without_laws = outputs[:, columns]
+        positions_without_laws = outputs[:, columns]  # (L, J)
         for _ in range(STATIC_ITERATIONS):
             solution = static_solution(
                 laws, positions_without_laws, compliance, kernel=compiled_kernel()

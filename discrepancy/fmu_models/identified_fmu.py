@@ -115,12 +115,14 @@ class IdentifiedFmu(FmuRuns):
         self._is_linear: dict[tuple[Hashable, ...], bool] = {}
         self._release_amplitudes: dict[str, float] = {}
         self._systems = ResultCache(MOST_SYSTEMS)
-        self._paces = ResultCache()
+        self._step_choices = ResultCache()
 
     def _check_parameters(self) -> None:
-        """Refuse a file whose parameter bounds, effect switches or settings the FMU does not allow.
+        """Raise an error if the FMU does not allow a value that the file may set.
 
-        Bounds beyond the range of an FMU parameter would cut off its posterior.
+        These are the bounds of calibrated parameters, the switches of effects, and the parameters
+        of trials at rest and in motion. A bound outside the range of an FMU parameter would cut off
+        the posterior.
         """
         description = self.description
         settings: list[Mapping[str, float]] = []
@@ -135,7 +137,7 @@ class IdentifiedFmu(FmuRuns):
             self.asset.check_parameters(by_key)
 
     def _find_release_variables(self) -> list[str]:
-        """Return the variables that begin a ring-down, as far as [release] names them.
+        """Return the variables that the file names in [release], which begin a ring-down.
 
         They are the parameters of displacement and velocity, and the input of a holding force.
         """
@@ -184,7 +186,9 @@ class IdentifiedFmu(FmuRuns):
         """Return the FMU as a linear system; None if it is not linear.
 
         The system is identified from the responses to single forces and releases. The FMU is linear
-        if such a system exists, and predicts the response to all of them together.
+        if such a system exists, and predicts the response to all of them together. This prediction
+        is tested once for a set of inputs and releases, at the first operating point. The result is
+        also None if the file forbids superposition, or if there is nothing to excite the FMU.
         """
         has_excitation = bool(excitation.inputs or excitation.releases)
         if not self.description.superposition or not has_excitation:
@@ -204,9 +208,13 @@ class IdentifiedFmu(FmuRuns):
         return system if self._is_linear[linearity_key] else None
 
     def _identify_system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
-        """Return the linear system with the FMU's responses to unit forces and releases, if any."""
+        """Return the linear system that has the FMU's responses to unit forces and releases.
+
+        The result is None if no system of moderate order has them.
+        """
         responses = [self._response_to_force(excitation, name) for name in excitation.inputs]
         responses += [self._response_to_release(excitation, name) for name in excitation.releases]
+        # (steps, outputs, inputs and releases), without the sample at the start
         records = np.stack(responses, axis=2)[1:]
         return realise_state_space(records, len(excitation.inputs), excitation.step)
 
@@ -232,16 +240,17 @@ class IdentifiedFmu(FmuRuns):
     def _response_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (recorded_steps + 1, C) after a release by one unit.
 
-        The outputs without a release are subtracted. The FMU is released by the nominal amount of
-        the first call for this variable (the same in all later calls), and the outputs are divided
-        by it.
+        The outputs without a release are subtracted. The FMU is released by an amplitude by which
+        the outputs are divided: that of the excitation, or for an input its probing amplitude. All
+        later calls for this variable use the amplitude of the first call.
         """
         nominal_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
             nominal_amplitude = self.probing_amplitude(name)
         amplitude = self._release_amplitudes.setdefault(name, nominal_amplitude)
         run = self._run_of_excitation(excitation._replace(force=None), {name: amplitude})
-        key = (*excitation.recording_arguments, name, True)
+        is_release = True
+        key = (*excitation.recording_arguments, name, is_release)
         return self.cached(key, lambda: self._motion_of_run(excitation, run) / amplitude)
 
     def _is_input(self, name: str) -> bool:
@@ -263,16 +272,8 @@ class IdentifiedFmu(FmuRuns):
     ) -> bool:
         """Return whether a linear system predicts the FMU's response to all inputs at once.
 
-        The recorded force and the releases act, and random forces on all inputs.
-
-        Parameters
-        ----------
-        system : FmuStateSpace
-            The system.
-        excitation : FmuExcitation
-            The state, force, releases and inputs of the FMU.
-        tolerance : float
-            Largest error of an output, relative to its largest motion.
+        The releases act, the recorded force, and random forces (of a fixed seed) on all other
+        inputs. The largest error of each output may be `tolerance` times its largest motion.
         """
         release_values = self._release_values_of_system(excitation)
         run = self._run_of_excitation(excitation, release_values)
@@ -303,7 +304,8 @@ class IdentifiedFmu(FmuRuns):
     def _release_values_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
         """Return the release parameters or holding force that give a linear FMU its displacement.
 
-        They are scaled by the displacement of the release point per unit.
+        The first one is the displacement over that of the release point under a unit value. Without
+        an output of the release point, the values of the excitation are returned.
         """
         release_values = dict(excitation.releases)
         column = self.variables.columns.get("release")
@@ -318,7 +320,8 @@ class IdentifiedFmu(FmuRuns):
     def _find_release_values(self, excitation: FmuExcitation) -> dict[str, float]:
         """Return the release parameters or holding force that give any FMU its displacement.
 
-        The amount is found by the secant method, with the FMU at the start of a run.
+        The first one is found by the secant method, with the FMU at the start of a run. Without an
+        output of the release point, the values of the excitation are returned.
 
         Raises
         ------
@@ -360,20 +363,26 @@ class IdentifiedFmu(FmuRuns):
         """Return the run of the FMU under an excitation.
 
         Release variables that are inputs of the FMU are set before the start; the others are
-        parameters of the operating point.
+        parameters of the operating point. Under a recorded force, the run begins from rest under
+        the force at the first sample.
         """
-        begin = {name: amount for name, amount in release_values.items() if self._is_input(name)}
-        parameters = {name: amount for name, amount in release_values.items() if name not in begin}
+        initial_loads = {
+            name: amount for name, amount in release_values.items() if self._is_input(name)
+        }
+        parameters = {
+            name: amount for name, amount in release_values.items() if name not in initial_loads
+        }
+        if excitation.force is not None:
+            for name, factor in excitation.force_factors.items():
+                initial_loads[name] = factor * excitation.first_force
         run = FmuRun(
-            excitation.state.with_parameters(parameters),
-            excitation.step,
-            excitation.recorded_steps,
-            begin,
+            operating_point=excitation.state.with_parameters(parameters),
+            step=excitation.step,
+            steps=excitation.recorded_steps,
+            initial_offsets=initial_loads,
         )
         if excitation.force is None:
             return run
-        for name, factor in excitation.force_factors.items():
-            begin[name] = factor * excitation.first_force
         # inputs are held constant over a step: they get the mean force of each step
         time = excitation.step * np.arange(excitation.recorded_steps + 1.0)
         at_begin, at_end = equivalent_ramps(excitation.force.values_at, time)
@@ -396,15 +405,16 @@ class IdentifiedFmu(FmuRuns):
             return start + system.state_at_rest(first_force * excitation.force_factor_values)
         return start
 
-    # ------------------------------------------------------------ pace
+    # ------------------------------------------------------------ communication step
 
     def choose_step(self, trial: Trial, state: OperatingPoint) -> StepChoice:
         """Return the angular frequency of the FMU's first mode, and the step for a trial.
 
-        Both may be given in the model's file. If the file gives no frequency, the first mode is the
-        one with the largest flexibility at the first port; without a port, the one with the highest
-        peak in the spectrum. If it gives no step, the step is an integer fraction of the sampling
-        interval.
+        The file of the model may state both. Otherwise the first mode is the one with the largest
+        flexibility at the first port; without ports, or if the FMU is not linear, it is the one
+        with the highest peak in the spectrum. The step is an integer fraction of the sampling
+        interval, at which no mode is aliased and the first mode turns by at most
+        `LARGEST_STEP_PHASE`.
         """
         interval = trial.interval
         system, excitation, steps_per_sample = self._system_that_shows_all_modes(
@@ -429,7 +439,7 @@ class IdentifiedFmu(FmuRuns):
         """Return the excitation that shows the modes of the FMU at the sampling of a trial.
 
         It has a force at each port; without ports, a release; without both, a load on the first
-        input, as any input will do to see how fast the FMU moves.
+        input, since any input shows how fast the FMU moves.
         """
         inputs = tuple(dict.fromkeys(self.port_inputs))
         releases = {}
@@ -447,7 +457,8 @@ class IdentifiedFmu(FmuRuns):
         """Return the system identified at a step that samples all modes without aliasing.
 
         The step is halved until no mode turns by more than `LARGEST_MODE_PHASE` in it, and the
-        system also predicts the FMU at half the step.
+        system also predicts the FMU at half the step. This ends early if the FMU is not linear, has
+        a fixed step, or if the sampling interval has more than `MOST_PARTS` parts.
         """
         fixed_step = self.description.motion.step
         parts = 1
@@ -478,7 +489,7 @@ class IdentifiedFmu(FmuRuns):
             motion = self._response_to_release(excitation, next(iter(excitation.releases)))
         else:
             motion = self._response_to_force(excitation, excitation.inputs[0])
-        # vibration about the final position
+        # vibration (steps + 1, C) about the final position
         last_quarter = motion[-len(motion) // 4 :]
         motion = motion - last_quarter.mean(axis=0)
         frequencies, power = periodogram(
@@ -494,18 +505,18 @@ class IdentifiedFmu(FmuRuns):
                 f"The FMU model {self.description.name!r} does not move; state angular_frequency "
                 "in [scales]."
             )
-        loudest = frequencies[np.argmax(power.max(axis=1))]
-        # a line at zero is not a vibration: the first frequency above zero is the least
-        return 2.0 * np.pi * float(max(frequencies[1], loudest))
+        peak_frequency = frequencies[np.argmax(power.max(axis=1))]
+        # a peak at zero is not a vibration: the first frequency above zero is the least
+        return 2.0 * np.pi * float(max(frequencies[1], peak_frequency))
 
     def nominal_step_choice(self, trial: Trial) -> StepChoice:
         """Return the step of a trial in the nominal state, kept while parameters are fitted."""
-        step_choice: StepChoice = self._paces.get(
+        step_choice: StepChoice = self._step_choices.get(
             trial.interval, lambda: self.choose_step(trial, self.nominal_point)
         )
         return step_choice
 
 
 def recorded_step_count(trial: Trial) -> int:
-    """Return the number of steps that are recorded for a trial."""
+    """Return how many steps are recorded for a trial: one for each sample, within limits."""
     return min(max(len(trial.time), LEAST_RECORDED_STEPS), MOST_RECORDED_STEPS)

@@ -135,7 +135,8 @@ class FmuModel(DescribedModel):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign.
 
-        Scales that the file states are taken from there; the others are computed with the FMU.
+        Scales that the file states are taken from there; the others are computed with the FMU at
+        the prior mean of the parameters.
         """
         conditions = Conditions(self.prior_mean(campaign))
         largest_displacements = self._largest_displacements(campaign, conditions)
@@ -153,21 +154,24 @@ class FmuModel(DescribedModel):
                 static_stiffness=stiffness.static,
             )
         file_scales = self.description.scales
-        campaign_sizes = campaign.largest_magnitudes
+        largest = campaign.largest_magnitudes
         return Scales(
             length=file_scales.length or 1.0,
             tip_stiffness=file_scales.tip_stiffness or load_point.static,
             modal_mass=file_scales.modal_mass or load_point.modal / frequency**2,
             angular_frequency=frequency,
-            force=campaign_sizes["force"],
-            load_factor=campaign_sizes["load_factor"],
-            duration=campaign_sizes["duration"],
-            campaign_time=campaign_sizes["campaign_time"],
+            force=largest["force"],
+            load_factor=largest["load_factor"],
+            duration=largest["duration"],
+            campaign_time=largest["campaign_time"],
             ports=ports,
         )
 
     def _largest_displacements(self, campaign: Campaign, conditions: Conditions) -> FloatArray:
-        """Return the largest displacement of each port (P,) in the trials of a campaign."""
+        """Return the largest displacement of each port (P,), simulated in the trials of a campaign.
+
+        Units are m, or rad at a port that turns. Laws of the patch are left out.
+        """
         largest = np.zeros(len(self.ports))
         for trial in campaign.trials:
             if trial.is_dynamic:
@@ -215,7 +219,11 @@ class FmuModel(DescribedModel):
         return stiffnesses
 
     def _first_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
-        """Return the angular frequency of the first mode [rad/s]; 1 if no trial shows it."""
+        """Return the angular frequency of the first mode [rad/s].
+
+        It is that of the file, or else that of the FMU in the first dynamic trial. In a campaign
+        of trials at rest it is 1. Without trials it is that of a simulated ring-down.
+        """
         frequency = self.description.scales.angular_frequency
         if frequency:
             return frequency
@@ -225,7 +233,7 @@ class FmuModel(DescribedModel):
             return self.fmu.choose_step(dynamic_trial, operating_point).angular_frequency or 1.0
         if campaign.trials:
             return 1.0
-        # without a campaign: adapt the sampling interval to the frequency, in three rounds
+        # without trials: adapt the sampling interval to the frequency, in three rounds
         interval = 0.01
         for _ in range(3):
             trial = trial_without_readings(TrialKind.RINGDOWN, interval)
@@ -234,7 +242,10 @@ class FmuModel(DescribedModel):
         return frequency or 1.0
 
     def _load_point_stiffness(self, stiffnesses: list[PortStiffness]) -> PortStiffness:
-        """Return the stiffness of the first port with a load input, else of the first port."""
+        """Return the stiffness of the first port whose force input is one of the trials' loads.
+
+        If there is none, it is that of the first port; without ports, 1 N/m.
+        """
         force_inputs = self._force_inputs.values()
         for port_input, stiffness in zip(self.fmu.port_inputs, stiffnesses, strict=True):
             if port_input in force_inputs:
@@ -246,10 +257,11 @@ class FmuModel(DescribedModel):
     def _respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the response of a trial.
+        """Return the outputs (N, C) of a trial, and their rates if it is dynamic.
 
         The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
-        recorded force is not zero.
+        recorded force is not zero. Raises `ModelError` if the trial is at rest, but an output is to
+        be differentiated.
         """
         columns = self._output_columns(outputs)
         if trial.is_dynamic:
@@ -284,23 +296,15 @@ class FmuModel(DescribedModel):
     ) -> SampledOutputs:
         """Return outputs of the FMU in a dynamic trial, and their rates.
 
-        Parameters
-        ----------
-        trial : Trial
-            The trial.
-        conditions, patch : Conditions, ModelPatch
-            Parameters, health and initial state, and the primitives that act.
-        columns : OutputColumns
-            The outputs.
-        parts : int
-            Factor on the number of samples of the trial.
+        They are read at the times of the samples with the clock error of `conditions`; each
+        interval between them is divided into `parts`.
         """
         laws = self._laws_at_ports(patch)
         times = subdivide(conditions.motion_times(trial.time), parts)
         first_stamp = float(trial.time[0])
         record_length = float(trial.time[-1]) - first_stamp
-        # An FMU begins at time zero. If the stamps count from elsewhere (a time of day), they are
-        # shifted, since the FMU would have to be simulated from there.
+        # An FMU is simulated from time zero. If the first stamp is far from it (a time of day), all
+        # stamps are shifted, so that nothing is simulated before the record.
         begins_near_zero = 0.0 <= first_stamp <= LATEST_BEGIN * record_length
         if trial.kind is not TrialKind.RINGDOWN and not begins_near_zero:
             trial = replace(trial, time=trial.time - first_stamp)
@@ -312,7 +316,7 @@ class FmuModel(DescribedModel):
     def _outputs_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
     ) -> FloatArray:
-        """Return all outputs (N, C) of a static trial or a flight."""
+        """Return all outputs (N, C) of the FMU in the N rows of a static trial or a flight."""
         loads = self._loads_at_rest(trial, conditions, patch)
         rows = range(len(trial.time))
         states = [self._operating_point(trial, conditions, patch, row) for row in rows]
@@ -391,11 +395,11 @@ class FmuModel(DescribedModel):
                 "speeds jump with forces."
             )
         system = system.in_coordinates_of(mean_system)
-        # rows that give positions and speeds (derivatives of order 0 and 1) of the ports
+        # matrices (ports, n) from the state to positions and speeds of the ports
         port_displacements = self.fmu.displacement_columns
         positions_by_state, _ = system.output_rows(port_displacements, 0)
         speeds_by_state, _ = system.output_rows(port_displacements, 1)
-        # rows that give the outputs
+        # matrices (C, n) and (C, ports) from state and port forces to the outputs
         output_columns = self._output_columns(outputs)
         outputs_by_state, outputs_by_force = system.output_rows(
             output_columns.columns, output_columns.derivatives
@@ -417,7 +421,10 @@ class FmuModel(DescribedModel):
         return system.has_jumping_speed(port_displacements, port_forces)
 
     def _system_with_parameters(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
-        """Return the linear system at values of the parameters; None if the FMU is not linear."""
+        """Return the linear system at values of the parameters; None if the FMU is not linear.
+
+        The damage is that of the first row of the trial.
+        """
         conditions = Conditions(parameters, health=trial.health[:1])
         state = self._operating_point(trial, conditions, self.patch)
         return self.fmu.linear_system(self.fmu.excitation_of(trial, state, self.ports))
@@ -436,7 +443,10 @@ class FmuModel(DescribedModel):
         return port_laws(patch.of(PortForce), self.ports)
 
     def _load_change(self, patch: ModelPatch) -> LoadChange:
-        """Return the change of loads by those primitives that the FMU does not simulate itself."""
+        """Return how a patch changes the loads of trials.
+
+        Primitives that the FMU simulates itself are left out, as they act there.
+        """
         effects = self.description.effects
         return LoadChange.from_patch(
             primitive for primitive in patch if primitive.kind not in effects
@@ -456,10 +466,11 @@ class FmuModel(DescribedModel):
         return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
 
     def _force_factors(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
-        """Return the factor of the recorded force on each input of the FMU.
+        """Return the factor of the recorded force on each input of the FMU, by variable name.
 
-        It is one for the force input of the load place. If a patch moves the load, its bending
-        moment and torque get the distances [m].
+        It is 1 for the force input of the load place. If a patch moves the load, the inputs of
+        bending moment and torque have its distances along the span and the chord [m] as factors.
+        Raises `ModelError` if a load moves along the chord of an FMU without an input of torque.
         """
         inputs = self.description.inputs
         change = self._load_change(patch)
@@ -484,32 +495,27 @@ class FmuModel(DescribedModel):
     ) -> OperatingPoint:
         """Return the parameters and constant inputs of the FMU in a row of a trial.
 
-        Parameters
-        ----------
-        trial : Trial
-            Any trial.
-        conditions : Conditions
-            Parameters and health.
-        patch : ModelPatch
-            Primitives; those that the FMU simulates itself become parameters.
-        row : int
-            Row of a trial at rest; a dynamic trial is in the state of its first sample.
+        The inputs are stiffness losses and temperature. The parameters are those that the file
+        states for this kind of trial, the calibrated ones, and those of primitives of the patch
+        that the FMU simulates itself. A dynamic trial has the temperature of its first sample.
         """
-        names = self.variables
+        variables = self.variables
         # inputs
-        sections = self.description.inputs
-        losses = self.region_losses(trial, conditions.health, patch)
+        input_names = self.description.inputs
+        losses = self.region_losses(trial, conditions.health, patch)  # (rows or 1, regions)
         row_losses = losses[min(row, len(losses) - 1)]
         inputs: dict[str, float] = {}
-        for name, loss in zip(sections.regions.values(), row_losses, strict=True):
-            inputs[names.variable(name)] = loss
-        if sections.temperature is not None:
+        for name, loss in zip(input_names.regions.values(), row_losses, strict=True):
+            inputs[variables.variable(name)] = loss
+        if input_names.temperature is not None:
             rise = float(trial.temperature[0 if trial.is_dynamic else row])
-            reference = sections.temperature_reference or 0.0
-            inputs[names.variable(sections.temperature)] = reference + rise
+            reference = input_names.temperature_reference or 0.0
+            inputs[variables.variable(input_names.temperature)] = reference + rise
         # parameters
-        table = self.description.motion if trial.is_dynamic else self.description.static
-        parameters = {names.parameter(name): value for name, value in table.parameters.items()}
+        section = self.description.motion if trial.is_dynamic else self.description.static
+        parameters = {
+            variables.parameter(name): value for name, value in section.parameters.items()
+        }
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
         parameters |= effect_parameters(

@@ -22,14 +22,16 @@ from fe.runtime.time_steps import Boundaries, loaded_steps
 class PortCoupling:
     """Masses at P ports of an FMU, on which J laws act.
 
+    The object keeps the memory of the laws from step to step.
+
     Parameters
     ----------
     laws : PortLaws
-        The laws.
+        The J laws.
     ports : sequence of str
-        Names of their ports.
+        Names of their P ports.
     speed_gain : (P, P) ndarray
-        Change of speed of each port in a step under a unit force at each input.
+        Change of speed in a step of each port (row) under a unit force at each port (column).
     step : float
         Step of the FMU [s].
     memory : ndarray, optional
@@ -45,13 +47,14 @@ class PortCoupling:
         memory: FloatArray | None,
     ) -> None:
         count = len(ports)
+        # one coordinate for each port, without stiffness and damping
         masses = ModalSystem(
             np.zeros(count),
             np.zeros((count, count)),
             dict(zip(ports, np.eye(count), strict=True)),
             actions=dict(zip(ports, speed_gain.T / step, strict=True)),
         )
-        # arrays of a single step, whose forces `speed_loss` fills in each time
+        # arrays of a single step, into which each call of `speed_loss` writes its forces
         self._step = step
         boundaries = Boundaries(np.array([0.0, step]), np.arange(2), np.array([step]))
         no_displacement = np.zeros((2, len(laws)))
@@ -70,7 +73,7 @@ class PortCoupling:
         # arrays of state and results, which each step overwrites
         self._has_memory = memory is not None
         memory = laws.unloaded_memory() if memory is None else memory
-        self._operating_point = ModalState(np.zeros(count), np.zeros(count), memory)
+        self._state = ModalState(np.zeros(count), np.zeros(count), memory)
         self._results = ModalMotion(
             q=np.zeros((2, count)),
             v=np.zeros((2, count)),
@@ -84,8 +87,9 @@ class PortCoupling:
     ) -> FloatArray:
         """Return the speed (P,) that the laws take from the ports during the next step.
 
-        The step is integrated with the laws, and the speed at its end is compared with the speed
-        that the ports would have without them. The laws remember the step.
+        The step is integrated with the laws, and the speed at its end is subtracted from the speed
+        that the ports would have without them. The memory of the laws is advanced by the step, so
+        that each step needs exactly one call.
 
         Parameters
         ----------
@@ -95,23 +99,24 @@ class PortCoupling:
             The accelerations of the ports without the laws, constant during the step.
         """
         h = self._step
-        self._operating_point.q[:] = positions
-        self._operating_point.v[:] = speeds
-        # changes of position and speed of the ports under a constant acceleration
+        self._state.q[:] = positions
+        self._state.v[:] = speeds
+        # changes (2 P,) of position and speed of the ports under a constant acceleration
         self._steps.increment[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
         self._steps.begin_force[:] = accelerations
         self._steps.end_force[:] = accelerations
+        # compiled code takes no keywords
         compiled_kernel().integrate(
             tuple(self._steps),
-            0,
-            1,
-            0,
-            True,
+            0,  # first boundary
+            1,  # last boundary
+            0,  # first sample to record
+            True,  # steps couple the coordinates
             self._has_memory,
             self._law_arrays,
-            tuple(self._operating_point),
+            tuple(self._state),
             tuple(self._results),
         )
         self._has_memory = True
         speeds_without_laws = speeds + h * accelerations
-        return speeds_without_laws - self._operating_point.v
+        return speeds_without_laws - self._state.v

@@ -46,7 +46,10 @@ class Readout:
 def sample_by_splines(
     values: FloatArray, step: float, readout: Readout, remaining_derivatives: Sequence[int]
 ) -> SampledOutputs:
-    """Return values and rates of outputs at given times, by splines through an even time grid.
+    """Return values and rates of outputs at given times, by cubic splines through an even grid.
+
+    Before time zero the outputs rest: an output has its first value, and its derivatives are zero.
+    After the last time of the grid, values and rates are those of this time.
 
     Parameters
     ----------
@@ -55,10 +58,10 @@ def sample_by_splines(
     step : float
         Step of the grid [s].
     readout : Readout
-        Outputs and times. Before time zero the first value holds, at zero rate.
+        The C outputs, and the N times at which they are read.
     remaining_derivatives : sequence of int
-        How many times each column of `values` is differentiated here. It is zero if the values
-        are the wanted derivatives already.
+        How many times each column of `values` is differentiated here (C,): 0 where `values` are the
+        derivatives of the readout already.
     """
     grid = step * np.arange(len(values))
     curve = CubicSpline(grid, values)
@@ -67,12 +70,11 @@ def sample_by_splines(
     rates = curve(clipped_times, 1)
     for column, order in enumerate(remaining_derivatives):
         if order > 0:
-            # A second derivative of a spline is inaccurate. A new spline through the first
-            # derivatives is as accurate as the first one. It is differentiated once less.
+            # The second derivative of a cubic spline is inaccurate. So its first derivatives are
+            # interpolated by another spline, which is differentiated once less.
             derivative = CubicSpline(grid, curve(grid, 1)[:, column])
             sampled[:, column] = derivative(clipped_times, order - 1)
             rates[:, column] = derivative(clipped_times, order)
-    # before time zero outputs rest, so that their derivatives are zero
     is_before = readout.times < 0.0
     rates[is_before] = 0.0
     sampled[np.ix_(is_before, np.array(readout.derivatives) > 0)] = 0.0

@@ -47,7 +47,7 @@ WITHOUT_PORTS = LawPorts(NO_INDICES, NO_INDICES, np.zeros(0))
 
 
 class SystemMotion(NamedTuple):
-    """States (N, n) and forces (N, E) of a system at the samples."""
+    """States (N, n) of a system at the samples, and all forces (N, E) on it: loads minus laws."""
 
     states: FloatArray
     forces: FloatArray
@@ -72,23 +72,23 @@ def system_motion(
     system : FmuStateSpace
         The system that moves.
     excitation : Excitation
-        Forces, with directions (E,).
+        Forces, whose directions (E,) are over the inputs of the system.
     start : (n,) array
         State at the first time.
     laws : PortLaws
         J internal forces.
     ports : LawPorts
-        Where they act.
+        The J outputs and inputs at which the laws act.
     refinement : int
         Steps with laws are this many times smaller.
     memory : array, optional
         Memory of the laws at the first time; by default they were loaded from zero at once.
     """
-    coupled = _system_with_ports(
+    with_ports = _system_with_ports(
         system, laws.ports, tuple(ports.columns.tolist()), tuple(ports.force_indices.tolist())
     )
-    modal = coupled.modal
-    # steps under the forces
+    modal = with_ports.modal
+    # steps under the forces, which act on P port coordinates and n states
     boundaries = step_boundaries(
         modal,
         laws,
@@ -98,22 +98,24 @@ def system_motion(
         excitation.jump_times,
     )
     begin_force, end_force = equivalent_ramps(
-        lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
+        lambda times: excitation.loads_at(times, with_ports.directions.T), boundaries.time
     )
+    # (boundaries, J): displacement of each law's port that appears at once with the loads
     direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
     steps = loaded_steps(modal, boundaries, begin_force, end_force, direct_displacement)
-    # position and speed of the ports at the start, from the state
-    port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
-    rest_positions = ports.rest_positions[coupled.first_laws]
+    # position and speed (P,) of the ports at the start, from the state
+    port_rows = system.output_matrix[ports.columns[with_ports.first_laws]]
+    rest_positions = ports.rest_positions[with_ports.first_laws]
     positions = port_rows @ start + rest_positions
     speeds = port_rows @ system.state_matrix @ start
+    # the state is a speed; the coordinate of this speed acts on nothing and begins at zero
     initial_motion = InitialMotion(
-        q=np.concatenate((positions, 0.0 * start)),
+        q=np.concatenate((positions, np.zeros_like(start))),
         v=np.concatenate((speeds, start)),
         memory=memory,
     )
     motion = integrate_motion(modal, laws, steps, initial_motion, compiled_kernel())
-    # all forces on the system: the excitation minus those of the laws
+    # all forces (N, E) on the system: the excitation minus those of the laws
     forces = excitation.loads_at(excitation.sample_times, np.eye(system.input_matrix.shape[1]))
     np.subtract.at(forces.T, ports.force_indices, motion.port_forces.T)
     return SystemMotion(motion.v[:, len(positions) :], forces)
@@ -127,9 +129,9 @@ class SystemWithPorts(NamedTuple):
     directions : (P + n, E) ndarray
         Rates of the ports' speeds and of the state under unit forces.
     modal : ModalSystem
-        Ports and state; a state is the speed of a coordinate.
+        The equation of motion of P ports and n states; a state is the speed of a coordinate.
     first_laws : (P,) ndarray of int
-        The first law at each port.
+        Index of the first law at each port; ports are in alphabetical order.
     """
 
     directions: FloatArray
@@ -144,16 +146,16 @@ def _system_with_ports(
     columns: tuple[int, ...],
     force_numbers: tuple[int, ...],
 ) -> SystemWithPorts:
-    """Return a system with the ports of J laws as coordinates.
+    """Return a system with the P ports of J laws as coordinates before its n states.
 
     Parameters
     ----------
     system : FmuStateSpace
         The system, of order n.
     names : tuple of str
-        Port of each law.
+        Port of each law (J,).
     columns, force_numbers : tuple of int
-        Displacement output and force of each law's port.
+        Indices (J,) of the displacement output and of the force of each law's port.
     """
     port_names, first_laws = np.unique(names, return_index=True)
     port_count = len(first_laws)
@@ -167,8 +169,8 @@ def _system_with_ports(
     directions = np.vstack((port_rates @ system.input_matrix, system.input_matrix))
     damping = np.zeros((port_count + state_count, port_count + state_count))
     damping[:, port_count:] = -np.vstack((port_rates @ system.state_matrix, system.state_matrix))
-    # Feedthrough: a displacement that appears at once with the force is a residual flexibility of
-    # the port; below rounding it is none.
+    # A displacement that appears at once with the force (feedthrough) is a flexibility of the port
+    # in addition to that of the states; one as small as a rounding error is set to zero.
     direct_compliance = system.feedthrough[port_columns, port_forces]
     static_compliance = system.gain[port_columns, port_forces]
     modal = ModalSystem(

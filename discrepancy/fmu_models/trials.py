@@ -18,14 +18,17 @@ def effect_parameters(
     known_parameters: Collection[str],
     model_name: str,
 ) -> dict[str, float]:
-    """Return the parameters by which an FMU that implements effects itself gets those of a patch.
+    """Return the parameters that switch on the effects of an FMU for the primitives of a patch.
+
+    An FMU can implement effects itself: `effect.ID.active` switches one on, and `effect.ID.KEY` is
+    a number of its primitive. Primitives of a kind that the FMU does not implement are left out.
 
     Parameters
     ----------
     patch : ModelPatch
-        The primitives of the patch. Those of a kind that the FMU does not implement are left out.
+        The primitives.
     effects : mapping of str to str
-        The id of the FMU's effect, by the kind of the primitive that it implements.
+        The ID of the FMU's effect, by the kind of the primitive that it implements.
     known_parameters : collection of str
         The names of parameters that are set already.
     model_name : str
@@ -34,7 +37,7 @@ def effect_parameters(
     Raises
     ------
     ModelError
-        If the patch has two primitives for one effect.
+        If the patch has two primitives for one effect, or an effect is switched on already.
     """
     parameters: dict[str, float] = {}
     for primitive in patch:
@@ -63,18 +66,26 @@ def first_trial(campaign: Campaign, *, is_dynamic: bool) -> Trial | None:
 
 
 def trial_without_readings(kind: TrialKind, interval: float) -> Trial:
-    """Return a trial without readings, for scales without a campaign."""
+    """Return a trial without readings, for scales without a campaign.
+
+    It has one row if it is static, else 400 samples at the interval [s].
+    """
     count = 1 if kind is TrialKind.STATIC else 400
     return Trial.plain("", kind, (), interval * np.arange(float(count)))
 
 
 def release_values(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
-    """Return the variables that release an FMU, each with its displacement [m] or velocity [m/s].
+    """Return the displacement [m], and velocity [m/s], of the release point by variable of the FMU.
+
+    The first entry of `conditions.initial` is the state of the first mode, relative to the nominal
+    displacement: for a release from rest the relative deviation of the displacement, else amplitude
+    and velocity, the velocity also divided by the angular frequency.
 
     Raises
     ------
     ModelError
-        If the FMU has no such variable, or none for the velocity of a release in motion.
+        If the FMU has no variable that releases it, or none for the velocity although the record
+        does not begin at rest.
     """
     release = require_release(trial)
     variables = fmu.release_variables

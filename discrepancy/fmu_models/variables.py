@@ -139,9 +139,9 @@ class FmuVariables:
     def _bound_parameters(
         self, known_bindings: Mapping[str, ParameterBinding]
     ) -> dict[str, ParameterBinding]:
-        """Return the parameters that the binding does not have, or has in another unit.
+        """Return the parameters of the model that the binding lacks, or has in another unit.
 
-        The value and the range that the binding has in another unit are left out.
+        These are rebound in the unit of the model, without a value and a range of the binding.
         """
         description = self._description
         units: dict[str | None, str] = {
@@ -180,9 +180,10 @@ class FmuVariables:
         return observed
 
     def _expanded_outputs(self, section: FmuOutputSection) -> list[ObservedVariable]:
-        """Return the observed variables of an output section, and store their quantities.
+        """Return the observed variables of an output section, and add them to `quantities`.
 
-        A section may stand for several outputs by a pattern in its name and its variable.
+        A section may stand for several outputs by a pattern `{a..b}` in its name and its variable.
+        Raises `ModelError` if the two stand for different numbers of outputs.
         """
         names = expand(section.name)
         variables = expand(section.variable)
@@ -214,7 +215,10 @@ class FmuVariables:
 
 
 def _variables_by_name(binding: Binding) -> dict[str, str]:
-    """Return the variables of the FMU by the names of a binding, with and without their role."""
+    """Return the variables of the FMU by the names of a binding: as `tip` and as `monitor.tip`.
+
+    If several roles have one name, the name alone is that of the last of them.
+    """
     variables: dict[str, str] = {}
     for role in ("monitor", "load", "health", "control"):
         for key, variable in getattr(binding, role).items():

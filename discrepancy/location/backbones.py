@@ -59,7 +59,8 @@ def backbones(
     """Return how frequency and damping of each mode change along a ring-down.
 
     Damped cosines, one for each mode that still rings, are fitted in windows that overlap by half.
-    The result for a mode is called its backbone: frequency and damping ratio over the amplitude.
+    The result for a mode is called its backbone: frequency and damping ratio over the amplitude. A
+    mode that is not credible in a window (`BackbonePoint.is_credible`) is left out from there on.
 
     Parameters
     ----------
@@ -93,9 +94,9 @@ def backbones(
             f"and at most {time.size}, the record's length, are needed: give a longer or more "
             "finely sampled record."
         )
-    is_ringing = np.ones(start.size, dtype=bool)
+    is_ringing = np.ones(start.size, dtype=bool)  # (modes,)
     poles = (1j - 0.02) * start  # first guess: a damping ratio of 2 %
-    points: list[list[BackbonePoint]] = [[] for _ in start]
+    points: list[list[BackbonePoint]] = [[] for _ in start]  # of each mode, in each window
     for first_sample in range(0, time.size - width + 1, max(1, round(0.5 * width))):
         samples = slice(first_sample, first_sample + width)
         window = DampedCosines(time[samples], signal[samples], averaging_width)
@@ -140,7 +141,8 @@ class BackbonePoint(NamedTuple):
     def is_credible(self, start: float) -> bool:
         """Return whether the mode still rings, at a frequency close to its start value [rad/s].
 
-        Its amplitude must exceed `LEAST_AMPLITUDE` standard errors.
+        Its amplitude must exceed `LEAST_AMPLITUDE` standard errors, its frequency must be within
+        30 % of the start value, and its damping ratio below 0.5.
         """
         change = abs(2.0 * np.pi * self.frequency / start - 1.0)
         is_above_error = self.amplitude > LEAST_AMPLITUDE * self.amplitude_error
@@ -163,23 +165,15 @@ def _points_of_window(
     """Return amplitude, frequency and damping of each mode in a window, with standard errors.
 
     They belong to the centroid of the mode's energy in time, because a mode that decays quickly is
-    visible mainly at the start of the window.
-
-    Parameters
-    ----------
-    time : (N,) ndarray
-        Times in the window [s].
-    solution : DampedCosineFit
-        The damped cosine that was fitted in the window.
-    noise_deviation : float or None
-        The standard deviation of the noise; that of the window's residuals if None.
+    visible mainly at the start of the window. Times (N,) count from the start of the window [s].
+    Standard errors are those for the given noise, or for the residuals of the window if it is None.
     """
     residual_deviation = float(solution.deviation[0])
     deviation = residual_deviation if noise_deviation is None else noise_deviation
     points = []
     for mode in solution.modes:
         decay = -mode.pole.real
-        # energy is proportional to exp(-2 decay t); centred and clipped against overflow
+        # (N,), proportional to exp(-2 decay t); centred and clipped against overflow
         energy = np.exp(-2.0 * np.clip(decay * (time - time[-1] / 2.0), -50.0, 50.0))
         centroid = float(energy @ time / energy.sum())
         # number of equally weighted samples with the same information: (sum w)^2 / sum w^2

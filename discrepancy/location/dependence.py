@@ -27,9 +27,9 @@ from reporting.arrays import AnyArray
 
 
 def mode_bands(frequencies: Sequence[float]) -> list[tuple[float, float]]:
-    """Return the band of each mode [Hz], lowest first.
+    """Return the frequency band of each mode [Hz], lowest first, given their frequencies [Hz].
 
-    Bands end midway (geometrically) between neighbouring frequencies. The lowest begins at half the
+    Bands meet at the geometric mean of neighbouring frequencies. The lowest begins at half the
     first frequency, the highest ends at `sqrt(2)` times the last.
     """
     modes = np.asarray(frequencies, dtype=float)
@@ -61,7 +61,7 @@ def modal_motion(
         w. Its modulus is the amplitude of the mode at each time.
     """
     count = len(values)
-    mirrored_motion = np.concatenate([values[:0:-1], values, values[-2::-1]])
+    mirrored_motion = np.concatenate([values[:0:-1], values, values[-2::-1]])  # (3 N - 2, C)
     spectrum = np.fft.fft(mirrored_motion, axis=0)
     ordinate_frequencies = np.fft.fftfreq(len(spectrum), interval)[:, np.newaxis]
     spectra_of_modes = []
@@ -69,6 +69,7 @@ def modal_motion(
         in_band = (ordinate_frequencies >= low) & (ordinate_frequencies < high)
         # positive frequencies alone, doubled: the analytic signal
         spectra_of_modes.append(2.0 * spectrum * in_band)
+    # without the mirror images
     return np.asarray(np.fft.ifft(spectra_of_modes, axis=1)[:, count - 1 : 2 * count - 1])
 
 
@@ -79,12 +80,13 @@ def mode_shares(
 ) -> FloatArray:
     """Return the fraction (M,) of the excess variance in the frequency band of each mode.
 
-    The excess is the sum of squares of the residuals minus its expectation for white noise.
+    The excess is the sum of squares of the residuals minus its expectation for white noise. If
+    there is none in total, the excess of each band is returned instead, in units of the noise.
 
     Parameters
     ----------
     trials : sequence of FittedTrial
-        The dynamic trials with their predictions and residuals.
+        Dynamic trials, for their sampling intervals.
     white_residuals : sequence of (N, C) ndarray
         The white residuals of each trial.
     frequencies : sequence of float
@@ -95,13 +97,13 @@ def mode_shares(
     for fitted_trial, values in zip(trials, white_residuals, strict=True):
         # An ordinate of the periodogram is one on average for white noise of unit variance, and
         # stands for two terms of the sum of squares: a cosine and a sine.
-        surplus = sum(2.0 * (periodogram(series) - 1.0) for series in values.T)
+        excess = sum(2.0 * (periodogram(series) - 1.0) for series in values.T)  # (ordinates,)
         duration = len(values) * fitted_trial.trial.interval
-        ordinate_frequencies = np.arange(1, np.size(surplus) + 1) / duration
-        total_excess += float(np.sum(surplus))
+        ordinate_frequencies = np.arange(1, np.size(excess) + 1) / duration
+        total_excess += float(np.sum(excess))
         for mode, (low, high) in enumerate(mode_bands(frequencies)):
             in_band = (ordinate_frequencies >= low) & (ordinate_frequencies < high)
-            excess_of_modes[mode] += float(np.sum(surplus, where=in_band))
+            excess_of_modes[mode] += float(np.sum(excess, where=in_band))
     if total_excess <= 0.0:
         return excess_of_modes
     return np.clip(excess_of_modes / total_excess, 0.0, 1.0)
@@ -113,7 +115,8 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     The modes are the highest peaks, sorted by frequency. A peak is the largest ordinate within a
     factor of 1.4 in frequency on both sides, and at least a thousandth of the largest of all. It
     has at least four periods in the record, because a wrong zero or a slow decay looks like a peak
-    at lower frequencies.
+    at lower frequencies. Spectra are summed over the channels and over those trials that are as
+    long and as finely sampled as the longest one.
     """
     longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
     count = len(longest_trial.time)
@@ -186,14 +189,9 @@ def excess_over_noise(trials: Sequence[FittedTrial]) -> float:
 
 
 def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Return piecewise linear hat functions, whose sums are all piecewise linear functions.
+    """Return hat functions, the basis of piecewise linear functions, at values (n,).
 
-    Parameters
-    ----------
-    values : (n,) ndarray
-        Values at which the functions are evaluated.
-    low, high : float
-        The first and the last knot.
+    Their knots are evenly spaced from `low` to `high`.
 
     Returns
     -------
@@ -236,6 +234,7 @@ def explained_dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]
     if trials[0].trial.is_dynamic:
         line = dominant_line(trials)
         modes = predicted_frequencies(trials)
+    # by subject and name of the dependence, for each channel
     equations: dict[tuple[str, str], list[NormalEquations]] = {}
     for column in range(len(trials[0].trial.channels)):
         with_channel = [
@@ -288,9 +287,9 @@ class SpectralLine(NamedTuple):
         Parameters
         ----------
         trials : sequence of FittedTrial
-            The T trials with their predictions and residuals.
+            The T trials; time counts from the start of each.
         column : int
-            The index of the channel's column in the arrays of the trial.
+            The index of the channel in the arrays of the trials.
 
         Returns
         -------
@@ -330,7 +329,7 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
     choices = 0
     for folds in (0.0, 1.0, 3.0, 10.0, 30.0):
         decay = folds / (length * interval)
-        power = np.zeros(frequencies.size)
+        power = np.zeros(frequencies.size)  # explained sum of squares, in units of the noise
         for fitted_trial in evenly_sampled:
             weight = np.exp(-decay * interval * np.arange(len(fitted_trial.trial.time)))
             weighted_residuals = np.nan_to_num(fitted_trial.standardised) * weight[:, np.newaxis]
@@ -358,7 +357,7 @@ def dependence_bases(
     trials : sequence of FittedTrial
         Trials of one kind in which the channel is used.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trials.
     modes : sequence of float
         The frequencies of the modes [Hz].
 
@@ -384,14 +383,9 @@ def dependence_bases(
 
 
 class _UsedSamples:
-    """The used samples of a channel in several trials, one trial after the other.
+    """The n used samples of a channel in several trials, one trial after the other.
 
-    Parameters
-    ----------
-    trials : sequence of FittedTrial
-        The trials with their predictions and residuals.
-    column : int
-        The index of the channel's column in the arrays of the trial.
+    `column` is the index of the channel in the arrays of the trials.
     """
 
     def __init__(self, trials: Sequence[FittedTrial], column: int) -> None:
@@ -418,8 +412,8 @@ class _UsedSamples:
 
     def stack_arrays(self, arrays: Sequence[AnyArray]) -> AnyArray:
         """Return arrays (N, ...) of the trials at the used samples, stacked (n, ...)."""
-        is_used = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
-        return np.concatenate(is_used)
+        used_arrays = [array[rows] for array, rows in zip(arrays, self.rows, strict=True)]
+        return np.concatenate(used_arrays)
 
     def split_by_trial(self, functions: FloatArray) -> FloatArray:
         """Return functions with separate columns for each trial, thus separate coefficients.
@@ -447,7 +441,7 @@ class _UsedSamples:
         They are zero in a trial that lacks them. The names, such as "x", are those of
         `discrepancy.location.map.dependence_functions`.
         """
-        width = 1
+        width = 1  # columns of a function: a harmonic has a cosine and a sine
         for features_of_trial in self._features:
             for name in features_of_trial.keys() & set(names):
                 width = max(width, features_of_trial[name].shape[1])
@@ -460,7 +454,7 @@ class _UsedSamples:
 
 
 def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
-    """Return the functions of time and of load that static readings may depend on.
+    """Return the functions (n, k) of time and of load that static readings may depend on.
 
     The basis of the time also has a constant, so that it does not matter when the time begins. The
     functions of the load are proportional to it (the prediction x and the load itself), or are not
@@ -482,10 +476,11 @@ def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
 def _dynamic_bases(
     samples: _UsedSamples, modes: Sequence[float]
 ) -> dict[tuple[str, str], FloatArray]:
-    """Return the functions of each dependence of dynamic records: drift, motion, harmonics, modes.
+    """Return the functions (n, k) of each dependence of dynamic records, by subject and name.
 
-    For a mode, its predicted motion is multiplied by hat functions of its amplitude or of time, in
-    phase and a quarter of a period out of phase.
+    They are a drift of the zero (Legendre polynomials of time), the predicted displacement x and
+    speed v, and their harmonics. For each mode, its predicted motion is multiplied by hat functions
+    of its amplitude or of time, in phase and a quarter of a period out of phase.
     """
     bases: dict[tuple[str, str], FloatArray] = {}
     relative_time = samples.stack_used_samples(
@@ -506,6 +501,7 @@ def _dynamic_bases(
     time = samples.stack_used_samples(lambda fitted_trial: fitted_trial.trial.time)
     by_time = _hat_functions(time, float(time.min()), float(time.max()))
     for mode in range(len(modes)):
+        # complex: in phase and out of phase, (n, 1)
         motion = samples.stack_arrays([motion_of_trial[mode] for motion_of_trial in motions])
         amplitude = np.abs(motion[:, 0])
         if not amplitude.any():

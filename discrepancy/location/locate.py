@@ -142,12 +142,8 @@ def _disagreements(
 ) -> list[Disagreement]:
     """Return the findings in all kinds of trials, sorted by the excess variance that they explain.
 
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The residuals of the fitted trials.
-    white_residuals : sequence of (N, C) ndarray
-        The white residuals of each trial.
+    `white_residuals` are those of each trial (N, C). For each kind of trial, the findings are its
+    main dependence, if one is significant, and its patterns over the channels.
     """
     findings: list[tuple[float, Disagreement]] = []
     for kind in group_by_kind(residuals, white_residuals):
@@ -165,7 +161,10 @@ def _disagreements(
 
 
 def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
-    """Return the remarks on missing noise records, and on residuals smaller than the noise."""
+    """Return the remarks on missing noise records, and on residuals smaller than the noise.
+
+    Residuals are smaller if a test of their mean square rejects at `_SMALL_RESIDUALS_P_VALUE`.
+    """
     remarks = []
     unrecorded_channels = sorted({*residuals.channel_names} - {*residuals.recorded_channels})
     if unrecorded_channels:
@@ -175,17 +174,17 @@ def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
             "deviation with its degrees of freedom."
         )
     for names in noise_groups(residuals).values():
-        square, freedom = mean_square_ratio(residuals, names)
+        mean_square, freedom = mean_square_ratio(residuals, names)
         if freedom < 1.0:
             continue
         noise_freedom = residuals.degrees_of_freedom(names[0])
-        p_value = variance_p_value(square, freedom, noise_freedom, small=True)
+        p_value = variance_p_value(mean_square, freedom, noise_freedom, small=True)
         if p_value < _SMALL_RESIDUALS_P_VALUE:
             first_names = f"{', '.join(names[:4])}{' ..' if len(names) > 4 else ''}"
             remarks.append(
                 f"Residuals of {first_names} are smaller than their noise record allows (mean "
-                f"square {square:.2g} of its expectation, p = {p_value:.1g}): the stated noise is "
-                "too large, or not that of these channels."
+                f"square {mean_square:.2g} of its expectation, p = {p_value:.1g}): the stated "
+                "noise is too large, or not that of these channels."
             )
     return tuple(remarks)
 
@@ -225,16 +224,15 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
 def _isolated_outliers(absolute_residuals: FloatArray) -> BoolArray:
     """Return which samples (N,) of a record are isolated outliers.
 
-    Parameters
-    ----------
-    absolute_residuals : (N,) ndarray
-        The absolute residuals in units of the noise; nan in gaps.
+    `absolute_residuals` (N,) are in units of the noise, and nan in gaps. The rules are those of
+    `outlier_remarks`.
     """
     finite = absolute_residuals[np.isfinite(absolute_residuals)]
     if not finite.size:
         return np.zeros(len(absolute_residuals), dtype=bool)
+    # the standard deviation of the residuals, estimated by their median
     limit = _LEAST_OUTLIER * max(1.0, float(np.median(finite)) / _MEDIAN_OF_ABSOLUTE_NORMAL)
-    neighbours = np.full((2, len(absolute_residuals)), np.nan)
+    neighbours = np.full((2, len(absolute_residuals)), np.nan)  # the previous and the next sample
     neighbours[0, 1:] = absolute_residuals[:-1]
     neighbours[1, :-1] = absolute_residuals[1:]
     # next to a gap a neighbour is nan, and the comparison with it is false
@@ -245,15 +243,10 @@ def _isolated_outliers(absolute_residuals: FloatArray) -> BoolArray:
 def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Disagreement | None:
     """Return the finding on the dependence that best explains the residuals of a kind of trial.
 
-    Of several dependences that explain nearly the same fraction of the excess variance, the one
-    with the fewest coefficients is taken. None if no dependence is significant.
-
-    Parameters
-    ----------
-    kind : TrialsOfKind
-        The trials of one kind, which have the same channels.
-    patterns : sequence of Disagreement
-        The patterns of these trials over the channels.
+    A dependence is significant if it explains at least `_LEAST_SHARE` of the excess variance with a
+    p-value below 1e-3. Of several that explain nearly the same fraction, the one with the fewest
+    coefficients is taken. The result is None if none is significant. The patterns of these trials
+    over the channels may show that the finding concerns a single channel.
     """
     candidates = list(explained_dependences(kind.trials))
     significant = [
@@ -276,10 +269,9 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
         phrase = "by amplitude or time (these releases do not tell the two apart)"
     if simplest.name.startswith("a "):  # a line or a drift
         phrase = simplest.name
+        # a line with its own frequency, or a drift, is not a mode of the model
         if subject.startswith("mode"):
-            subject = (
-                "all channels"  # a line with its own frequency is not one of a mode of the model
-            )
+            subject = "all channels"
     capitalised = f"{subject[0].upper()}{subject[1:]}"
     return kind.disagreement(
         subject, simplest.name, f"{capitalised}, {phrase},", simplest.share, simplest.p_value
@@ -289,7 +281,10 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
 def _amplitude_and_time_look_alike(
     dependence: Dependence, candidates: Sequence[Dependence]
 ) -> bool:
-    """Return whether a dependence on amplitude explains as much as one on time, or the reverse."""
+    """Return whether amplitude and time explain about as much of the same subject's residuals.
+
+    `dependence` is the one of the two that was chosen. For any other the answer is no.
+    """
     other_name = {"amplitude": "time", "time": "amplitude"}.get(dependence.name)
     return any(
         candidate.subject == dependence.subject
@@ -302,14 +297,9 @@ def _amplitude_and_time_look_alike(
 def _disagreeing_subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
     """Return the subject of a disagreement: a channel, the mode with most excess, or all channels.
 
-    A channel or a mode is named only if it has more than half of the excess variance.
-
-    Parameters
-    ----------
-    kind : TrialsOfKind
-        The trials of one kind, which have the same channels.
-    patterns : sequence of Disagreement
-        The patterns of these trials over the channels.
+    A channel is named if it is the only one, or if its pattern over the channels explains more than
+    half of the excess variance. Otherwise a mode is named if its band of frequencies has more than
+    half of it.
     """
     channels = kind.trials[0].trial.channels
     for pattern in patterns:

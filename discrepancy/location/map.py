@@ -56,13 +56,13 @@ def normal_equations_of(
     rows : sequence of (FittedTrial, (N,) ndarray of bool)
         Trials, and which of their N samples are the rows of `basis`, one trial after the other.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trials.
 
     Returns
     -------
     NormalEquations or None
-        None if all functions are zero, or if there are as many functions as samples, which would
-        fit any residuals exactly.
+        The normal equations; functions that are zero everywhere are left out. None if all are, or
+        if there are as many functions as samples, which would fit any residuals exactly.
     """
     norms = np.linalg.norm(basis, axis=0)
     basis = basis[:, norms > 0.0] / norms[norms > 0.0]
@@ -114,8 +114,8 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
     equations : sequence of NormalEquations
         The normal equations of each channel; every channel has its own coefficients.
     """
-    projection = np.concatenate([equation.projection for equation in equations])
-    variances, directions = np.linalg.eigh(_covariance_of_projection(equations))
+    projection = np.concatenate([equation.projection for equation in equations])  # (K,)
+    variances, directions = np.linalg.eigh(_covariance_of_projection(equations))  # (K,), (K, K)
     is_remaining = variances > _LEAST_REMAINING_VARIANCE
     components = directions[:, is_remaining].T @ projection
     squares = components**2 / variances[is_remaining]
@@ -125,13 +125,10 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedS
 
 
 def _covariance_of_projection(equations: Sequence[NormalEquations]) -> FloatArray:
-    """Return G = B^T B - (S^T B)^T (S^T B), with the functions B of all K coefficients, (K, K).
+    """Return the covariance G = B^T B - (S^T B)^T (S^T B) of the projection, (K, K).
 
-    Parameters
-    ----------
-    equations : sequence of NormalEquations
-        The normal equations of each channel. Without the sensitivities S of one of them nothing
-        counts as absorbed by the fit.
+    B are the functions of all channels, with K coefficients in total. If one channel lacks the
+    sensitivities S, nothing counts as absorbed by the fit.
     """
     gram = np.asarray(block_diag(*(equation.gram for equation in equations)))
     has_sensitivities = all(len(equation.absorbed_by_fit) > 0 for equation in equations)
@@ -147,14 +144,14 @@ def motion_envelope(fitted_trial: FittedTrial, column: int) -> FloatArray:
 
     It is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the rate v,
     averaged over one period. The angular frequency w is the rms of v over the rms of x, as it is
-    for a harmonic motion.
+    for a harmonic motion. If nothing moves, it is |x|.
 
     Parameters
     ----------
     fitted_trial : FittedTrial
-        The trial with its prediction, residuals, and the rates of the prediction.
+        The trial, with the rates of its prediction.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trial.
 
     Returns
     -------
@@ -197,15 +194,16 @@ def dependence_functions(fitted_trial: FittedTrial, column: int) -> dict[str, Fl
     Parameters
     ----------
     fitted_trial : FittedTrial
-        The trial with its prediction and residuals.
+        The trial, with its prediction; the functions of the rate need the rates of the prediction.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trial.
 
     Returns
     -------
     dict of str to (n, k) ndarray
         Values of each function, k = 1 or 2 columns, at the n used samples. The names are those of
-        `Cell.statistic`.
+        `Cell.statistic`. Functions that are zero, or of which nothing remains after the projection,
+        are left out.
     """
     is_used = fitted_trial.used[:, column]
     trial = fitted_trial.trial
@@ -232,6 +230,7 @@ def dependence_functions(fitted_trial: FittedTrial, column: int) -> dict[str, Fl
                 amplitude * np.cos(order * phase),
                 amplitude * np.sin(order * phase),
             ]
+    # orthonormal bases of the mean, x and v (n, 2 or 3), and of the mean alone (n, 1)
     scaled_functions = [values / _rms_or_one(values) for values in linear_functions.values()]
     linear_basis, _ = np.linalg.qr(np.column_stack(scaled_functions))
     mean_basis = linear_basis[:, :1]
@@ -249,20 +248,10 @@ def dependence_functions(fitted_trial: FittedTrial, column: int) -> dict[str, Fl
 def _add_projected_function(
     functions: dict[str, FloatArray], name: str, columns: FloatArray, basis: FloatArray
 ) -> None:
-    """Add a function to a dictionary after it was made orthogonal to a basis.
+    """Add a function to `functions`, in place, after it was made orthogonal to a basis.
 
-    It is not added if hardly anything remains of one of its columns.
-
-    Parameters
-    ----------
-    functions : dict of str to ndarray
-        The functions by name, changed in place.
-    name : str
-        The name of the function.
-    columns : (n, k) ndarray
-        The values of the k columns of the function at n samples.
-    basis : (n, b) ndarray
-        The orthonormal columns that are projected out.
+    It is not added if less than 1e-6 of the norm of one of its columns remains. The function has k
+    columns (n, k), and the columns of the basis (n, b) are orthonormal.
     """
     projected_columns = columns - basis @ (basis.T @ columns)
     norms = np.linalg.norm(columns, axis=0)
@@ -362,14 +351,9 @@ def _cells_of_trial(
 ) -> Iterator[Cell]:
     """Yield the cells of a trial: its whole records, and their bins.
 
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The set, for the noise records.
-    fitted_trial : FittedTrial
-        The trial with its prediction and residuals.
-    white_residuals : (N, C) ndarray
-        The white residuals of the trial.
+    Whole records are tested for all dependences, bins for the mean, and both for the variance. The
+    white residuals (N, C) are tested in bands of frequency, if all samples of a dynamic record are
+    used.
     """
     trial = fitted_trial.trial
     for column, channel in enumerate(trial.channels):
@@ -454,18 +438,10 @@ def _spans(fitted_trial: FittedTrial, column: int) -> Iterator[_Span]:
 def _spans_of_bins(
     axis: str, values: FloatArray, edges: FloatArray, is_used: BoolArray
 ) -> Iterator[_Span]:
-    """Yield a span for each bin of an axis.
+    """Yield a span for each bin of an axis that has a width.
 
-    Parameters
-    ----------
-    axis : str
-        The name of the axis.
-    values : (N,) ndarray
-        The value of each sample on the axis.
-    edges : (B + 1,) ndarray
-        The edges of the bins, ascending.
-    is_used : (N,) ndarray of bool
-        Whether each sample is used.
+    `values` (N,) are those of the samples on the axis, and `edges` (B + 1,) the ascending edges of
+    B bins. Samples outside of them belong to the first or the last bin.
     """
     bin_of_sample = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
     for bin_index, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -535,15 +511,15 @@ def _variance_cells(
 ) -> Iterator[Cell]:
     """Yield a cell with the sum of squared residuals over its expectation.
 
-    Nothing is yielded without a noise record, with too few samples, or if the fit has absorbed the
-    residuals.
+    Nothing is yielded without a noise record (`noise_freedom` of 0), with too few samples, or if
+    the fit has absorbed the residuals.
 
     Parameters
     ----------
     fitted_trial : FittedTrial
-        The trial with its prediction and residuals.
+        The trial.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trial.
     is_used : (N,) ndarray of bool
         The samples of the cell.
     cell : Cell
@@ -570,9 +546,10 @@ def _variance_cells(
 def _frequency_cells(
     series: FloatArray, interval: float, template: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the variance of a channel's residuals in bands of frequency, and its p-value.
+    """Yield a cell of the map with the variance of a channel's residuals in each frequency band.
 
-    Each band is one cell of the map of residuals. Bands are wider at high frequency.
+    Bands are wider at high frequency. Nothing is yielded without a noise record, or for a record
+    too short for `BIN_COUNT` bands of four ordinates on average.
 
     Parameters
     ----------
@@ -585,8 +562,7 @@ def _frequency_cells(
     noise_freedom : float
         The degrees of freedom of the channel's noise record; 0 if it has none.
     """
-    ordinates = periodogram(series)  # of the frequencies 1, 2, 3, ... times the resolution
-    # With four ordinates in each band on average, the variance of a band can be tested.
+    ordinates = periodogram(series)  # at the frequencies 1, 2, 3, ... times the resolution
     is_too_short = ordinates.size < 4 * BIN_COUNT
     if is_too_short or noise_freedom <= 0.0:
         return

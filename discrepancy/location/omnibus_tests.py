@@ -49,9 +49,9 @@ class OmnibusTest:
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
     """Group the channels that share one noise record.
 
-    Channels with equal stated noise share one record, so that their variance tests are not
-    independent. A recorded noise belongs to its own channel. Channels without a noise record are
-    left out.
+    Channels of one quantity with equal stated noise share one record, so that their variance tests
+    are not independent. A recorded noise belongs to its own channel. Channels without a noise
+    record are left out.
 
     Returns
     -------
@@ -84,20 +84,20 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
         The test; its statistic is nan if no channel has a noise record.
     """
     subsets = [residuals, *_split_by_kind(residuals)]
-    p_values_of_groups: list[float] = []
-    records: list[_RecordVariance] = []
+    p_values_of_groups: list[float] = []  # of each noise record
+    records: list[_RecordVariance] = []  # of each channel in each trial
     weighted_sum = 0.0
     total_freedom = 0.0
     for names in noise_groups(residuals).values():
         noise_freedom = residuals.degrees_of_freedom(names[0])
         p_values = []
         for subset in subsets:
-            square, freedom = mean_square_ratio(subset, names)
+            mean_square, freedom = mean_square_ratio(subset, names)
             if freedom < LEAST_FREEDOM:
                 continue
-            p_values.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
+            p_values.append(noise_tests.variance_p_value(mean_square, freedom, noise_freedom))
             if subset is residuals:
-                weighted_sum = weighted_sum + square * freedom
+                weighted_sum = weighted_sum + mean_square * freedom
                 total_freedom = total_freedom + freedom
         if p_values:
             p_values_of_groups.append(min(1.0, len(p_values) * min(p_values)))
@@ -133,9 +133,9 @@ def _variance_tests_of_records(
     for fitted_trial in residuals.trials:
         single_trial = replace(residuals, trials=(fitted_trial,))
         for name in channels:
-            square, freedom = mean_square_ratio(single_trial, (name,))
+            mean_square, freedom = mean_square_ratio(single_trial, (name,))
             if freedom >= LEAST_FREEDOM:
-                p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
+                p_value = noise_tests.variance_p_value(mean_square, freedom, noise_freedom)
                 yield _RecordVariance(f"{fitted_trial.trial.name}, {name}", p_value)
 
 
@@ -206,7 +206,7 @@ class _RecordTest(NamedTuple):
 def _combine_record_tests(name: str, tests: Sequence[_RecordTest]) -> OmnibusTest:
     """Return the tests of all records combined into one; its p-value is nan if there are none.
 
-    Statistic and place are those of the record with the least p-value.
+    The statistic, and the trial and channel, are those of the record with the least p-value.
     """
     if not tests:
         return OmnibusTest(name, np.nan, np.nan, "")
@@ -216,7 +216,10 @@ def _combine_record_tests(name: str, tests: Sequence[_RecordTest]) -> OmnibusTes
 
 
 def coloured_noise_remarks(residuals: ResidualSet) -> dict[str, str]:
-    """Return a remark on each channel whose noise record is not white itself, by its name."""
+    """Return a remark on each channel whose noise record is not white itself, by its name.
+
+    The remark names the spectral line of the record if there is a significant one.
+    """
     remarks = {}
     for name, channel in residuals.channels.items():
         series = record_at_rest(channel)

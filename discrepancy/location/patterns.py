@@ -74,18 +74,10 @@ class TrialsOfKind(NamedTuple):
     def disagreement(
         self, subject: str, dependence: str, phrase: str, share: float, p_value: float
     ) -> Disagreement:
-        """Return the record of a finding on these trials, with the sentence that tells it.
+        """Return the record of a finding on these trials.
 
-        Parameters
-        ----------
-        subject, dependence : str
-            The subject and the dependence that the finding states.
-        phrase : str
-            The beginning of the sentence that tells the finding.
-        share : float
-            The fraction of the excess variance that it explains.
-        p_value : float
-            The p-value of the finding.
+        Its sentence consists of the phrase, the kind of trials, the explained fraction of the
+        excess variance (`share`) and the p-value.
         """
         p_text = "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.1g}"
         sentence = (
@@ -98,14 +90,9 @@ class TrialsOfKind(NamedTuple):
 def group_by_kind(
     residuals: ResidualSet, white_residuals: Sequence[FloatArray]
 ) -> list[TrialsOfKind]:
-    """Return the trials grouped by kind and channels; the residuals of a group form one matrix.
+    """Return the trials, with the white residuals (N, C) of each, grouped by kind and channels.
 
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The residuals of all trials, with the channels.
-    white_residuals : sequence of (N, C) ndarray
-        The white residuals of each trial.
+    A second group of one kind has a number in its name, such as "static (2)".
     """
     groups: dict[tuple[str, tuple[str, ...]], TrialsOfKind] = {}
     for fitted_trial, values in zip(residuals.trials, white_residuals, strict=True):
@@ -128,7 +115,8 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
     size. The square of that value has the law of Tracy and Widom (Johnstone 2001, Ann. Statist. 29,
     295-327), approximated by a shifted gamma distribution with the same moments (Chiani 2014,
     J. Multivar. Anal. 129, 69-81). The p-value is averaged over the error of the noise records,
-    because a channel whose noise was underestimated looks like a pattern.
+    because a channel whose noise was underestimated looks like a pattern. At most `MOST_PATTERNS`
+    are returned, up to the first with a p-value above `PATTERN_LEVEL`.
 
     Parameters
     ----------
@@ -137,7 +125,7 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
     kind : TrialsOfKind
         The trials of one kind, which have the same channels.
     """
-    matrix = np.vstack(kind.white)
+    matrix = np.vstack(kind.white)  # (samples of all trials, channels)
     sample_count, channel_count = matrix.shape
     if min(sample_count, channel_count) < 2:
         return []
@@ -221,20 +209,11 @@ class _PatternMeaning(NamedTuple):
 def _interpret_pattern(
     residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
 ) -> _PatternMeaning:
-    """Interpret a pattern over the channels by the known pattern that it agrees with best.
+    """Interpret a pattern `weights` (C,) over the channels by the known one that it resembles most.
 
-    The agreement is the squared cosine of the angle between the two. The meaning is "mixed" if it
-    is less than `LEAST_AGREEMENT` for all known patterns, or if two of them agree about equally
-    well.
-
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The set, for the channels.
-    trials : sequence of FittedTrial
-        The trials in which it shows.
-    weights : (C,) ndarray
-        The pattern: one weight for each of the C channels.
+    The agreement of two patterns is the squared cosine of the angle between them. The meaning is
+    "mixed" if it is less than `LEAST_AGREEMENT` for all known patterns, or if a known pattern of
+    another meaning agrees within 0.05 of the best one.
     """
     channels = trials[0].trial.channels
     agreements = []
@@ -264,15 +243,16 @@ def _known_patterns(
 ) -> Iterator[tuple[_PatternMeaning, FloatArray]]:
     """Yield the patterns over C channels that have a known meaning, with this meaning.
 
-    They are one channel alone, the same physical value in all channels, and the main pattern of the
-    predicted motion, which is zero if the predictions are zero.
+    They are one channel alone, the same physical value in all channels (if all measure the same
+    quantity), and the main pattern of the predicted motion, which is zero if the predictions are
+    zero.
 
     Parameters
     ----------
     residuals : ResidualSet
         The set, for the quantities of the channels.
     trials : sequence of FittedTrial
-        The trials with their predictions and residuals.
+        The trials, for their predictions.
     weights : (C,) ndarray
         The pattern to interpret; its largest entry selects the single channel.
 
@@ -297,7 +277,7 @@ def _known_patterns(
     for fitted_trial in trials:
         # deviations from the mean, in units of the noise
         predictions.append((fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)) / noise)
-    prediction = np.vstack(predictions)
+    prediction = np.vstack(predictions)  # (samples of all trials, C)
     _, _, right_vectors = np.linalg.svd(prediction, full_matrices=False)
     response = right_vectors[0] if np.any(prediction) else 0.0 * right_vectors[0]
     phrase = "The pattern of the predicted response itself (dynamics, load, or clock)"

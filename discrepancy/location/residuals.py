@@ -109,7 +109,7 @@ class ChannelFit(NamedTuple):
     fitted_trial : FittedTrial
         The trial with its prediction and residuals.
     column : int
-        The index of the channel's column in the arrays of the trial.
+        The index of the channel in the arrays of the trial.
     used : (N,) ndarray of bool
         False for samples that are left out.
     """
@@ -208,13 +208,13 @@ class ResidualSet:
         """Return residuals that are white with unit variance if the model is right.
 
         A fit absorbs part of the noise: its residuals r have the covariance I - S S^T. The sum
-        r + S z, with one standard normal vector z for all trials, has the covariance I: a residual
-        at a draw of the posterior is distributed as the noise itself (Johnson 2007, Bayesian
-        Analysis 2(4), 719-734). In held-out trials r contains the error of the parameters, which
-        is subtracted; see `_held_out_draw`. Without sensitivities, sqrt(leverage) z is added with
-        an independent z for each sample, and residuals with a variance above that of the noise are
-        divided by their standard deviation. Samples that are not used are replaced by draws of the
-        noise, so that series stay evenly spaced.
+        r + S z, with one standard normal vector z for all trials, has the covariance I: the
+        residual at a draw of the posterior is distributed as the noise itself (Johnson 2007,
+        Bayesian Analysis 2(4), 719-734). In held-out trials r contains the error of the parameters,
+        which is subtracted; see `_held_out_draw`. Without sensitivities, sqrt(leverage) z is added
+        with an independent z for each sample, and residuals with a variance above that of the noise
+        are divided by their standard deviation. Samples that are not used are replaced by draws of
+        the noise, so that series stay evenly spaced.
 
         Parameters
         ----------
@@ -226,12 +226,12 @@ class ResidualSet:
         tuple of (N, C) ndarray
             The white residuals of each trial.
         """
-        draw = generator.standard_normal(self._parameter_count())
-        held_out_draw = self._held_out_draw(draw)
+        draw = generator.standard_normal(self._parameter_count())  # (P,)
+        held_out_draw = self._held_out_draw(draw)  # (P,)
         white_residuals = []
         for fitted_trial in self.trials:
             noise = generator.standard_normal(fitted_trial.residual.shape)
-            residual = np.nan_to_num(fitted_trial.standardised)
+            residual = np.nan_to_num(fitted_trial.standardised)  # (N, C)
             if fitted_trial.sensitivity is None:
                 absorbed_variance = np.clip(1.0 - fitted_trial.expected_variance, 0.0, 1.0)
                 restored_noise = np.sqrt(absorbed_variance) * generator.standard_normal(
@@ -239,7 +239,7 @@ class ResidualSet:
                 )
                 residual = residual + restored_noise
                 residual = residual / np.sqrt(np.maximum(fitted_trial.expected_variance, 1.0))
-            elif fitted_trial.trial.held_out:
+            elif fitted_trial.trial.held_out:  # sensitivity is (N, C, P)
                 residual = residual - fitted_trial.sensitivity @ held_out_draw
             else:
                 residual = residual + fitted_trial.sensitivity @ draw
@@ -284,7 +284,7 @@ class ResidualSet:
         weighted_residual = np.zeros(draw.size)
         for fitted_trial in self.trials:
             if fitted_trial.trial.held_out and fitted_trial.sensitivity is not None:
-                sensitivity = fitted_trial.sensitivity[fitted_trial.used]
+                sensitivity = fitted_trial.sensitivity[fitted_trial.used]  # (used samples, P)
                 precision += sensitivity.T @ sensitivity
                 weighted_residual += sensitivity.T @ fitted_trial.standardised[fitted_trial.used]
         mean = np.linalg.solve(precision, weighted_residual)
@@ -294,9 +294,10 @@ class ResidualSet:
 
 
 def without_coloured_records(residuals: ResidualSet) -> ResidualSet:
-    """Mark the records with coloured noise that cannot be whitened as not used.
+    """Return the set without the records whose coloured noise cannot be whitened.
 
-    Correlated noise in them would be taken for a discrepancy of the model.
+    They stay in it with all samples marked as not used. Correlated noise in them would be taken for
+    a discrepancy of the model.
     """
     noise = {name: noise_model(channel, 1.0) for name, channel in residuals.channels.items()}
     trials = []
@@ -385,14 +386,9 @@ class MeanSquareRatio(NamedTuple):
 
 
 def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> MeanSquareRatio:
-    """Return the sum of squares of channels' residuals divided by its expectation.
+    """Return the sum of squares of some channels' residuals in all trials over its expectation.
 
-    Parameters
-    ----------
-    residuals : ResidualSet
-        Trials that are all fitted, or all held out.
-    channels : sequence of str
-        The names of the channels.
+    The trials of the set must be all fitted, or all held out.
     """
     sum_of_squares = 0.0
     records = []

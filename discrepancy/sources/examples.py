@@ -114,7 +114,9 @@ def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
 
 
 def usual_plan(model: Model) -> ExamplePlan:
-    """Return the usual plan for a model: gauges and tip of a wing, else outputs at rest.
+    """Return the usual plan for a model: gauges and tip of a wing, else all outputs of order zero.
+
+    Velocities and accelerations are not measured. The force acts at the first load place.
 
     Raises
     ------
@@ -140,7 +142,8 @@ def plan_from_scales(
     """Return a plan for any model, from its natural scales.
 
     The largest load moves the model by 2 % of its length. The noise of a channel is 0.1 % of its
-    reading under that load.
+    reading under that load, and the deviation of its zero twice that. Ring-downs last 20 periods of
+    the first mode, with 50 samples in each.
 
     Parameters
     ----------
@@ -179,7 +182,8 @@ def plan_from_scales(
         interval=period / 50.0,
         load_place=load_place,
     )
-    # noise from the readings under the largest force; a channel that shows nothing gets the largest
+    # noise from the readings (C,) under the largest force; a channel that shows nothing gets the
+    # noise of the channel with the largest reading
     trial = _planned_static_trial("", plan, np.array([force]), start=0.0)
     conditions = prior_conditions(campaign, model, trial)
     readings = np.abs(observe(model, campaign, trial, ModelPatch(), conditions).values[0])
@@ -271,16 +275,9 @@ def example_campaign(
 def _with_samples_at_rest(
     channel: Channel, plan: ExamplePlan, generator: np.random.Generator
 ) -> Channel:
-    """Return a channel with a noise record of simulated samples at rest, if it has noise.
+    """Return a channel whose noise record holds simulated samples at rest.
 
-    Parameters
-    ----------
-    channel : Channel
-        The channel with its quantity and noise record.
-    plan : ExamplePlan
-        The plan, for the sampling interval.
-    generator : Generator
-        The source of the random noise.
+    A channel without noise is returned as it is, and takes no random numbers.
     """
     if channel.noise is None:
         return channel
@@ -311,8 +308,9 @@ def write_example(
 def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     """Return the trials of a kind without readings; one of each kind is held out.
 
-    Static trials load and unload the model in steps of a fifth of the plan's force. Flights take
-    its load factors. Ring-downs are released from its displacement and from fractions of it.
+    Three static trials load, unload and load the model again in steps of a fifth of the plan's
+    force. Two flights take its load factors, the second without the first of them. Four ring-downs
+    are released from fractions of its displacement.
     """
     if kind is TrialKind.STATIC:
         levels = plan.force * np.arange(6, dtype=np.float64) / 5.0
@@ -332,7 +330,6 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
     time = plan.interval * samples
     releases = []
-    # each release from a smaller fraction of the plan's displacement; the third is held out
     for number, fraction in enumerate((1.0, 0.7, 0.5, 0.3), start=1):
         releases.append(
             Trial.plain(
@@ -391,20 +388,10 @@ def _simulate_readings(
     gains: Mapping[str, float],
     generator: np.random.Generator,
 ) -> Trial:
-    """Return a trial whose readings are simulated by the model, with noise.
+    """Return a trial with simulated readings of a structure: the model, and the effects of a patch.
 
-    Parameters
-    ----------
-    model, patch
-        The model, and the effects that the structure has in addition.
-    campaign : Campaign
-        The campaign with its channels.
-    trial : Trial
-        The trial, whose readings are still empty.
-    gains : mapping of str to float
-        The gain of each channel, by its name.
-    generator : Generator
-        The source of the errors of release and zeros, and of noise.
+    The errors of the release and of the zeros, and the noise, are drawn from the generator; the
+    gains are given by channel.
     """
     conditions = prior_conditions(campaign, model, trial)
     if trial.release is not None:
@@ -424,8 +411,5 @@ def _simulate_readings(
 
 
 def _finite_or_zero(deviation: float) -> float:
-    """Return a standard deviation, or 0 for an infinite one (a quantity that is not known at all).
-
-    An example draws no error of such a quantity.
-    """
+    """Return a standard deviation; 0 for an infinite one, since no error can be drawn from it."""
     return deviation if np.isfinite(deviation) else 0.0

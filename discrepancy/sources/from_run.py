@@ -105,7 +105,7 @@ def run_campaign(
 
 
 def _check_scenario(folder: Path, scenario: JsonObject) -> None:
-    """Refuse a run whose asset is not the wing, or that has a steady force at the tip."""
+    """Raise an error if the asset of a run is not the wing, or has a steady force at the tip."""
     states = {state["name"] for state in scenario["state"]}
     is_of_wing = scenario["observation"].get("role") == STRAIN
     if not is_of_wing or states != {*records.USUAL_REGIONS}:
@@ -142,26 +142,15 @@ def _build_campaign(
     """Return some steps of a run as a campaign of one flight, with some of its steps held out.
 
     The strains are the readings that the twin observed; those that were lost are not used. The
-    health is the twin's smoothed estimate.
-
-    Parameters
-    ----------
-    folder : path
-        The folder of the run.
-    run : DataTree
-        The content of `run.nc`.
-    scenario : dict
-        The content of the scenario file.
-    steps : slice
-        The labels of the first and the last step.
-    held_out_share : float
-        The fraction of the steps that is held out.
+    health is the twin's smoothed estimate, with a standard deviation of at least
+    `HEALTH_DEVIATION`. `run` is the content of `run.nc`, and `steps` goes from the label of the
+    first step to that of the last, which is included.
     """
     observed_steps = run["observed"].to_dataset().sel(step=steps)
     count = observed_steps.sizes["step"]
     if not count:
         raise CampaignDataError(_no_steps_message(folder, run, steps))
-    strain = np.asarray(observed_steps[STRAIN].values, dtype=np.float64)
+    strain = np.asarray(observed_steps[STRAIN].values, dtype=np.float64)  # (steps, gauges)
     is_used = np.isfinite(strain)
     if not is_used.any():
         raise CampaignDataError(
@@ -216,14 +205,8 @@ def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, re
 def _flight_remarks(is_used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
     """Return the remarks on a flight: its length, its noise, and its lost readings.
 
-    Parameters
-    ----------
-    is_used : (N, C) ndarray of bool
-        False for readings of N steps that were lost.
-    noise : float
-        The standard deviation of a gauge's noise [1].
-    source_of_noise : str
-        Where it is stated, as a phrase.
+    `is_used` (N, C) is False for readings of N steps that were lost, `noise` the standard deviation
+    of a gauge's noise [1], and `source_of_noise` the phrase on where it is stated.
     """
     remarks = [
         f"Flight of {counted(len(is_used), 'step')} read from a run folder; health in each step: "
@@ -305,14 +288,15 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
 def _is_calibrated_wing(folder: Path) -> bool:
     """Return whether the run folder has a calibration of a wing.
 
-    The calibration of another model's parameters contains no wing design.
+    The calibration of another model's parameters contains no wing design. For a damaged file the
+    answer is yes, since the error is raised where the file is used.
     """
     file = folder / CALIBRATION_FILE
     if not file.is_file():
         return False
     try:
         return load_calibration(file).design is not None
-    except CalibrationError:  # its message is raised where the file is used
+    except CalibrationError:
         return True
 
 
@@ -335,7 +319,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     """
     block_count = count // block
     held_out_count = min(round(share * count / block), block_count - 1)
-    # n + 1 block numbers from 1 to the last; without the last of them, n are evenly spread
+    # indices of n blocks: n + 1 evenly spread ones from block 1 to the last, without the last
     held_out_blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
     return np.isin(np.arange(count) // block, held_out_blocks)
 
@@ -344,7 +328,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
 
 
 def _read_config(folder: Path) -> JsonObject:
-    """Return the content of `config.json`, which has a scenario."""
+    """Return the content of `config.json`; raise `CampaignFileError` if it has no scenario."""
     with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is not a run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
@@ -397,7 +381,8 @@ def _end_times(folder: Path, steps: records.FloatArray) -> records.FloatArray:
 def _temperature_rises(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
     """Return the temperatures of steps (N,) minus the reference temperature [K].
 
-    None if they were not recorded.
+    What the twin observed comes before what the simulation stored as truth. The result is None if
+    neither has a temperature.
     """
     for group, name in product(("observed", "truth"), TEMPERATURE):
         if group in run.children and name in run[group]:
@@ -407,7 +392,10 @@ def _temperature_rises(run: xr.DataTree, steps: slice) -> records.FloatArray | N
 
 
 def _strain_noise(scenario: JsonObject) -> tuple[float, str]:
-    """Return the standard deviation of a strain reading [1], and its source as a phrase."""
+    """Return the standard deviation of a strain reading [1], and its source as a phrase.
+
+    It is that of the simulated gauges if the scenario states it, else the one that the twin uses.
+    """
     truth = scenario.get("truth") or {}
     deviation = (truth.get("noise") or {}).get("standard_deviation")
     if deviation:

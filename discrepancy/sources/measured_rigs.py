@@ -11,6 +11,7 @@ from scipy.signal import savgol_filter
 
 from discrepancy.campaign.reading import CAMPAIGN_FILE
 from discrepancy.campaign.records import FloatArray
+from discrepancy.checks.held import runs_of_true
 from discrepancy.errors import CampaignFileError
 from discrepancy.sources.real_wing import real_wing
 from discrepancy.sources.rig_files import RigFiles
@@ -41,7 +42,10 @@ Deviations of noise are those of the sixth differences of its records."""
 
 
 def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) -> Path:
-    """Write a campaign, and the `model.toml` of a rig, from a folder of published measurements.
+    """Write the campaign of a rig from a folder of published measurements.
+
+    The shipped TOML files of the rig (`campaign.toml`, and `model.toml` if it has one) are written
+    too; trials, channels and remarks that come from the records are added to `campaign.toml`.
 
     Parameters
     ----------
@@ -87,23 +91,11 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: object) ->
 def _read_numbers(
     file: Path, columns: Sequence[str], separator: str | None = ",", skipped: int = 1
 ) -> dict[str, FloatArray]:
-    """Return the first columns of a published table, by name.
+    """Return the first columns (N,) of a published table, by the names given in their order.
 
-    Parameters
-    ----------
-    file : Path
-        The path of the table.
-    columns : sequence of str
-        The names of the columns, in order; an increasing "time" first if there is one.
-    separator : str or None
-        The character between cells; None for blanks.
-    skipped : int
-        The number of lines before the first line of numbers.
-
-    Raises
-    ------
-    CampaignFileError
-        If there is no such file, or it is not as it was published.
+    `separator` is None for blanks between cells, and `skipped` the number of lines before the first
+    line of numbers. Raises `CampaignFileError` if there is no such file, if it has fewer than 8
+    rows or a cell that is no number, or if a column "time" does not increase.
     """
     if not file.is_file():
         raise CampaignFileError(f"There is no {file}: give the folder of the published records.")
@@ -127,7 +119,7 @@ def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return the longest free fall in a record of a phone, without `END_CUT` seconds at its ends.
 
     The accelerometer of a phone in free fall reads nearly zero, as it shows acceleration minus
-    gravity.
+    gravity. The phone falls while the absolute reading is below `LARGEST_FALLING_READING`.
 
     Returns
     -------
@@ -142,26 +134,23 @@ def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
         If the file is not as it was published, or holds no fall.
     """
     columns = _read_numbers(file, ("time", "x", "y", "z"))
-    is_falling = np.abs(columns["z"]) < LARGEST_FALLING_READING
-    # falls begin and end in turn where `is_falling` changes
-    edges = np.flatnonzero(np.diff(np.r_[False, is_falling, False].astype(int)))
-    begins, ends = edges[::2], edges[1::2]
-    if not len(begins):
+    falls = runs_of_true(np.abs(columns["z"]) < LARGEST_FALLING_READING)  # (falls, 2)
+    if not len(falls):
         raise CampaignFileError(
             f"{file} holds no fall: its column z never stays below {LARGEST_FALLING_READING:g} "
             "m/s2."
         )
-    longest_run = int(np.argmax(ends - begins))
-    in_fall = slice(begins[longest_run], ends[longest_run])
+    first_sample, end = falls[int(np.argmax(falls[:, 1] - falls[:, 0]))]
+    in_fall = slice(first_sample, end)
     time, acceleration = columns["time"][in_fall], columns["z"][in_fall]
     is_inside = (time >= time[0] + END_CUT) & (time <= time[-1] - END_CUT)
     return np.round(time[is_inside] - time[0], 9), acceleration[is_inside]
 
 
 def _phone_files(data: Path) -> RigFiles:
-    """Return the files of a campaign of falls of a phone.
+    """Return the files of a campaign of falls of a phone, and of its noise record.
 
-    Its sensor shows acceleration minus gravity, thus only its bias in a free fall.
+    The accelerometer shows acceleration minus gravity, so that a free fall shows its bias alone.
     """
     at_rest = _read_numbers(
         data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0
@@ -190,7 +179,10 @@ def _phone_files(data: Path) -> RigFiles:
 
 
 def _tank_files(data: Path) -> RigFiles:
-    """Return the files of two records of two tanks: one for estimation, one for validation."""
+    """Return the files of two records of two tanks: one for estimation, one for validation.
+
+    Readings at the end of the range of the level sensor become empty cells.
+    """
     columns = _read_numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
     # the records have no times: they were sampled every 4 s
     time: FloatArray = 4.0 * np.arange(len(columns["uEst"]), dtype=np.float64)
@@ -207,41 +199,25 @@ def _tank_files(data: Path) -> RigFiles:
 def _pendulum_files(data: Path) -> RigFiles:
     """Return the files of two records of a pendulum, with the angle as input and torque as output.
 
-    The rod turns over: a motion that was simulated from the torque would soon diverge from the
-    measured one, because small errors grow at the upper equilibrium.
+    The torque is not the input: the rod turns over, and a motion that is simulated from the torque
+    soon diverges from the measured one, because small errors grow at the upper equilibrium. Samples
+    are averaged over `AVERAGING_TIME`, and angles are smoothed by a Savitzky-Golay filter.
     """
     tables = {}
     for name in ("pd_trajectory", "ilqr"):
         columns = _read_numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
         published_interval = float(np.median(np.diff(columns["time"])))
-        averaged = max(round(AVERAGING_TIME / published_interval), 1)
+        group_size = max(round(AVERAGING_TIME / published_interval), 1)
         samples = np.stack((columns["time"], columns["position"], columns["torque"]), axis=1)
-        time, angle, torque = _group_means(samples, averaged).T
+        # means of successive groups of samples; an incomplete group at the end is dropped
+        group_count = len(samples) // group_size
+        groups = samples[: group_count * group_size].reshape(group_count, group_size, 3)
+        time, angle, torque = groups.mean(axis=1).T
         angle = savgol_filter(angle, SMOOTHED_SAMPLES, 3)
         tables[f"{name}.csv"] = table_text(
             {"time": np.round(time, 9), "angle": angle, "torque": torque}
         )
     return RigFiles(tables, {})
-
-
-def _group_means(samples: FloatArray, averaged: int) -> FloatArray:
-    """Return the means of successive groups of samples.
-
-    Parameters
-    ----------
-    samples : (N, C) ndarray
-        Samples; an incomplete group at the end is dropped.
-    averaged : int
-        The number of samples in a group.
-
-    Returns
-    -------
-    (N // averaged, C) ndarray
-        The mean of each group.
-    """
-    count = len(samples) // averaged * averaged
-    groups = samples[:count].reshape(-1, averaged, samples.shape[1])
-    return np.asarray(groups.mean(axis=1))
 
 
 RIGS: dict[str, Callable[..., RigFiles]] = {

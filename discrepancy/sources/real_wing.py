@@ -70,7 +70,10 @@ def real_wing(
     columns: int = AVERAGED_COLUMNS,
     detrended: bool = True,
 ) -> RigFiles:
-    """Return the ring-downs of the wing of Kapteyn et al., and its loading runs.
+    """Return the ring-downs of the wing of Kapteyn et al., and its loading runs if there are any.
+
+    The noise record of the signal is the scatter between the ring-downs (`trial_scatter`), scaled
+    up so that its variance includes the reading error that they share.
 
     Parameters
     ----------
@@ -98,7 +101,7 @@ def real_wing(
     interval = float(windows[0].time[1])
     scatter = trial_scatter(windows)
     deviation = float(np.std(scatter, ddof=1))
-    # scaled to the variance deviation^2 + READING_ERROR^2, as all trials share the reading error
+    # scaled to the variance deviation^2 + READING_ERROR^2
     noise = scatter * np.hypot(1.0, READING_ERROR / deviation)
     tables = {
         "noise.csv": table_text({"time": interval * np.arange(float(len(noise))), SIGNAL: noise})
@@ -166,11 +169,13 @@ def _read_lab_data(data: Path) -> _LabData:
 
 
 def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
-    """Return the loading runs of the wing as static trials, and the channel of the tip."""
-    # an error of the load appears as an error of the displacement, by the compliance
+    """Return the loading runs of the wing as static trials, and the channel of the tip.
+
+    An error of the load counts as noise of the displacement that it causes by the compliance.
+    """
     compliance = float(np.median(measurements.displacement / measurements.load))
-    by_load = measurements.load_standard_deviation * compliance
-    deviation = float(np.hypot(measurements.displacement_standard_deviation, by_load))
+    deviation_by_load = measurements.load_standard_deviation * compliance
+    deviation = float(np.hypot(measurements.displacement_standard_deviation, deviation_by_load))
     channel = {**AT_TIP, "noise": {"standard_deviation": deviation}}
     tables = {}
     trials = []
@@ -198,22 +203,22 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
     Parameters
     ----------
     windows : sequence of PlotWindow
-        The windows of the recording that become trials.
+        The R windows, one of each ring-down, with N samples each.
 
     Returns
     -------
     ((R - 1) N,) ndarray
-        Noise [V].
+        Noise [V], one contrast after the other.
     """
-    signals = np.array([window.signal for window in windows])
+    signals = np.array([window.signal for window in windows])  # (R, N)
     trial_count, sample_count = signals.shape
     mean = signals.mean(axis=0)
     rate = np.gradient(mean)
-    basis = np.stack((mean, rate, np.gradient(rate), np.ones(sample_count)), axis=1)
+    basis = np.stack((mean, rate, np.gradient(rate), np.ones(sample_count)), axis=1)  # (N, 4)
     basis /= np.linalg.norm(basis, axis=0)
     coefficients, *_ = np.linalg.lstsq(basis, signals.T, rcond=None)
-    residual = signals.T - basis @ coefficients
-    contrasts = (residual @ helmert(trial_count).T).T
+    residual = signals.T - basis @ coefficients  # (N, R)
+    contrasts = (residual @ helmert(trial_count).T).T  # (R - 1, N)
     correction = np.sqrt(sample_count / (sample_count - basis.shape[1]))
     return np.asarray(contrasts.ravel() * correction)
 
@@ -221,8 +226,8 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
 def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
     """Return the slow drift of the zero (N,) [V] that all records share.
 
-    It is the weighted moving average of the mean record; nan at the ends, where the average is
-    incomplete.
+    It is the moving average of the mean record, with Hann weights over `TREND_COLUMNS` samples; nan
+    at the ends, where the average is incomplete.
     """
     weights = np.hanning(TREND_COLUMNS + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
@@ -235,25 +240,11 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 def _plot_window(
     record: RingDownRecord, zero: FloatArray, begin: float, columns: int
 ) -> PlotWindow:
-    """Return the part of a record from the start of the window on, averaged over plot columns.
+    """Return a record minus its slow zero from `begin` [s] on, averaged over groups of columns.
 
-    The slow zero is subtracted, and the times are made even and start at zero.
-
-    Parameters
-    ----------
-    record : RingDownRecord
-        The record, with a value for each column of the plot.
-    zero : (N,) ndarray
-        The slow zero that is subtracted [V]; nan where it is not known.
-    begin : float
-        The start of the window after the release [s].
-    columns : int
-        Columns that are averaged into one sample.
-
-    Raises
-    ------
-    CampaignDataError
-        If fewer than 60 samples are left.
+    The record has a value for each column of the plot. Where the zero (N,) [V] is nan, the record
+    is left out, as is an incomplete group of columns at the end. The times of the result are even
+    and start at zero. Raises `CampaignDataError` if fewer than 60 samples are left.
     """
     inside = np.flatnonzero(np.isfinite(zero) & (record.time >= begin))
     count = len(inside) // columns
@@ -262,8 +253,8 @@ def _plot_window(
             f"{record.source}: {counted(count, 'sample')} {is_or_are(count)} left after {begin:g} "
             "s; 60 are needed."
         )
-    averaged = inside[: count * columns].reshape(count, columns)
-    time = record.time[averaged].mean(axis=1)
+    groups = inside[: count * columns].reshape(count, columns)  # indices of the averaged values
+    time = record.time[groups].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    signal = np.asarray((record.signal - zero)[averaged].mean(axis=1))
+    signal = np.asarray((record.signal - zero)[groups].mean(axis=1))
     return PlotWindow(interval * np.arange(float(count)), signal)
