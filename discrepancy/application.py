@@ -3,7 +3,7 @@
 import json
 import shlex
 from dataclasses import dataclass
-from dataclasses import replace as changed
+from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,10 @@ def apply_verdict(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> AppliedVerdict:
-    """Write the model of a verdict with the effects that were found, and its parameters.
+    """Write the model of a verdict with the effects that were found, and its fitted parameters.
+
+    For an unexplained gap, the effects are those of the best hypothesis if its proof shows that the
+    error becomes smaller. Effects of an earlier patch in the model stay in it.
 
     Parameters
     ----------
@@ -90,14 +93,14 @@ def apply_verdict(
 
     Returns
     -------
-    Applied
+    AppliedVerdict
         The file, a sentence on what was applied, and the command to use it.
 
     Raises
     ------
     DiscrepancyError
-        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot
-        say it.
+        If the verdict gives nothing to apply, its model has changed or is gone, or the format of
+        the file cannot hold the effects.
     fmu_asset.errors.PatchFileError
         If an FMU cannot carry an effect.
     FileNotWrittenError
@@ -110,7 +113,7 @@ def apply_verdict(
     stored = files.read_verdict_file(verdict_file)
     applied_patch = _patch_to_apply(stored, verdict_file, member)
     choice = model_of(stored.origin, verdict_file, progress)
-    patch = changed(applied_patch, origin=stored.origin).combine_with(choice.built_in)
+    patch = replace_fields(applied_patch, origin=stored.origin).combine_with(choice.built_in)
     is_stated_by_file = _is_stated_by_file(choice, patch.patch)
     if out is None:
         stem = Path(choice.file or "wing").stem
@@ -118,7 +121,7 @@ def apply_verdict(
     path = Path(out)
     _check_destination(path, choice, verdict_file, replace=replace)
     sentence = f"{_applied_effects(applied_patch)}, {_certainty_clause(applied_patch, stored)}."
-    patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
+    patch = replace_fields(patch, sentence=f"{sentence} {stored.verdict.sentence}")
     if path.suffix == ".fmu":
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
         return AppliedVerdict(path, sentence, "")
@@ -148,12 +151,10 @@ def _is_stated_by_file(choice: ModelChoice, patch: ModelPatch) -> bool:
 
 
 def _structure_text(choice: ModelChoice, patch: files.StoredPatch, path: Path) -> str:
-    """Return the file of a structure, as text, with the changes and parameters of a patch.
+    """Return the text of a structure's file with the changes and parameters of a patch.
 
-    Raises
-    ------
-    ModelError
-        If the file cannot state a change.
+    Calibrated parameters become nominal values, or the mass of a section `[[mass]]`. Raises
+    `ModelError` if the file cannot state a change.
     """
     assert choice.path is not None
     with ModelError.instead_of(FiniteElementError, before=f"{path}: "):
@@ -175,25 +176,16 @@ def _structure_text(choice: ModelChoice, patch: files.StoredPatch, path: Path) -
 def _check_destination(
     path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool
 ) -> None:
-    """Refuse a destination that has an unknown format, exists, or is a source of the model.
+    """Raise an error if a destination has an unknown ending, exists, or is a source of the model.
 
-    Parameters
-    ----------
-    path : Path
-        The destination.
-    choice : ModelChoice
-        The model that is patched.
-    verdict_file : Path
-        The file of the verdict.
-    replace : bool
-        True if an existing file may be replaced.
+    With `replace` it may exist, but never be a file from which the patched model is made.
     """
     if path.suffix not in ENDINGS:
         raise FileNotWrittenError(
             f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out."
         )
     patch_file = verdict_file.parent / files.PATCH_NAME
-    sources = (choice.file, *choice.beneath, choice.path or "", verdict_file, patch_file)
+    sources = (choice.file, *choice.base_files, choice.path or "", verdict_file, patch_file)
     if path.exists() and path.resolve() in {Path(source).resolve() for source in sources}:
         raise FileNotWrittenError(
             f"{path} is a file from which the patched model is made: choose another --out."
@@ -241,19 +233,9 @@ def _patch_to_apply(
 ) -> files.StoredPatch:
     """Return the patch of the effects that are applied.
 
-    Parameters
-    ----------
-    stored : StoredVerdict
-        The verdict.
-    file : Path
-        Its file.
-    member : str or None
-        Member of a group that is applied; None for the first.
-
-    Raises
-    ------
-    DiscrepancyError
-        If the verdict has no such member, or gives nothing to apply.
+    It is read from the `patch.json` beside the verdict, or made from a recorded hypothesis: that of
+    a `member` of a group, or the proved one of an unexplained gap. Raises `DiscrepancyError` if the
+    verdict has no such member, or gives nothing to apply.
     """
     verdict = stored.verdict
     is_group = verdict.kind is VerdictKind.GROUP
@@ -274,7 +256,7 @@ def _patch_to_apply(
     if verdict.kind is VerdictKind.UNEXPLAINED:
         hypothesis = _proved_hypothesis(verdict, stored.proof)
     elif verdict.kind in files.APPLIED:
-        hypothesis = _hypothesis(verdict, member)
+        hypothesis = _recorded_hypothesis(verdict, member)
     if hypothesis is None:
         reason = _NOTHING_TO_APPLY.get(
             verdict.kind, "the effects that the verdict names are missing from the file"
@@ -303,10 +285,11 @@ _NOTHING_TO_APPLY = {
 """Why a verdict gives nothing to apply."""
 
 
-def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
+def _recorded_hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
     """Return the recorded hypothesis with the effects of a verdict, or of a member of its group.
 
-    None if the verdict does not record it.
+    Without a member, it is that of the first member of a group. The result is None if the verdict
+    does not record the hypothesis.
     """
     if verdict.kind is VerdictKind.GROUP:
         identifiers = {*(member or verdict.group[0]).split(" + ")}
@@ -321,7 +304,7 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
 def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
     """Return the hypothesis that the proof of an unexplained gap tested, if it lowers the error.
 
-    None if it does not, or if there is no proof.
+    The result is None if it does not, if there is no proof, or if the verdict does not record it.
     """
     if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
         return None
@@ -332,21 +315,12 @@ def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | No
 
 
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
-    """Return the file of a lumped model, as text, with the laws and parameters of a patch added.
+    """Return the text of a lumped model's file with the laws and parameters of a patch added.
 
-    The laws of an effect get a parameter that scales their force, with the deviation of the patch.
-
-    Parameters
-    ----------
-    choice : ModelChoice
-        The lumped model, from its own file or shipped with the package.
-    patch : StoredPatch
-        The effects to add as laws, and the calibrated parameters.
-
-    Raises
-    ------
-    ModelError
-        If the file cannot be read, or the result is not a valid lumped model.
+    The priors of calibrated parameters become their posteriors. The laws of an effect get a common
+    parameter that scales their force, with the mean 1 and the relative deviation of the patch. The
+    model is read from its own file or shipped with the package. Raises `ModelError` if the file
+    cannot be read, or if the result is not a valid lumped model.
     """
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
     model_tables = read_toml(file, ModelError, what="lumped model")
@@ -386,9 +360,9 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
 def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
     """Return the standard deviation of the force of an effect's laws over the force.
 
-    It is taken from the 90 % interval of the number that scales the force of the first law or, in a
-    patch without intervals, of the first parameter of the effect. Of a table it is that of the
-    largest force.
+    It is half the 90 % interval over 1.645 times the value: of the number that scales the force of
+    the first law or, in a patch without intervals, of the first parameter of the effect. Of a table
+    of forces, the largest force is taken. Without a finite interval the result is 0.
     """
     law = effect.patch.primitives[0]
     assert isinstance(law, PortForce)  # only laws at ports are written into a model's file
@@ -398,8 +372,8 @@ def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
         if interval.primitive == 0 and interval.parameter == law.proportional[0]
     ]
     ranges += [(estimate.value, estimate.low, estimate.high) for estimate in effect.parameters]
-    if curve_of((effect,)) is not None:
-        ranges.sort(key=lambda ends: -abs(ends[0]))
+    if curve_of((effect,)) is not None:  # a table of forces: the largest first
+        ranges.sort(key=lambda value_low_high: -abs(value_low_high[0]))
     for value, low, high in ranges:
         if value != 0.0 and np.isfinite(high - low):
             return float((high - low) / (2.0 * norm.ppf(0.95) * abs(value)))
@@ -460,7 +434,7 @@ def pack_patched(
         options = tailoring(load_calibration(choice.path))
     # The names are those of fields of the state.
     parameters: dict[str, Any] = {parameter.name: parameter.mean for parameter in patch.parameters}
-    options["state"] = changed(options["state"], **parameters)
+    options["state"] = replace_fields(options["state"], **parameters)
     pack_wing(
         choice.design,
         path,
@@ -476,7 +450,8 @@ def pack_patched(
 def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> str:
     """Pack the FMU of a wing with the patch of a verdict, and return a sentence about it.
 
-    Its effects are switched off.
+    The effects are switched off in the FMU. If an FMU cannot carry one of them, no FMU is written,
+    and the sentence says so.
     """
     try:
         switches = pack_patched(
@@ -488,9 +463,10 @@ def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> st
 
 
 def _command_with_model(command: str, model: Path) -> str:
-    """Return the command of a verdict with another model and another folder, for this folder.
+    """Return the command that repeats a verdict's investigation with another model.
 
-    Paths below the working folder are written relative to it, and a default seed is left out.
+    Its results go to a folder named after campaign and model. Paths below the working folder are
+    written relative to it, and the default seed is left out.
     """
     words = shlex.split(command)
     campaign_index = 4 if words[3] == "--from-run" else 3

@@ -33,6 +33,7 @@ from reporting.json_file import plain as json_of
 from reporting.provenance import Provenance
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
+"""What stands in JSON for numbers that it does not have."""
 _NAME_OF_TRIAL = {"type": "string", "description": "Name of the trial."}
 _BEGIN = {
     "type": ["number", "null"],
@@ -54,6 +55,7 @@ _WINDOWS = {
 
 
 def _number(value: object) -> float:
+    """Return a number of a document; raise `ValueError` for anything else, such as a boolean."""
     if value is None or isinstance(value, str):
         if value not in _WORDS:
             raise ValueError(
@@ -66,6 +68,7 @@ def _number(value: object) -> float:
 
 
 def _patch(rows: object) -> ModelPatch:
+    """Return the patch of a list of primitives; raise `ValueError` if it is not one."""
     try:
         return ModelPatch.from_list(rows)
     except InvalidPatchError as cause:
@@ -207,16 +210,16 @@ def write_document(path: Path, schema: str, record: object) -> Path:
     path : Path
         The file.
     schema : str
-        Name of the schema.
+        Name of the schema, written under the key `schema`.
     record : dataclass instance
-        The document.
+        The record. The fields of its `origin` become keys of the document itself.
 
     Raises
     ------
     VerdictFileError
-        If it could not be read again.
+        If the document could not be read again.
     reporting.errors.FileNotWrittenError
-        If it cannot be written.
+        If the file cannot be written.
     """
     content = plain_data(record)
     try:

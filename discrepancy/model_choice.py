@@ -64,7 +64,7 @@ class ModelChoice:
         File or name of the model, as in `Origin.model_file`.
     built_in : StoredPatch or None
         Patch that is already applied to the model; None without one.
-    beneath : tuple of str
+    base_files : tuple of str
         Files or names of the models that a patched model is based on.
     """
 
@@ -77,7 +77,7 @@ class ModelChoice:
     design_hash: str = ""
     file: str = ""
     built_in: StoredPatch | None = None
-    beneath: tuple[str, ...] = ()
+    base_files: tuple[str, ...] = ()
 
 
 def choose_model(name: str | Path | None, progress: Progress | None = None) -> ModelChoice:
@@ -153,7 +153,7 @@ def _choose(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _refuse_near_structure(name: str) -> None:
-    """Refuse a name that is not a lumped model, but like that of a shipped structure."""
+    """Raise an error if a name is no lumped model, but resembles that of a shipped structure."""
     question = did_you_mean(name, structure_files())
     if question and not (SHIPPED_MODELS / f"{name}.toml").exists():
         raise ModelError(f"There is no model {name!r}.{question}")
@@ -246,7 +246,10 @@ def choice_of_run(folder: Path) -> ModelChoice:
 
 
 def _choose_patched(path: Path, progress: Progress | None) -> ModelChoice:
-    """Return the model of a patch file: the model that the patch was made for, with its effects."""
+    """Return the model that a patch file was made for, with its effects and parameters.
+
+    That model may itself be a patched one; `built_in` then combines all patches.
+    """
     stored = read_patch(path)
     base = model_of(stored.origin, path, progress)
     calibrated = {
@@ -258,7 +261,7 @@ def _choose_patched(path: Path, progress: Progress | None) -> ModelChoice:
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
         built_in=stored.combine_with(base.built_in),
-        beneath=(*base.beneath, base.file),
+        base_files=(*base.base_files, base.file),
     )
 
 
@@ -301,14 +304,8 @@ def _choose_fmu(path: Path) -> ModelChoice:
 def _choose_wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
     """Return the choice of a wing model, from its calibration, its design or the shipped design.
 
-    Parameters
-    ----------
-    model : WingModel
-        The model.
-    kind : ModelKind
-        Whether it is from a calibration or a design.
-    path : Path or None
-        File of the calibration or design; None for the shipped design.
+    `path` is the file of the calibration or design; None for the shipped design. The hash of a
+    design includes the shipped prior of the parameters, since the file has none.
     """
     if path is not None and kind is ModelKind.CALIBRATION:
         source_hash = hash_file(path)

@@ -34,7 +34,7 @@ SUSPECTS = (
 LEVELS = 8
 """Number of levels of a load line, from zero to the largest force."""
 SAMPLES, SAMPLES_PER_PERIOD = 1200, 20
-"""Number of samples of a release, and of those in a period of the first mode."""
+"""Samples of the ring-down after a release, and samples in a period of the first mode."""
 RELEASED_SHARE = 0.5
 """Force of a release over the largest one."""
 RELEASE_DEVIATION = 0.02
@@ -73,18 +73,22 @@ class Plan(NamedTuple):
     separability: Separability
 
     def least_change(self, row: Detectability) -> ModelPatch | None:
-        """Return a suspicion at the least size that the trials show; None if they show none."""
+        """Return the patch of a suspected effect at the least value that the trials detect.
+
+        The other parameters of the effect have their start values. The result is None if the trials
+        detect no value of it.
+        """
         if row.reason or not np.isfinite(row.detectable):
             return None
         term = EffectTerm(row.effect, row.place)
-        sizes = term.physical_values(term.start_values()) | {row.parameter: row.detectable}
-        return row.effect.patch(self.setting, sizes, row.place)
+        values = term.physical_values(term.start_values()) | {row.parameter: row.detectable}
+        return row.effect.patch(self.setting, values, row.place)
 
 
 def plans_of(
     model: StructureModel, precision: Precision, catalogue: Sequence[Effect]
 ) -> tuple[Plan, Plan]:
-    """Return what static loads can decide, and what static loads and releases can.
+    """Return what static loads can decide, and what static loads together with releases can.
 
     Parameters
     ----------
@@ -93,7 +97,7 @@ def plans_of(
     precision : Precision
         How precise the channels are.
     catalogue : sequence of Effect
-        The effects, of which the suspicions are compared.
+        The catalogue; only the effects among `SUSPECTS` are compared.
 
     Raises
     ------
@@ -130,7 +134,11 @@ def _plan(
 
 
 def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[Trial]) -> Campaign:
-    """Return the campaign of planned trials, with the channels that they record."""
+    """Return the campaign of planned trials, with the channels that they record.
+
+    A channel has stated noise, a zero known to `ZERO_OVER_NOISE` times that, and the gain error of
+    the precision.
+    """
     recorded = {name for trial in trials for name in trial.channels}
     channels = {}
     for name, quantity in model.quantities.items():
@@ -155,7 +163,10 @@ def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[T
 
 
 def _load_lines(model: StructureModel) -> list[Trial]:
-    """Return a load line of each force, with readings of zero; accelerations are not read."""
+    """Return a static trial of each force, from zero to the largest force in `LEVELS` steps.
+
+    Its readings are zero, and accelerations are not among its channels.
+    """
     channels = tuple(
         name for name, quantity in model.quantities.items() if quantity is not Quantity.ACCELERATION
     )
@@ -172,15 +183,18 @@ def _load_lines(model: StructureModel) -> list[Trial]:
 
 
 def _releases(model: StructureModel) -> list[Trial]:
-    """Return a release of each force, from the displacement along it under a static load."""
+    """Return a ring-down after the release of each force, held at `RELEASED_SHARE` of the largest.
+
+    It is released from the static displacement along the force at the prior mean of the parameters.
+    """
     state = SystemState(tuple(model.prior_mean().tolist()))
     system = model.build_system(state)
-    first_frequency = float(system.angular_frequency.min()) / (2.0 * np.pi)
+    first_frequency = float(system.angular_frequency.min()) / (2.0 * np.pi)  # Hz
     time = np.arange(SAMPLES) / (SAMPLES_PER_PERIOD * first_frequency)
     releases = []
     for name in model.forces:
-        load = model.force_row(name, state)
-        flexibility = float(load @ np.linalg.solve(system.stiffness, load))
+        load = model.force_row(name, state)  # (modes,) under a unit force
+        flexibility = float(load @ np.linalg.solve(system.stiffness, load))  # m/N
         displacement = RELEASED_SHARE * model.largest_force * flexibility
         releases.append(
             Trial.plain(

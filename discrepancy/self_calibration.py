@@ -27,11 +27,12 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import check_and_prepare, investigate
 
 NULL_SHARE = 3
-"""Every so many campaigns one contains no effect."""
+"""One of this many campaigns contains no effect."""
 NOTHING = "nothing"
+"""What stands for the identifier of the hidden effect if there is none."""
 OTHER = {kind: kind.value for kind in VerdictKind if kind is not VerdictKind.NAMED}
 OTHER[VerdictKind.FAMILY] = "family only"
-"""Columns of the confusion matrix besides the names."""
+"""Columns of the confusion matrix besides the names, by the kind of verdict."""
 OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 """Outcomes of verdicts that say less than a name, if they contain the hidden effect."""
 
@@ -113,12 +114,7 @@ class SelfCalibration:
     def share(self, outcome: str, *, null: bool = False) -> Proportion:
         """Return the fraction of an outcome among campaigns with a hidden effect, or without one.
 
-        Parameters
-        ----------
-        outcome : str
-            The outcome.
-        null : bool
-            True for campaigns in which nothing was hidden.
+        `null` is True for the campaigns in which nothing was hidden.
         """
         outcomes = self.outcomes(null=null)
         return wilson_interval(outcomes.count(outcome), len(outcomes))
@@ -126,10 +122,7 @@ class SelfCalibration:
     def outcomes(self, *, null: bool) -> list[str]:
         """Return the outcome of each campaign with a hidden effect, or of each one without.
 
-        Parameters
-        ----------
-        null : bool
-            True for campaigns in which nothing was hidden.
+        `null` is True for the campaigns in which nothing was hidden.
         """
         outcomes = []
         for case in self.cases:
@@ -175,11 +168,14 @@ class SelfCalibration:
         return rows
 
     def _confusion_columns(self, rows: list[str]) -> list[str]:
-        """Return the verdicts that occurred: "nothing missing", names by row, other verdicts."""
+        """Return the verdicts that occurred: "nothing missing", then names, then other verdicts.
+
+        Names have the order of the rows; those that are no row (of several effects) come after.
+        """
         verdicts = {_confusion_column(case) for case in self.cases}
         names = verdicts.difference(OTHER.values())
         names_of_rows = [row for row in rows if row in names]
-        names_of_no_row = sorted(names.difference(rows))
+        other_names = sorted(names.difference(rows))
         # several kinds of verdict may share one column
         other_verdicts = [
             verdict for verdict in dict.fromkeys(OTHER.values()) if verdict in verdicts
@@ -187,8 +183,8 @@ class SelfCalibration:
         nothing_missing = OTHER[VerdictKind.NOTHING_MISSING]
         if nothing_missing in other_verdicts:
             other_verdicts.remove(nothing_missing)
-            return [nothing_missing, *names_of_rows, *names_of_no_row, *other_verdicts]
-        return [*names_of_rows, *names_of_no_row, *other_verdicts]
+            return [nothing_missing, *names_of_rows, *other_names, *other_verdicts]
+        return [*names_of_rows, *other_names, *other_verdicts]
 
 
 def _confusion_column(case: CalibrationCase) -> str:
@@ -271,7 +267,7 @@ def _hidden_effects(
     """Draw the effects that are hidden in the campaigns.
 
     All testable effects are used in a random order before one is used again. Every `NULL_SHARE`-th
-    campaign has no effect.
+    campaign has no effect, and neither has any further one if no effect is detectable.
 
     Parameters
     ----------
@@ -282,7 +278,7 @@ def _hidden_effects(
     count : int
         Number of campaigns.
     generator : Generator
-        Source of the order, of places and of sizes.
+        Source of the order, and of places and parameters.
 
     Returns
     -------
@@ -319,20 +315,12 @@ def _investigate_simulated(
 ) -> CalibrationCase:
     """Simulate a campaign, investigate it, and compare the verdict with the hidden effect.
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Simulates the campaign.
-    effects : sequence of Effect
-        The catalogue.
-    hidden : HiddenEffect or None
-        The effect that the structure has; None for none.
-    seed : SeedSequence
-        Seed of the campaign.
+    `effects` is the catalogue of the investigation. If the structure cannot carry the effect with
+    the nuisances that were drawn, they are drawn once more.
     """
     try:
         campaign = simulator.simulate(hidden, np.random.default_rng(seed))
-    except ModelError:  # the structure could not carry the effect with these nuisances: draw others
+    except ModelError:
         campaign = simulator.simulate(hidden, np.random.default_rng(seed.spawn(1)[0]))
     verdict = investigate(campaign, simulator.model, effects, thorough=False).verdict
     identifier, place, distance = NOTHING, "", 0.0
@@ -369,18 +357,20 @@ def outcome_of(
 ) -> str:
     """Return the outcome of a verdict, given the hidden effect.
 
-    A group that contains the effect, and a family whose nearest member it is, are correct but say
-    less than the name; they have outcomes of their own. A group or a family without the effect is
-    wrong, and so is any name if there is no effect.
+    A group that contains the effect, a family whose nearest member it is, and a verdict that names
+    it in part are correct but say less than the name; they have outcomes of their own. Without the
+    effect they are wrong, and so is any name if there is no effect. For other kinds of verdict the
+    outcome is the kind, such as "unexplained".
 
     Parameters
     ----------
     hidden : str
-        Identifier of the hidden effect, or `NO_EFFECTS`.
+        Identifier of the hidden effect, or `NOTHING`.
     kind : VerdictKind
         Kind of the verdict.
     named, group : tuple of str
-        Identifiers of its effects, and members of its group.
+        Identifiers of its effects, and members of its group; those of a member with several effects
+        are joined by " + ".
     """
     if kind is VerdictKind.NOTHING_MISSING:
         return "right" if hidden == NOTHING else "missed"
@@ -397,16 +387,10 @@ def outcome_of(
 def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, and "right" and "wrong" always, in a fixed order.
 
-    Parameters
-    ----------
-    self_calibration : SelfCalibration
-        The cases.
-    null : bool
-        True for campaigns in which nothing was hidden.
+    `null` is True for the campaigns in which nothing was hidden.
     """
-    always_shown = {"right", "wrong"}
-    shown = always_shown.union(self_calibration.outcomes(null=null))
-    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in shown]
+    outcomes = {"right", "wrong"}.union(self_calibration.outcomes(null=null))
+    return [outcome for outcome in _OUTCOMES_IN_ORDER if outcome in outcomes]
 
 
 _OUTCOMES_IN_ORDER = (

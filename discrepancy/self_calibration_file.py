@@ -114,14 +114,9 @@ def self_calibration_schema() -> JsonSchema:
 def _stored_outcomes(
     self_calibration: SelfCalibration, *, null: bool
 ) -> dict[str, StoredProportion]:
-    """Return the proportions of all outcomes, by outcome.
+    """Return the proportion of each outcome among the campaigns without an effect, or with one.
 
-    Parameters
-    ----------
-    self_calibration : SelfCalibration
-        The cases.
-    null : bool
-        True for campaigns without an effect, False for those with one.
+    `null` is True for those without an effect.
     """
     proportions = {}
     for outcome in ordered_outcomes(self_calibration, null=null):
@@ -130,7 +125,7 @@ def _stored_outcomes(
 
 
 def _stored_proportion(proportion: Proportion) -> StoredProportion:
-    """Return a proportion as it is stored."""
+    """Return a proportion as it is stored; its fraction is None, not nan, without cases."""
     return StoredProportion(
         count=proportion.count,
         total=proportion.total,

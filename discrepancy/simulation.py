@@ -68,7 +68,7 @@ class Simulator:
         self.setting = Setting(campaign, model, model.scales(campaign))
         problem = Problem(campaign, model, self.setting)
         self.fitted = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
-        # nuisances of all trials, held-out ones too, with the parameters of that fit
+        # local unknowns of all trials, held-out ones too, with the shared unknowns of that fit
         self.problem = problem.with_trials(campaign.trials)
         zeros = tuple(np.zeros(data.unknowns.unknown_count) for data in self.problem.trials)
         start = replace(self.fitted.point, local=zeros)
@@ -77,7 +77,7 @@ class Simulator:
     def screen(self) -> Screen:
         """Return the screen that measures the distance d^2 of an effect.
 
-        It is linearised about a fit to the predictions of the model as data.
+        It is linearised about a fit to a campaign whose readings are the predictions of the model.
         """
         predicted = campaign_as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
@@ -88,18 +88,11 @@ class Simulator:
     def draw_effect(
         self, effect: Effect, screen: Screen, generator: np.random.Generator
     ) -> HiddenEffect | None:
-        """Draw an effect's place and parameters until it is detectable.
+        """Draw an effect's place and parameters from their priors until it is detectable.
 
-        None is returned if it is not after `MOST_DRAWS` draws.
-
-        Parameters
-        ----------
-        effect : Effect
-            The effect.
-        screen : Screen
-            Measures the distance of a draw.
-        generator : Generator
-            Source of places and sizes.
+        It is detectable if its distance d^2, which the screen measures, is at least
+        `DETECTION_DISTANCE`. A draw that the structure cannot carry counts as not detectable. The
+        result is None if none of `MOST_DRAWS` draws is detectable.
         """
         places = effect.places(self.setting)
         for _ in range(MOST_DRAWS):
@@ -115,6 +108,10 @@ class Simulator:
 
     def simulate(self, hidden: HiddenEffect | None, generator: np.random.Generator) -> Campaign:
         """Return a campaign with simulated readings in place of the measured ones.
+
+        Parameters, gains, zeros and other nuisances are drawn from their priors; those without a
+        prior, and free initial states, keep their fitted values. The noise is drawn with the
+        autocorrelation of the noise records, and its deviation with the error of the records.
 
         Parameters
         ----------
@@ -139,9 +136,7 @@ class Simulator:
             trial = data.trial
             fitted_local = self.nuisances.local[trial_index]
             local = _draw_unknowns(fitted_local, data.unknowns.precision, generator)
-            if has_free_initial_state(
-                trial
-            ):  # the prior has no information: the state stays as fitted
+            if has_free_initial_state(trial):  # its prior is too wide to be drawn from
                 initial_state = data.unknowns.indices.initial_state
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
@@ -161,8 +156,8 @@ class Simulator:
     def _noise_ratio(self, name: str, generator: np.random.Generator) -> float:
         """Draw the ratio of a channel's true noise deviation to that of its noise record.
 
-        A record with n degrees of freedom estimates the variance by chi-squared over n times the
-        true one.
+        A record with n degrees of freedom estimates the variance as chi-squared / n times the true
+        one. The ratio is 1 if the deviation is exact, or if there is no noise record.
         """
         freedom = self.problem.noise_models[name].degrees_of_freedom
         if isinf(freedom) or freedom <= 0.0:
@@ -175,35 +170,18 @@ def _draw_unknowns(
 ) -> FloatArray:
     """Draw scaled unknowns (K,) from their priors; those without a prior keep their fitted values.
 
-    Parameters
-    ----------
-    fitted : (K,) ndarray
-        Fitted values, in prior standard deviations.
-    precision : (K,) ndarray
-        Prior precision of each unknown; zero without a prior.
-    generator : Generator
-        Source of the draws.
+    `fitted` (K,) are in prior standard deviations, and an unknown without a prior has zero
+    `precision` (K,). As many numbers are drawn as there are unknowns, with or without a prior.
     """
     draws = generator.standard_normal(len(fitted))
     return np.where(precision > 0.0, draws, fitted)
 
 
 def _draw_noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> FloatArray:
-    """Draw noise (N,) of one channel in a trial, with the autocorrelation of its noise record.
+    """Draw noise (N,) [channel's unit] of one channel in the N rows of a trial.
 
-    Parameters
-    ----------
-    model : NoiseModel
-        Noise of the channel.
-    trial : Trial
-        The trial of N rows.
-    generator : Generator
-        Source of the draws.
-
-    Returns
-    -------
-    (N,) ndarray
-        Noise [channel's unit].
+    It has the autocorrelation of the noise record if the trial is sampled at the same interval,
+    else it is white.
     """
     count = len(trial.time)
     if not trial.is_dynamic or not model.can_whiten(trial.interval):

@@ -128,12 +128,13 @@ def _write_files(folder: Path, content: ReportInput, *, report: bool) -> None:
 
 
 def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:
-    """Write the patch and the FMU of a verdict, if it has them.
+    """Write the patch of a verdict and, if one effect or set is named and it is asked for, its FMU.
 
     Returns
     -------
     ReportInput
-        The content with the intervals of the patch and the remark on the FMU added.
+        The content with the intervals of the patch and the remark on the FMU added; unchanged if
+        the verdict has no patch.
     """
     investigation = content.investigation
     problem = investigation.problem

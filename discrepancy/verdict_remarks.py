@@ -64,34 +64,29 @@ def effects_not_fitted(
 ) -> tuple[NotFitted, ...]:
     """Return the effects of a catalogue that were not fitted, each with the reason.
 
-    Parameters
-    ----------
-    setting : Setting
-        Campaign and model.
-    effects : sequence of Effect
-        The catalogue.
-    search : Search
-        The search, with all its fits.
+    The reason is that the effect is not available in this setting, could not be fitted, seemed less
+    promising than others, or was screened out; only then its gain is a number.
     """
-    along_force: set[str] = set()  # fitted along the missing force
-    for fitted_force in search.force_estimates:
-        along_force.update(term.effect.identifier for term in fitted_force.candidate.terms)
-    fitted = search.fitted_effects() | along_force
-    rows = []
+    # identifiers of effects that were fitted to the missing force, and of all that were fitted
+    fitted_to_force: set[str] = set()
+    for estimate in search.force_estimates:
+        fitted_to_force.update(term.effect.identifier for term in estimate.candidate.terms)
+    fitted = search.fitted_effects() | fitted_to_force
+    not_fitted = []
     for effect in effects:
         identifier = effect.identifier
         unavailable = effect.unavailable(setting)
         if unavailable is not None:
-            rows.append(NotFitted(identifier, unavailable))
+            not_fitted.append(NotFitted(identifier, unavailable))
         elif identifier not in fitted:
             gain = search.screened_gains.get(identifier, nan)
             refusal = search.problem.refusals.get(identifier)
             if refusal is not None and not 0.0 < gain < SEARCH.least_gain_to_fit:
                 reason = f"could not be fitted: {refusal}"
             elif isnan(gain):
-                place_clause = "along the missing force" if along_force else "at first sight"
-                reason = f"less promising than others {place_clause}"
+                comparison = "along the missing force" if fitted_to_force else "at first sight"
+                reason = f"less promising than others {comparison}"
             else:
                 reason = f"screened out: at most {gain:.1f} nat more than the unchanged model"
-            rows.append(NotFitted(identifier, reason, gain))
-    return tuple(rows)
+            not_fitted.append(NotFitted(identifier, reason, gain))
+    return tuple(not_fitted)

@@ -186,20 +186,20 @@ def investigate(
         kind = VerdictKind.DATA_ERROR
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
-    with stage("Fitting the known parameters, and searching the catalogue", "name") as tell:
+    with stage("Fitting the known parameters, and searching the catalogue", "name") as show_message:
         problem = problem_without_wrong_ends(campaign, model)
         campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = reach_verdict(
-            problem, catalogue, on_progress=tell, on_search=on_search
+            problem, catalogue, on_progress=show_message, on_search=on_search
         )
         verdict = verdict_with_untested_effects(verdict, problem.setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
-        share = time_step_error(problem, fit)
-        if share > SEARCH.largest_step_error:
+        step_error = time_step_error(problem, fit)
+        if step_error > SEARCH.largest_step_error:
             remarks.append(
-                f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
+                f"The time steps cost up to {step_error:.2g} of the noise (rms), more than the "
                 f"permitted {SEARCH.largest_step_error:g}: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
@@ -241,7 +241,8 @@ def investigate(
             proof = prove_effects(
                 before, after, errors=errors, effects=effect_labels(fit), seed=seed
             )
-    # a hypothesis without a name says nothing of the sensors, and one below the limit of nothing
+    # Sensors are estimated beside effects only if these are named. Parameters are estimated beside
+    # the effects of the fit also if these have no name, unless there is no gap.
     has_unnamed_effects = bool(fit.candidate.terms) and verdict.kind not in KINDS_WITH_NAME
     fit_of_sensors = search.no_effect if has_unnamed_effects else fit
     fit_of_parameters = fit_of_sensors if verdict.kind in KINDS_WITHOUT_GAP else fit
@@ -288,10 +289,11 @@ def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
 
 
 def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) -> bool:
-    """Return whether the effects of a verdict act throughout and leave no force at the ports.
+    """Return whether the effects of a verdict explain the whole force that the model lacks.
 
-    One of them is a law at a port. The simulation of effects that are named, or that are a member
-    of a group, leaves only noise. Otherwise, the estimate with the missing force tells.
+    The answer is no unless one of them is a law at a port, and none acts only in some stretches of
+    time. It is yes for kinds of verdict whose effects leave only noise when they are simulated.
+    Otherwise the estimate of the missing force beside these effects decides.
     """
     terms = fit.candidate.terms
     has_law = any(term.place in search.problem.model.ports for term in terms)
@@ -311,7 +313,7 @@ def _remarks(
     search: Search,
     fit: CandidateFit,
 ) -> list[str]:
-    """Return the remarks on a verdict, without those on its residuals."""
+    """Return the remarks of the campaign, and those on the fit, the catalogue and the model."""
     remarks = [*problem.campaign.remarks]
     remarks += implausible_value_remarks(problem, fit)
     remarks += missing_port_remark(problem.setting, catalogue)
@@ -336,7 +338,10 @@ def _remarks(
 def _read_input(
     campaign: Campaign | str | Path, model: Model | str | Path | None
 ) -> tuple[Campaign, Model]:
-    """Return campaign and model, read from files where paths are given."""
+    """Return campaign and model, read from files where paths are given.
+
+    For the folder of a mission, the default of the model is that of its twin.
+    """
     if not isinstance(campaign, Campaign):
         is_run_folder = (Path(campaign) / RUN_FILE).is_file()
         if is_run_folder and model is None:
@@ -350,9 +355,10 @@ def _read_input(
 def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign in the names of its model, with outliers marked and trials held out.
+    """Return the campaign as it is investigated, and the faults of its data.
 
-    The faults of its data are returned, too.
+    Its outputs and load places have the names of the model, outliers are marked, and trials are
+    held out.
 
     Parameters
     ----------
@@ -386,15 +392,16 @@ def check_and_prepare(
 def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     """Return the problem of a campaign and a model, with wrong readings at record ends left out.
 
-    The model need not describe the data well; `outliers.wrong_end_readings` states the rule. Each
-    such reading is reported by a remark.
+    They are found in the residuals of a fit without effects, which need not describe the data well;
+    `outliers.wrong_end_readings` states the rule. A remark reports them for each channel and trial,
+    unless the campaign accepts outliers there.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    from_start = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
-    none = refit_from_first_readings(problem, from_start)
-    fits = [(problem, none)]
+    first_fit = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
+    no_effect = refit_from_first_readings(problem, first_fit)
+    fits = [(problem, no_effect)]
     if problem.campaign.held_out:
-        fits.append(fit_held_out(problem, none))
+        fits.append(fit_held_out(problem, no_effect))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     new_remarks: list[str] = []
     for problem_of_trials, fitted in fits:
@@ -402,8 +409,8 @@ def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             trial = trials[data.trial.name]
             if not trial.is_dynamic:
                 continue
-            # Residuals are in units of the noise, whose deviation is thus 1. Without a noise record
-            # it counts as not known, which is 0 here.
+            # Residuals (N, C) are in units of the noise, whose deviation is thus 1. Without a noise
+            # record it counts as not known, which is 0 here.
             has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
             noise = np.array(has_noise, dtype=float)
             is_wrong = wrong_end_readings(residual, data.weight > 0.0, noise)
@@ -424,9 +431,11 @@ def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
 
 
 def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
-    """Return for which channels (C,) of a trial the campaign accepts readings like outliers."""
-    word = FaultKind.OUTLIERS.value
-    return np.array([word in campaign.accepted_faults(name, trial.name) for name in trial.channels])
+    """Return whether the campaign accepts outliers in each channel (C,) of a trial."""
+    fault = FaultKind.OUTLIERS.value
+    return np.array(
+        [fault in campaign.accepted_faults(name, trial.name) for name in trial.channels]
+    )
 
 
 def patch_draws(
@@ -465,9 +474,8 @@ def _effect_draws(fit: CandidateFit, seed: int, count: int) -> FloatArray:
     generator = np.random.default_rng(seed)
     if fit.draws is not None:
         return np.asarray(generator.choice(fit.draws, count))
-    # Gaussian approximation: with the Cholesky factor L of the covariance, L times a standard
-    # normal vector has this covariance. The diagonal is raised slightly, because the matrix may be
-    # singular to rounding.
+    # Gaussian approximation, by the Cholesky factor of the covariance (E, E). The diagonal is
+    # raised slightly, because the matrix may be singular to rounding.
     size = fit.candidate.parameter_count
     covariance = fit.effect_covariance + 1e-15 * np.eye(size)
     cholesky_factor = np.linalg.cholesky(covariance)

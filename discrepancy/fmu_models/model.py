@@ -513,9 +513,7 @@ class FmuModel(DescribedModel):
             inputs[variables.variable(input_names.temperature)] = reference + rise
         # parameters
         section = self.description.motion if trial.is_dynamic else self.description.static
-        parameters = {
-            variables.parameter(name): value for name, value in section.parameters.items()
-        }
+        parameters = {variables.parameter(key): value for key, value in section.parameters.items()}
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
         parameters |= effect_parameters(

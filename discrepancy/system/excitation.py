@@ -103,12 +103,12 @@ class Excitation:
 
     @property
     def is_smooth(self) -> bool:
-        """Whether a load follows a curve between the samples."""
+        """Whether a load follows a smooth curve between its samples."""
         return any(load.history.hold is Hold.SMOOTH for load in self.loads)
 
     @property
     def load_levels(self) -> LoadLevels:
-        """The recorded loads of a trial at rest, in each of its rows."""
+        """The recorded loads in each row of a trial at rest, without loads by a formula."""
         directions = []
         values = []
         for load in self.loads:

@@ -21,7 +21,10 @@ of its largest speed: the slope of the spline at its end is not more accurate.""
 
 
 class ReleasedState(NamedTuple):
-    """State at a release, and the force (n,) that holds the structure until then, if one does."""
+    """State at a release, and the force (n,) that holds the structure until then.
+
+    The force is None if the record does not begin at rest.
+    """
 
     begin: InitialMotion
     holding_force: FloatArray | None
@@ -30,16 +33,10 @@ class ReleasedState(NamedTuple):
 def state_at_first_stamp(
     system: LinearSystem, excitation: Excitation, laws: PortLaws
 ) -> InitialMotion:
-    """Return the state at the first stamp of a record that is not a ring-down.
+    """Return the state at the first time of a record that is not a ring-down.
 
-    Parameters
-    ----------
-    system : LinearSystem
-        The linear system whose motion is computed.
-    excitation : Excitation
-        Its loads, prescribed motions and release.
-    laws : PortLaws
-        The laws of the internal forces at ports.
+    By `excitation.begins` it is the equilibrium under the first loads, rest without loads, or the
+    unknown state `excitation.initial`.
 
     Raises
     ------
@@ -66,7 +63,8 @@ def state_at_first_stamp(
         largest_speeds = [
             np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
         ]
-        # an exact zero, since dry friction acts at any other speed; a recorded speed is exact
+        # The slope of a spline through recorded displacements is set to zero if it is nearly so:
+        # dry friction acts at any other speed. A recorded speed stays as it is.
         is_at_rest = np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)
         has_recorded_displacement = np.array(
             [motion.motion_order == 0 for motion in motions], dtype=np.bool_
@@ -75,7 +73,7 @@ def state_at_first_stamp(
         drive_speeds[is_at_rest & is_slope] = 0.0
     # equilibrium under the first loads and the first positions of the drives
     if excitation.begins is Start.SETTLED:
-        load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))
+        load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))  # (1, N)
         # a state is the speed of its coordinate, and a prescribed one acts through the damping
         prescribed_states = np.where(system.prescribes_state, drive_speeds, 0.0)
         if prescribed_states.any():
@@ -89,7 +87,8 @@ def state_at_first_stamp(
                 time=float(first_stamp[0]),
             )
             memory = equilibrium.memory
-            # mass-normalised modal amplitudes; those of states are speeds
+            # modal amplitudes (M,) by the orthogonality of mass-normalised shapes; those of states
+            # are speeds
             amplitudes = system.shapes.T @ (
                 system.mass @ (equilibrium.values[0] - drive_displacement)
             )
@@ -107,16 +106,8 @@ def released_state(
 ) -> ReleasedState:
     """Return the state at the release of a ring-down.
 
-    Parameters
-    ----------
-    system : LinearSystem
-        The linear system whose motion is computed.
-    excitation : Excitation
-        Its loads, prescribed motions and release.
-    point : ReleasePoint
-        The point from which the system is released, and how.
-    laws : PortLaws
-        The laws of the internal forces at ports.
+    A structure at rest is held at its release point, in equilibrium with the laws. Otherwise the
+    state is that of `excitation.initial`, and the laws have no memory.
 
     Raises
     ------
@@ -127,15 +118,15 @@ def released_state(
     largest_participation = float(np.max(np.abs(point_shape)))
     if largest_participation == 0.0:
         raise ModelError("The release point of a ring-down does not move in any mode of the model.")
-    # `unit_amplitudes`: of each mode, the amplitude that alone moves the point by the release
-    # displacement. A mode that hardly moves the point would need a huge one, hence the least.
+    # The amplitude of each mode (M,) that alone moves the point by the release displacement. A mode
+    # that hardly moves the point would need a huge one, hence the least participation.
     least_participation = LEAST_PARTICIPATION * largest_participation
     moves = np.abs(point_shape) >= least_participation
     participation = np.where(
         moves, point_shape, np.where(point_shape < 0.0, -least_participation, least_participation)
     )
     unit_amplitudes = point.release.displacement / participation
-    # deviations of displacement and speed from the release shape, in units of these amplitudes
+    # displacements and speeds of the modes (or deviations from the shape), in these amplitudes
     initial_by_mode = np.zeros((len(system.angular_frequency), 2))
     initial_by_mode[: len(excitation.initial)] = excitation.initial[: len(initial_by_mode)]
     relative_displacements, relative_velocities = initial_by_mode.T
@@ -162,7 +153,7 @@ def _held_state(
     """Return the state of a structure that is held at rest by a force at its release point.
 
     The force moves the release point by the release displacement, counted from its position under
-    the other loads.
+    the other loads. It compensates the forces of the laws, which would move the point back.
 
     Parameters
     ----------
@@ -186,8 +177,7 @@ def _held_state(
     memory = system.static_path(holding_force * row + load, laws, fixed_row=row, time=0.0).memory
     total_force = holding_force * row + load[0]
     if memory is not None:
-        # the forces of the laws move the release point back: the holding force compensates that
-        law_rows = system.rows_of_laws(laws, 0.0)
+        law_rows = system.rows_of_laws(laws, 0.0)  # (J, N)
         holding_force += (
             float(law_rows @ unit_force_displacement @ memory[:, LAGGED_FORCE]) / compliance
         )

@@ -89,7 +89,7 @@ class StaticPath(NamedTuple):
 
 
 def _differ_beyond_rounding(matrix: FloatArray, other_matrix: FloatArray) -> bool:
-    """Return whether two matrices differ by more than rounding."""
+    """Return whether two matrices differ by more than `ROUNDING` times the largest entry."""
     largest = np.abs(matrix).max(initial=1e-300)
     return bool(np.abs(matrix - other_matrix).max(initial=0.0) > ROUNDING * largest)
 
@@ -157,7 +157,10 @@ class LinearSystem:
 
     @cached_property
     def drive_shapes(self) -> FloatArray:
-        """Displacements and states (N, P) under a unit motion, or a unit state, of each drive."""
+        """Displacements and states (N, P) under a unit motion, or a unit state, of each drive.
+
+        They have the least norm of those that follow the drives (pseudo-inverse).
+        """
         shapes = np.zeros((self.unknown_count, len(self.drives)))
         if len(self.drives):
             n = self.displacement_count
@@ -190,9 +193,8 @@ class LinearSystem:
     def _state_shapes(self) -> FloatArray:
         """Return the shapes (state_count, K) of the K independent states that no drive prescribes.
 
-        A state s of first order, such as a temperature, obeys T s' + R s = G u' + H u, with the
-        capacity matrix T as the lower right block of `mass`. A drive prescribes a displacement or a
-        state. The shapes are along the principal axes of T, and each has a modal capacity of 1.
+        The shapes are along the principal axes of the capacity matrix T, which is the lower right
+        block of `mass`, and each has a modal capacity of 1.
         """
         n = self.displacement_count
         if not self.state_count:
@@ -238,8 +240,8 @@ class LinearSystem:
                 squares, shapes = eigh(stiffness, mass, subset_by_index=subset)
             except np.linalg.LinAlgError as cause:
                 raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
-        # A rigid motion has the eigenvalue zero, up to rounding. It is allowed only if `mode_count`
-        # is None.
+        # A rigid motion has the eigenvalue zero, up to rounding. It is allowed only if nothing need
+        # hold the system.
         if self.mode_count is None:
             is_rounding = np.abs(squares) <= ROUNDING * np.max(np.abs(squares), initial=0.0)
             squares = np.where(is_rounding, 0.0, squares)
@@ -313,10 +315,14 @@ class LinearSystem:
         )
 
     def _port_residuals(self) -> FloatArray | None:
-        """Return the compliance (P,) of ports in modes without inertia, if there are such modes."""
+        """Return the compliance (P,) of ports in the modes without inertia.
+
+        The result is None if all modes have inertia. An entry is zero if it is a rounding error, or
+        if the port is in `on_modes`.
+        """
         if not self.is_truncated or not self.ports:
             return None
-        rows = np.array(list(self.ports.values()))
+        rows = np.array(list(self.ports.values()))  # (P, N)
         residual_compliance = np.einsum("pn,np->p", rows, self.residual_displacements(rows.T))
         compliance = np.einsum("pn,np->p", rows, self.apply_flexibility(rows.T))
         is_flexible = [name not in self.on_modes for name in self.ports]
@@ -372,7 +378,7 @@ class LinearSystem:
         """
         if self.solved is not None:
             return self.solved.static(loads)
-        inverse = self._inverse_cholesky
+        inverse = self._inverse_cholesky  # K^-1 = L^-T L^-1
         return np.asarray(inverse.T @ (inverse @ loads))
 
     def residual_displacements(self, loads: FloatArray) -> FloatArray:
@@ -398,8 +404,8 @@ class LinearSystem:
         # Least squares: rigid motions may be unrestored, if no load acts along them.
         mode_count = len(self.angular_frequency)
         displacement_mode_count = self.displacement_mode_count
-        modal_loads = loads @ self.shapes
-        restoring = np.hstack(
+        modal_loads = loads @ self.shapes  # (L, M)
+        restoring = np.hstack(  # (M, M)
             (
                 self.modal_system.full_stiffness[:mode_count, :displacement_mode_count],
                 self.modal_system.damping[:mode_count, displacement_mode_count:mode_count],
@@ -441,7 +447,8 @@ class LinearSystem:
         laws : PortLaws
             Internal forces; a port of a state counts as undisplaced.
         levels : (L, k) array, optional
-            The value of each load at each level; by default each load is a level of its own.
+            The value of each load at each level; by default there are k levels, with a value of one
+            of one load each.
         memory, previous_level : arrays, optional
             The memory of the laws at the end of an earlier path, and the values (k,) of the loads
             there; by default the laws were never loaded.
@@ -454,10 +461,6 @@ class LinearSystem:
         time : float, optional
             Time [s] that decides which of the laws with time windows act.
 
-        Returns
-        -------
-        StaticPath
-
         Raises
         ------
         ModelError
@@ -465,11 +468,11 @@ class LinearSystem:
         SolutionError
             If the equations of the laws have no solution.
         """
-        law_rows = self.rows_of_laws(laws, time)
+        law_rows = self.rows_of_laws(laws, time)  # (J, N)
         law_rows[:, self.displacement_count :] = 0.0
         if levels is None:
             levels = np.eye(len(directions))
-        # displacements under unit loads, and under unit forces of the laws
+        # displacements under unit loads (k, N), and under unit forces of the laws (J, N)
         displacements = self.equilibrium_under(directions) + offset
         flexibility = self.equilibrium_under(law_rows)
         if fixed_row is not None:
@@ -478,8 +481,8 @@ class LinearSystem:
             flexibility = flexibility - np.outer(
                 flexibility @ fixed_row, point_force_displacement
             ) / float(point_force_displacement[0] @ fixed_row)
-        port_displacements = displacements @ law_rows.T
-        port_compliance = law_rows @ flexibility.T
+        port_displacements = displacements @ law_rows.T  # (k, J)
+        port_compliance = law_rows @ flexibility.T  # (J, J)
         if output_rows is not None:
             displacements = displacements @ output_rows.T
             flexibility = flexibility @ output_rows.T

@@ -34,8 +34,10 @@ class LoadChange(NamedTuple):
 
     @classmethod
     def from_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
-        """Return the change of loads by all gains and places of a patch, applied in their order."""
-        # a later gain acts on the load as it is changed so far, thus on earlier tares as well
+        """Return the change of loads by the primitives `LoadGain` and `LoadPlace` of a patch.
+
+        They are applied in their order: a later gain also acts on earlier tares.
+        """
         change = cls()
         for primitive in patch:
             if isinstance(primitive, LoadGain):
@@ -73,7 +75,7 @@ def choose_load_place(
     places : sequence of str
         The load places of the model.
     place : str or (float, float)
-        The load place that the trial names.
+        The load place that the trial names; `DEFAULT_PLACE` if it names none.
     model_name, trial_text : str
         Model and trial as they are called in a sentence.
 

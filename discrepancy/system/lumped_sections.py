@@ -34,19 +34,9 @@ _MATRIX_FORMS = (
 
 
 def _refuse_other_forms(value: object, expected: str) -> None:
-    """Refuse a value that is neither a number, nor a list of numbers, nor a list of lists.
+    """Raise `ValueError` unless a value is a number, a list of numbers, or a list of lists.
 
-    Parameters
-    ----------
-    value : object
-        The value as the file states it.
-    expected : str
-        The forms that are expected, for the message.
-
-    Raises
-    ------
-    ValueError
-        If the value has another form, or mixes numbers and lists.
+    A list that mixes numbers and lists is refused, too. `expected` names the forms in the message.
     """
     entries = as_list(value)
     are_lists = [isinstance(entry, list | tuple) for entry in entries]

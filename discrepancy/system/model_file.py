@@ -42,7 +42,7 @@ class ParameterSection(NamedSection):
     """Unit of the parameter."""
 
     def checks(self) -> Iterator[Check]:
-        """Yield a mean out of its range."""
+        """Yield the fault of a mean that is not between its limits."""
         where = f"low {self.low:g} and high {self.high:g}"
         yield (
             not self.low <= self.mean <= self.high,
@@ -94,7 +94,7 @@ class DescribedModel(Model):
     Parameters
     ----------
     description : ModelDescription
-        The content of the file `modelDescription.xml`.
+        The content of its TOML file.
     quantities : mapping of str to Quantity
         The physical quantity of each output, by its name.
     """

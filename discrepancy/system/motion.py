@@ -110,11 +110,11 @@ class Motion:
     def _displacements_without_inertia(self, rows: FloatArray) -> FloatArray:
         """Return the displacements row . u in the modes without inertia, as (N, C) for rows (C, n).
 
-        These high modes deform without inertia: applied forces deform them at once, internal forces
-        and the end of a holding force with the first-order lag of their damping.
+        Applied forces deform these high modes at once. Internal forces, and the end of a holding
+        force, deform them with the first-order lag of their damping.
         """
         system = self.system
-        residual_flexibility = system.residual_displacements(rows.T)
+        residual_flexibility = system.residual_displacements(rows.T)  # (n, C)
         displacement = np.zeros((len(self.time), len(rows)))
         if self.excitation.loads:
             displacement += self.excitation.loads_at(self.time, residual_flexibility)
@@ -132,9 +132,10 @@ class Motion:
         return displacement
 
     def response(self, equations: Sequence[OutputEquation]) -> Response:
-        """Return the values and rates of outputs at all samples, given their C equations.
+        """Return the values and rates (N, C) of outputs at all samples, given their C equations.
 
-        Modes without inertia contribute only to outputs that are not differentiated.
+        Modes without inertia contribute only to outputs that are not differentiated, and not to
+        rates. The rates of outputs with a direct load or force of laws are differences in time.
         """
         values, rates = self._outputs_of_modal_motion(equations)
         if self.system.is_truncated:
@@ -194,11 +195,12 @@ def simulate_motion(
     Parameters
     ----------
     system : LinearSystem
-        The linear system whose motion is computed.
+        The system that moves.
     excitation : Excitation
-        Its loads, prescribed motions and release.
+        Its loads, prescribed motions and release, and the times of the samples.
     laws : PortLaws
-        The laws of the internal forces at ports.
+        The laws of the internal forces at ports; a drift of the stiffness counts from the first
+        time of the record.
     refinement : int
         Time steps are this many times smaller than usual.
 
@@ -227,7 +229,7 @@ def _motion_from_record(
         # A speed-dependent law at a port that only drives move has no force at the start if the
         # drives begin at rest. The kernel instead computes the force that would hold the drive's
         # coordinate like a free mass, which no reading contains.
-        rows = laws.port_rows(system.modal_system.ports, len(begin.v))
+        rows = laws.port_rows(system.modal_system.ports, len(begin.v))  # (J, M + P)
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
         is_still = rows @ begin.v == 0.0
         motion.port_forces[0, is_driven & is_still & (laws.depends_on_speed == 1)] = 0.0
@@ -253,21 +255,8 @@ def _motion_from_release(
     """Return the motion after a release at time zero.
 
     Before a release from rest, the structure is held in its shape. If the release is not from rest
-    and the clock puts samples before time zero, the motion is continued backwards in time, without
-    internal forces.
-
-    Parameters
-    ----------
-    system : LinearSystem
-        The linear system whose motion is computed.
-    excitation : Excitation
-        Its loads, prescribed motions and release.
-    point : ReleasePoint
-        The point from which the system is released, and how.
-    laws : PortLaws
-        The laws of the internal forces at ports.
-    refinement : int
-        Steps are this many times smaller.
+    and the clock puts samples before time zero, the motion is continued backwards in time to the
+    first of them, without internal forces.
     """
     times = excitation.sample_times
     released = released_state(system, excitation, point, laws)
@@ -304,17 +293,11 @@ def _with_held_samples(
 ) -> ModalMotion:
     """Return a motion of `count` samples, with the held shape in the first `held_count` of them.
 
-    Parameters
-    ----------
-    motion : ModalMotion
-        The motion at the samples after the release.
-    begin : InitialMotion
-        The state at the release, which is that of the held shape.
-    held_count, count : int
-        The number of samples before the release, and of all samples.
+    `motion` is that after the release; samples beyond `count` are cut off. `begin` is the state at
+    the release, which is that of the held shape.
     """
-    laws = motion.port_forces.shape[1]
-    forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
+    law_count = motion.port_forces.shape[1]
+    forces = np.zeros(law_count) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
         """Return the row `before` for each held sample, followed by the rows `after`."""
@@ -341,20 +324,10 @@ def _integrate_from(
     begin: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
-    """Return the motion at time stamps, from the state at a time at or before the first stamp.
+    """Return the motion at times `stamps` (N,) [s], from the state `begin` at `first_time` [s].
 
-    Parameters
-    ----------
-    system, excitation, laws
-        The system, its loads and prescribed motions, and the internal forces.
-    first_time : float
-        The time of the state `begin` [s].
-    stamps : (N,) array
-        Times at which the motion is computed [s].
-    begin : InitialMotion
-        The state at the first time.
-    refinement : int
-        Time steps are this many times smaller than usual.
+    If the first stamp is not later than `first_time`, beyond rounding, the state is taken as that
+    at the first stamp.
     """
     tolerance = LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     is_late = stamps[0] - first_time > tolerance
@@ -388,13 +361,13 @@ def _integrate_in_steps(
     begin: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
-    """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
+    """Return the motion at times (N,) [s] from a state at the first of them, step by step."""
     modal = system.modal_system
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
     edges = np.concatenate((laws.switching_times, excitation.jump_times))
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
-    # displacements of the ports under loads in the modes without inertia
+    # displacements (K + 1, J) of the laws' ports under loads, in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
         residual = system.residual_displacements(system.rows_of_laws(laws).T)
@@ -411,17 +384,9 @@ def _linear_steps(
 ) -> StepArrays:
     """Return the linear steps of all coordinates between time boundaries.
 
-    Modal coordinates are integrated under their forces; the coordinate of a drive takes the
-    values of its prescribed motion.
-
-    Parameters
-    ----------
-    system, excitation
-        The system, its loads and prescribed motions, and the internal forces.
-    boundaries : Boundaries
-        The K + 1 boundaries of the steps.
-    port_displacements : (K + 1, J) array
-        The displacements of the laws' ports under the loads, in the modes without inertia [m].
+    Modal coordinates are integrated under their forces; the coordinate of a drive takes the values
+    of its prescribed motion. `port_displacements` (K + 1, J) are those of the laws' ports under the
+    loads, in the modes without inertia, at the K + 1 boundaries of the steps [m].
     """
     time = boundaries.time
     begin_force, end_force = equivalent_ramps(

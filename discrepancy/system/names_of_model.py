@@ -14,15 +14,7 @@ from discrepancy.system.load_change import DEFAULT_PLACE
 
 
 def campaign_in_names_of(campaign: Campaign, model: Model) -> Campaign:
-    """Return a campaign whose trials have the load place and the damage regions of a model.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        The campaign as it was read.
-    model : Model
-        The model that the campaign is compared with.
-    """
+    """Return a campaign whose trials have the load place and the damage regions of a model."""
     trials = tuple(_trial_in_names_of(trial, model) for trial in campaign.trials)
     return replace(campaign, trials=trials)
 
@@ -30,9 +22,9 @@ def campaign_in_names_of(campaign: Campaign, model: Model) -> Campaign:
 def _trial_in_names_of(trial: Trial, model: Model) -> Trial:
     """Return a trial with the load place and the damage regions of a model.
 
-    The default load place becomes the model's only one, if the model has one only. A region that
-    the model does not have stays if the campaign states a loss of it, so that the model can refuse
-    it.
+    The default load place becomes the model's own, if the model has only one. Regions of the model
+    that the trial does not have get no loss. A region that the model does not have is dropped,
+    unless the campaign states a loss of it: it then stays, so that the model can refuse it.
     """
     places = model.load_places
     load_place = trial.load_place

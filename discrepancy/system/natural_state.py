@@ -18,7 +18,8 @@ def natural_state_magnitudes(
     """Return typical magnitudes (L,) of the unknown state at the start of a trial.
 
     The magnitude of an amplitude is the larger of its largest value in the motion from rest, and
-    of the value that could explain the largest reading of a channel.
+    of the value that could explain the largest reading of a channel. An amplitude that neither
+    shows has the largest magnitude of all.
 
     Parameters
     ----------
@@ -51,11 +52,11 @@ def natural_state_magnitudes(
         if equation.feedthrough is not None or not readings.size:
             continue
         largest_reading = float(np.max(np.abs(readings)))
-        rows = equation.rows @ system.shapes
+        rows = equation.rows @ system.shapes  # (4, modes), by order of the time derivative
         displacement_rows = rows[:, :displacement_mode_count]
         state_rows = rows[:, displacement_mode_count:]
         if np.any(displacement_rows):
-            # order of the time derivative that the output reads; at w each order multiplies it by w
+            # the lowest derivative that the output reads; each order multiplies an amplitude by w
             derivative = np.argmax(np.any(rows, axis=1))
             amplitude = (
                 largest_reading

@@ -79,6 +79,6 @@ class RowsByDerivative(NamedTuple):
 def rows_in_coordinates(
     equations: Sequence[OutputEquation], shapes: FloatArray
 ) -> RowsByDerivative:
-    """Return the rows of outputs for modal coordinates, given the shapes (N, M)."""
-    by_output = np.array([equation.rows for equation in equations]) @ shapes
+    """Return the rows (C, M) of C outputs for modal coordinates, given the shapes (N, M)."""
+    by_output = np.array([equation.rows for equation in equations]) @ shapes  # (C, 4, M)
     return RowsByDerivative(*np.moveaxis(by_output, 1, 0))

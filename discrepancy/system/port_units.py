@@ -12,18 +12,18 @@ from discrepancy.system.response import EITHER, MOVES, TURNS
 
 
 def units_at_port(description: LumpedDescription, row: FloatArray) -> tuple[str, str]:
-    """Return the units of the force and of the motion at a port, `EITHER` if not known.
+    """Return the units of the force and of the motion at a port, `EITHER` if they are not known.
 
-    A port that an output or an input measures or prescribes has its unit. A port that is a sum or
-    difference of unknowns has their unit (length or angle), and an unknown has the unit of an
-    output or an input that measures or prescribes it alone.
+    A port with the row of an output, or of a prescribed input, has the unit of that. Another port
+    that is a sum or difference of unknowns has their unit, if all have the same. An unknown has the
+    unit of an output or an input that measures or prescribes it alone.
 
     Parameters
     ----------
     description : LumpedDescription
         The file of the model.
     row : (n,) array
-        The motion of the port in the unknowns.
+        The motion of the port is row . unknowns.
     """
     if not np.any(row[: description.displacement_count]):
         return _units_of_state_port(description)
@@ -44,7 +44,10 @@ def units_at_port(description: LumpedDescription, row: FloatArray) -> tuple[str,
 
 
 def _units_of_state_port(description: LumpedDescription) -> tuple[str, str]:
-    """Return the units of a flow at a port of a state, and of the state."""
+    """Return the units of a flow at a port of a state, and of the state.
+
+    The state has the unit of the outputs of states, if these measure a single quantity.
+    """
     first_state = description.displacement_count
     quantities = {
         output.quantity
@@ -70,9 +73,9 @@ def _units_by_unknown(description: LumpedDescription) -> dict[int, set[tuple[str
 def _measured_motions(
     description: LumpedDescription,
 ) -> Iterator[tuple[tuple[float, ...], tuple[str, str]]]:
-    """Yield the vector of each motion that an output measures or an input prescribes.
+    """Yield the vector (n,) of each motion that an output measures or an input prescribes.
 
-    The units of force and motion in its direction follow each vector.
+    With it come the units of force and motion in its direction.
     """
     sections: list[InputSection | OutputSection] = [*description.output]
     sections += description.input

@@ -31,7 +31,7 @@ def ported_system(
     Returns
     -------
     PortedSystem
-        Its matrices; see there for signs.
+        Its matrices, for the signs that its docstring states.
     """
     names = tuple(system.ports)
     port_rows = np.array([system.ports[name] for name in names]).reshape(
@@ -40,41 +40,33 @@ def ported_system(
     law_directions = np.array([system.law_directions[name] for name in names])
     law_directions = law_directions.reshape(len(names), system.unknown_count)
     direct_outputs = _direct_forces(system, equations, law_directions)
-    # the system in the coordinates q
+    # the system in the M coordinates q
     mass = shapes.T @ system.mass @ shapes
     damping = shapes.T @ system.damping @ shapes
     stiffness = shapes.T @ system.stiffness @ shapes
-    port_rows = port_rows @ shapes
-    law_directions = law_directions @ shapes
-    acceleration_per_force = np.linalg.solve(mass, law_directions.T)
+    port_rows = port_rows @ shapes  # (P, M)
+    law_directions = law_directions @ shapes  # (P, M)
+    acceleration_per_force = np.linalg.solve(mass, law_directions.T)  # (M, P)
     by_damping = np.linalg.solve(mass, damping)
     by_stiffness = np.linalg.solve(mass, stiffness)
-    # first order, s = (q, q'), without the integrals of states
+    # first order: the state is (q, q') with only the k coordinates q that are displacements
     coordinate_count = len(mass)
-    displacement_mode_count = system.displacement_mode_count
-    generator = np.zeros(
-        (displacement_mode_count + coordinate_count, displacement_mode_count + coordinate_count)
-    )
-    generator[:displacement_mode_count, displacement_mode_count : 2 * displacement_mode_count] = (
-        np.eye(displacement_mode_count)
-    )
-    generator[displacement_mode_count:, :displacement_mode_count] = -by_stiffness[
-        :, :displacement_mode_count
-    ]
-    generator[displacement_mode_count:, displacement_mode_count:] = -by_damping
+    k = system.displacement_mode_count
+    generator = np.zeros((k + coordinate_count, k + coordinate_count))
+    generator[:k, k : 2 * k] = np.eye(k)
+    generator[k:, :k] = -by_stiffness[:, :k]
+    generator[k:, k:] = -by_damping
     # rows of outputs: q'' = M^-1 (-K q - D q' - sum_p acts_p g_p) replaces the accelerations
     output_rows = rows_in_coordinates(equations, shapes)
-    of_position = (output_rows.position - output_rows.acceleration @ by_stiffness)[
-        :, :displacement_mode_count
-    ]
+    of_position = (output_rows.position - output_rows.acceleration @ by_stiffness)[:, :k]
     of_velocity = output_rows.velocity - output_rows.acceleration @ by_damping
-    no_position = np.zeros((len(names), displacement_mode_count))
+    no_position = np.zeros((len(names), k))
     no_velocity = np.zeros((len(names), coordinate_count))
     return PortedSystem(
         generator=generator,
         ports=names,
         actions=np.hstack((no_position, acceleration_per_force.T)),
-        positions=np.hstack((port_rows[:, :displacement_mode_count], no_velocity)),
+        positions=np.hstack((port_rows[:, :k], no_velocity)),
         speeds=np.hstack((no_position, port_rows)),
         outputs=np.hstack((of_position, of_velocity)),
         through=acceleration_per_force.T @ output_rows.acceleration.T - direct_outputs,
@@ -86,8 +78,9 @@ def _direct_forces(
 ) -> FloatArray:
     """Return the immediate change (P, C) of each output by a unit force at each port.
 
-    A force adds to the output that is the reaction of a drive, and to outputs of modes without
-    inertia, which deform at once.
+    `directions` (P, N) are those in which the forces act. A force adds to the output that is the
+    force of a prescribed motion, and it deforms modes without inertia at once. Other outputs do not
+    change.
     """
     direct_forces = np.zeros((len(directions), len(equations)))
     for column, equation in enumerate(equations):

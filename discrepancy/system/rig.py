@@ -54,7 +54,8 @@ class ControlLoop:
     direction : (N,) ndarray
         The load for a controller output of one.
     error_integral : (N,) ndarray
-        The row of the unknown that is the integral of the error; zero without an integral gain.
+        One at the unknown that is the integral of the error, else zero; all zero without an
+        integral gain.
     """
 
     section: ControllerSection
@@ -71,7 +72,8 @@ class ControlLoop:
 
         They have the form of `OutputEquation.rows`; the error is then minus the measured quantity.
         """
-        # row k multiplies the k-th time derivative: a shift by one row differentiates
+        # row k multiplies the k-th time derivative: a shift by one row differentiates (the last
+        # row, which is zero, comes first)
         measured_rate = np.roll(self.measured, 1, axis=0)
         rows = -self.proportional * self.measured - self.derivative * measured_rate
         rows[1] += self.integral * self.error_integral
@@ -80,11 +82,14 @@ class ControlLoop:
     def reference_loads(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
         """Return the loads that follow from the recorded reference of the controller.
 
+        There are none if the trial does not record its reference. The reference drives the
+        proportional force and the integral of the error; the derivative gain adds a second load.
+
         Raises
         ------
         ModelError
-            If the reference has another quantity than the controller, or goes in steps that have no
-            derivative.
+            If the reference has another quantity than the controller, or is held constant between
+            its samples although the controller differentiates it.
         """
         section = self.section
         if section.reference is None or section.reference not in inputs:
@@ -134,7 +139,10 @@ class Rig:
         return self.factors.get(name, 1.0)
 
     def load_direction(self, section: LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
-        """Return a load (N,) along a row, through the matrix and with the factor of its section."""
+        """Return the load (N,) of a section for a value of one, along a row of the first unknowns.
+
+        If the section names a matrix (`through`), the load is this matrix times the row.
+        """
         direction = np.zeros(len(self.matrices["mass"]))
         direction[: len(row)] = row
         if section.through is not None:
@@ -156,6 +164,8 @@ def build_rig(
     places: Sequence[PlaceSection],
 ) -> Rig:
     """Return a lumped model in a state.
+
+    A rise of the temperature softens the whole stiffness by the primitives `ModulusTemperature`.
 
     Parameters
     ----------
@@ -188,7 +198,7 @@ def build_rig(
     matrices = description.scaled_matrices(warm_factors)
     displacement_count = description.displacement_count
     if displacement_count:
-        # views of the matrices, changed in place
+        # views of the matrices, which `_apply_patch` changes in place
         mass = matrices["mass"][:displacement_count, :displacement_count]
         stiffness = matrices["stiffness"][:displacement_count, :displacement_count]
         _apply_patch(state.structure, description, places, mass, stiffness)
@@ -207,18 +217,10 @@ def _apply_patch(
     mass: FloatArray,
     stiffness: FloatArray,
 ) -> None:
-    """Add the point masses and root compliances of a patch to mass and stiffness (n, n).
+    """Add the point masses and root compliances of a patch to mass and stiffness (n, n), in place.
 
-    Parameters
-    ----------
-    patch : ModelPatch
-        The change of the structure.
-    description : LumpedDescription
-        The file's content, for the lever of the root.
-    places : sequence of PlaceSection
-        The places of masses in the order of their stations.
-    mass, stiffness : (n, n) arrays
-        Matrices that are changed in place.
+    A point mass acts at its station between the `places`. A root compliance is ignored if the file
+    has no `[root]`.
     """
     for primitive in patch:
         if isinstance(primitive, PointMass):
@@ -237,10 +239,10 @@ def _apply_patch(
 
 
 def _row_at_station(places: Sequence[PlaceSection], station: float) -> FloatArray:
-    """Return the row of the displacement at a station [m], interpolated between the places."""
+    """Return the row (n,) of the displacement at a station [m], interpolated between the places."""
     stations = [place.station for place in places]
-    columns = np.transpose([place.vector for place in places])
-    return np.array([np.interp(station, stations, column) for column in columns])
+    coefficients = np.transpose([place.vector for place in places])  # (n, places)
+    return np.array([np.interp(station, stations, values) for values in coefficients])
 
 
 def _damping_matrix(damping: Damping, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
@@ -261,7 +263,10 @@ def _damping_matrix(damping: Damping, mass: FloatArray, stiffness: FloatArray) -
 def _control_loops(
     description: LumpedDescription, factors: Mapping[str, float]
 ) -> dict[str, ControlLoop]:
-    """Return the controllers by name, with their gains times the factors of the parameters."""
+    """Return the controllers by name, with their gains times the factors of the parameters.
+
+    The integrals of errors are the last unknowns, in the order of the controllers that have them.
+    """
     unknown_count = description.unknown_count
     displacement_count = description.displacement_count
     next_integral = displacement_count + description.state_count

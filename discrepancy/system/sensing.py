@@ -33,7 +33,7 @@ class LoggerRates(NamedTuple):
 
 @dataclass(frozen=True)
 class TurnedGauges:
-    """Strain channels of a trial, if a patch turns gauges, and the strain components they need.
+    """Strain channels of a trial, if a patch turns gauges, and the outputs that readings need.
 
     Attributes
     ----------
@@ -49,11 +49,11 @@ class TurnedGauges:
 
 
 def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
-    """Return a trial and its patch with time counted from the first sample, if stamps are far off.
+    """Return a trial and its patch with times counted from the first sample, if it is far from 0.
 
-    Models count time from the start of the trial, but stamps may count from an epoch, or from the
-    start of a logger. Stamps that begin within the length of the record from zero are kept, since
-    a release happens at zero.
+    Models count time from the start of the trial, but time stamps may count from an epoch, or from
+    the start of a logger. Time stamps stay as they are if the first one is closer to zero than the
+    record is long, since a release happens at zero.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial,
 
 
 def _shift_window(window: Window, first_stamp: float) -> Window:
-    """Return a window in a clock that is zero at a time `first_stamp` [s]."""
+    """Return a window of time counted from `first_stamp` [s]; an open end stays open."""
     begin = None if window.begin is None else window.begin - first_stamp
     end = None if window.end is None else window.end - first_stamp
     return window._replace(begin=begin, end=end)
@@ -117,14 +117,14 @@ def observe(
         return model.respond(trial, campaign.outputs(trial), patch, conditions)
     gauges = _find_turned_gauges(model, campaign, trial, patch)
     response = _response_in_clocks(model, campaign, trial, patch, conditions, gauges)
-    # columns: the C channels, transverse strains of strain channels, their shear strains
+    # columns: the C channels, transverse strains of the G gauges, their shear strains
     channel_count = len(trial.channels)
-    turned_count = len(gauges.columns)
-    values = response.values
+    gauge_count = len(gauges.columns)
+    values = response.values  # (N, C + 2 G)
     transverse = np.zeros((len(values), channel_count))
     shear = np.zeros((len(values), channel_count))
-    transverse[:, gauges.columns] = values[:, channel_count : channel_count + turned_count]
-    shear[:, gauges.columns] = values[:, channel_count + turned_count :]
+    transverse[:, gauges.columns] = values[:, channel_count : channel_count + gauge_count]
+    shear[:, gauges.columns] = values[:, channel_count + gauge_count :]
     rates = response.rates[:, :channel_count] if response.rates is not None else None
     channel_response = Response(values[:, :channel_count], rates)
     return observe_response(
@@ -170,17 +170,10 @@ def _response_in_clocks(
     conditions: Conditions,
     gauges: TurnedGauges,
 ) -> Response:
-    """Return the response of all outputs at the sample times of their own loggers.
+    """Return the response of all outputs of `gauges` at the sample times of their own loggers.
 
-    The recorded inputs are first brought to their true times. All clocks are right at the first
-    stamp; the model is run once for each distinct clock rate.
-
-    Parameters
-    ----------
-    model, campaign, trial, patch, conditions
-        As in `observe`.
-    gauges : TurnedGauges
-        Strain channels, and the outputs that the model computes.
+    The recorded inputs are first brought to their true times. All loggers agree at the first
+    sample; the model is run once for each distinct rate of their clocks.
     """
     without_sensors = patch.without(*SENSORS)
     patch_rate, patch_zero = clock_of(patch)
@@ -198,11 +191,11 @@ def _response_in_clocks(
     values = np.zeros((len(trial.time), len(gauges.outputs)))
     output_slopes = np.zeros_like(values)
     for rate in np.unique(rates.channels).tolist():
-        # Clocks relative to the inputs' time: (1 + rate) / (1 + input rate) times (1 + clock rate),
-        # minus one. At the first stamp all clocks agree.
+        # relative to the time of the inputs: (1 + rate) / (1 + input rate) (1 + clock rate) - 1
         relative_rate = (rate - rates.inputs) / (1.0 + rates.inputs) * (
             1.0 + clock_rate
         ) + clock_rate
+        # the zero makes all clocks agree at the first sample
         logger_clock = relative_rate, clock_zero - relative_rate * first_stamp
         clock_conditions = replace(conditions, clock=logger_clock)
         response = model.respond(
@@ -218,13 +211,9 @@ def _response_in_clocks(
 def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> LoggerRates:
     """Return the clock errors (rate minus one) of a trial's inputs and channels.
 
-    By `LoggerClock` an event with time stamp t happened at (1 + error) t. The rates of several
-    loggers of one channel multiply. A static trial has no clock, so that its errors are zero.
-
-    Raises
-    ------
-    CatalogueError
-        If a patch names a logger that the campaign does not have.
+    By the primitive `LoggerClock`, what has the time stamp t happened at (1 + error) t. If several
+    act on one channel, their rates multiply. A trial at rest has no clock, so that its errors are
+    zero. Raises `CatalogueError` if the patch names a logger that the campaign does not have.
     """
     input_factor = 1.0
     channel_factors = np.ones(len(trial.channels))
@@ -244,7 +233,10 @@ def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> Logger
 
 
 def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[str, ...]:
-    """Return channels and inputs of a logger; raises `CatalogueError` if there is none."""
+    """Return the names of a logger's channels and inputs; `EVERY_CHANNEL` is the logger of all.
+
+    Raises `CatalogueError` if the campaign has no logger of that name.
+    """
     if logger == EVERY_CHANNEL:
         return (*trial.channels, *trial.input_names)
     if logger not in campaign.loggers:
@@ -254,10 +246,10 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
 
 
 def _with_channel_names(sensor_patch: ModelPatch, campaign: Campaign) -> ModelPatch:
-    """Return sensor primitives that name channels, not model outputs.
+    """Return the sensor primitives of a model with names of channels in place of its outputs.
 
-    A primitive that names a model output is replaced by one for each channel that measures it. An
-    output that no channel measures needs none.
+    A primitive that names an output is replaced by one for each channel that measures it; without
+    such a channel it is left out.
     """
     primitives: list[Primitive] = []
     for primitive in sensor_patch:
@@ -282,7 +274,7 @@ def observe_response(
 ) -> Response:
     """Return the readings of the channels, given the response of their outputs; see `observe`.
 
-    A caller may so try several sensor faults on one response. The response must already be sampled
+    With this, several faults of sensors can be tried on one response, which must already be sampled
     by the clocks of the patch.
 
     Parameters
@@ -329,7 +321,10 @@ def observe_response(
 
 
 def _release_displacement(trial: Trial, conditions: Conditions) -> float:
-    """Return the displacement of the release, scaled as the static shape is; 1 if there is none."""
+    """Return the displacement from which the structure is released, which scales a free gain.
+
+    It includes the deviation of a release from rest. For trials without a release it is 1.
+    """
     if trial.kind is not TrialKind.RINGDOWN or trial.release is None:
         return 1.0
     displacement = trial.release.displacement

@@ -93,11 +93,12 @@ class RecordedHistory:
         if derivative == 0:
             step_values = self.values
         else:
-            # the slope of the straight line that begins at each sample; after the last sample it is
-            # zero: no rise over an infinite interval
+            # (N,): the slope of the straight line that begins at each sample, which is zero after
+            # the last sample (no rise over an infinite interval)
             rises = np.diff(self.values, append=self.values[-1])
             step_values = rises / np.diff(self.time, append=np.inf)
-        # the last sample before each time; slightly earlier, because times at a jump are rounded
+        # The last sample before each time is taken. Times are moved back slightly, because a time
+        # at a jump may be rounded to just after it.
         just_before = time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time)
         next_sample = np.searchsorted(self.time, just_before)
         return np.asarray(step_values[np.maximum(next_sample - 1, 0)])
@@ -126,7 +127,7 @@ class FormulaHistory:
         return np.array([edge for span in self.spans for edge in span if isfinite(edge)])
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the values (N,) at times; a formula is never differentiated."""
+        """Return the values (N,) at times [s]; a formula is never differentiated."""
         spans = self.spans or ((-inf, inf),)
         is_inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
         return np.where(is_inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
@@ -135,10 +136,10 @@ class FormulaHistory:
 def equivalent_ramps(
     values_at: Callable[[FloatArray], FloatArray], time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return start and end values of straight lines that replace a function in each step.
+    """Return start and end values of straight lines that replace a function in each time step.
 
-    Each line goes through the function at the two Gauss-Legendre points of its step, so that it has
-    the same mean effect to fourth order in the step.
+    Each line goes through the function at the two Gauss-Legendre points of its step, so that the
+    integral of the motion over the step is right to fourth order in the step.
 
     Parameters
     ----------
@@ -164,6 +165,6 @@ def equivalent_ramps(
 
 
 def subdivide(time: FloatArray, parts: int) -> FloatArray:
-    """Return times (N,) with each interval between them divided into `parts` equal parts."""
-    position = np.arange((len(time) - 1) * parts + 1) / parts
+    """Return times (N,) with each interval divided into `parts`: ((N - 1) parts + 1,) times."""
+    position = np.arange((len(time) - 1) * parts + 1) / parts  # in intervals of `time`
     return np.interp(position, np.arange(len(time)), time)

@@ -481,9 +481,9 @@ def test_what_a_patched_model_lacks_is_named(second_verdict):
 
 
 def test_files_beneath_a_patched_model_are_not_replaced(second_verdict):
-    beneath = (str(second_verdict.rig), str(second_verdict.first_file))
-    files = (*beneath, second_verdict.folder / "verdict.json", second_verdict.folder / "patch.json")
-    assert choose_model(second_verdict.folder / "patch.json").beneath == beneath
+    base_files = (str(second_verdict.rig), str(second_verdict.first_file))
+    files = (*base_files, second_verdict.folder / "verdict.json", second_verdict.folder / "patch.json")
+    assert choose_model(second_verdict.folder / "patch.json").base_files == base_files
     for file in files:
         with pytest.raises(FileNotWrittenError, match="is a file from which the patched model is made"):
             apply_verdict(second_verdict.folder, file, replace=True)
