@@ -134,12 +134,16 @@ LONGEST_NAME = 20
 LONGEST_WORD = 14
 """Longest part of a word on one line in a narrower terminal, in the other columns."""
 
+_UNBROKEN = re.compile(r"\S+(?: (?:±|to) \S+)*")
+"""What stays on one line of a cell: a word, a value with its deviation, or an interval."""
+
 
 def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
     """Return a table without empty columns, for a terminal of a given width.
 
-    In a terminal narrower than `WIDE` long words may break at underscores and hyphens. The first
-    column is not wrapped if it has room, since it holds the names of the rows.
+    In a terminal narrower than `WIDE` long words may break at underscores and hyphens. If values
+    would still not fit on one line, the table is folded: all columns after the first one become
+    one, whose cells say "heading: value; heading: value".
 
     Parameters
     ----------
@@ -157,44 +161,73 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     shown_columns = [
         column for column in range(len(headings)) if not cells or any(row[column] for row in cells)
     ]
-    first_column = shown_columns[0] if shown_columns else 0
+    shown_headings = [headings[column] for column in shown_columns]
+    shown_cells = [[row[column] for column in shown_columns] for row in cells]
+    printed_cells = shown_cells
     if width < WIDE:
-        cells = [_with_broken_words(row, first_column) for row in cells]
-    width_of_names = None
-    if shown_columns and width >= NARROWEST:
-        columns = [[headings[column], *(row[column] for row in cells)] for column in shown_columns]
-        width_of_names = _width_of_names(columns, width)
+        printed_cells = [_with_broken_words(row) for row in shown_cells]
+    widths = _column_widths(shown_headings, printed_cells, width)
+    if widths is None and len(shown_columns) > 2:
+        shown_headings, printed_cells, widths = _folded(shown_headings, shown_cells, width)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in shown_columns:
-        # Rich narrows only columns without a fixed width
-        fixed_width = width_of_names if column == first_column else None
-        table.add_column(headings[column], overflow="fold", width=fixed_width)
-    for row in cells:
-        table.add_row(*[row[column] for column in shown_columns])
+    for column, heading in enumerate(shown_headings):
+        fixed_width = None if widths is None else widths[column]
+        table.add_column(heading, overflow="fold", width=fixed_width)
+    for row in printed_cells:
+        table.add_row(*row)
     return table
 
 
-def _width_of_names(columns: Sequence[Sequence[str]], width: int) -> int | None:
-    """Return the width of the first column of a table; None if it is narrowed like the others.
+def _column_widths(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], width: int
+) -> list[int] | None:
+    """Return widths of columns with which no value breaks; None if the terminal is too narrow.
 
-    Its names stay on one line if the longest takes at most half of the terminal. Otherwise they
-    get what the other columns leave, or two fifths of the terminal if that is more and the words of
-    the other columns stay whole in the rest.
+    The first column, which holds the names of the rows, is narrowed first, but only if its names
+    take more than half of the terminal, and then to two fifths of it. Then the widest is narrowed.
     """
-    names, *other_columns = columns
-    longest_name = _longest(names)
-    if longest_name <= width // 2:
-        return longest_name
-    inner_width = width - 2  # without the edges of the table
-    room_beside_lines = inner_width - sum(2 + _longest(column) for column in other_columns)
-    two_fifths = 2 * width // 5
-    if room_beside_lines >= two_fifths:
-        return min(longest_name, room_beside_lines)
-    words = [[word for cell in column for word in cell.split()] for column in other_columns]
-    room_beside_words = inner_width - sum(
-        2 + _longest(words_of_column) for words_of_column in words
-    )
-    return two_fifths if room_beside_words >= two_fifths else None
+    widths = []
+    least_widths = []
+    for column, heading in enumerate(headings):
+        texts = [heading, *(row[column] for row in rows)]
+        widths.append(_longest(texts))
+        least_widths.append(_longest(match for text in texts for match in _UNBROKEN.findall(text)))
+    room = width - 2 * len(headings)
+    if width >= NARROWEST and headings:
+        longest_name = widths[0]
+        name_width = longest_name if longest_name <= width // 2 else 2 * width // 5
+        least_widths[0] = max(least_widths[0], name_width)
+    while sum(widths) > room:
+        narrowable = [column for column, least in enumerate(least_widths) if widths[column] > least]
+        if not narrowable:
+            return None
+        has_long_names = 0 in narrowable
+        widest = 0 if has_long_names else max(narrowable, key=lambda column: widths[column])
+        widths[widest] -= 1
+    return widths
+
+
+def _folded(
+    headings: Sequence[str], rows: Sequence[Sequence[str]], width: int
+) -> tuple[list[str], list[list[str]], list[int]]:
+    """Return headings, cells and column widths of a table whose columns are folded into two."""
+    name_width = min(width // 3, _longest([headings[0], *(row[0] for row in rows)]))
+    room = width - 4 - name_width
+    folded_rows = []
+    for name, *cells in rows:
+        lines = [""]
+        for heading, cell in zip(headings[1:], cells, strict=True):
+            if not cell:
+                continue
+            value = f"{heading}: {cell}"
+            separator = "; " if lines[-1] else ""
+            if lines[-1] and len(lines[-1] + separator + value) >= room:
+                lines[-1] += ";"
+                lines.append(value)
+            else:
+                lines[-1] += f"{separator}{value}"
+        folded_rows.append([break_words(name, LONGEST_NAME), "\n".join(lines)])
+    return [headings[0], ""], folded_rows, [name_width, room]
 
 
 def _longest(texts: Iterable[str]) -> int:
@@ -202,13 +235,12 @@ def _longest(texts: Iterable[str]) -> int:
     return max((len(line) for text in texts for line in text.split("\n")), default=0)
 
 
-def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:
-    """Return the cells of a row with their long words broken."""
-    cells = []
-    for column, text in enumerate(row):
-        longest_part = LONGEST_NAME if column == first_column else LONGEST_WORD
-        cells.append(break_words(text, longest_part))
-    return cells
+def _with_broken_words(row: Sequence[str]) -> list[str]:
+    """Return the cells of a row with their long words broken; the first cell is a name."""
+    return [
+        break_words(text, LONGEST_WORD if column else LONGEST_NAME)
+        for column, text in enumerate(row)
+    ]
 
 
 def break_words(text: str, longest: int) -> str:

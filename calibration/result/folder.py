@@ -39,6 +39,8 @@ REPORT_NAME = "report.html"
 WING_FIELDS = "wing.vtu"
 MODE_FIELDS = "modes.vtu"
 
+MOST_SHOWN_VALUES = 5
+"""Most parameters whose values stand on the first screen of the page, in one row."""
 _DRAWN = (REPORT_NAME, WING_FIELDS, MODE_FIELDS, f"{FIGURES}/*.svg", f"{FIGURES}/*.png")
 """Files that show a calibration; those of an older one must not stay beside a newer
 `calibration.nc`."""
@@ -111,7 +113,7 @@ def write_page(result: Calibration, folder: Path, further_sections: Sequence[Sec
     hashes = result.provenance["input_hashes"].items()
     inputs = ", ".join(f"{name} {value[:12]}" for name, value in hashes)
     values = []
-    for prior in result.priors[:6]:
+    for prior in result.priors[:MOST_SHOWN_VALUES]:
         value = prior.quantity.printed(
             result.mean(prior.name), result.standard_deviation(prior.name)
         )

@@ -42,18 +42,21 @@ def headline(result: Calibration) -> str:
 def outcome_sentences(result: Calibration) -> str:
     """Return how far the data narrow the parameters, and whether data, priors and model agree."""
     ratios = sorted(100 * result.posterior_over_prior(prior.name) for prior in result.priors)
-    narrowed = f"{ratios[0]:.0f} to {ratios[-1]:.0f} %" if len(ratios) > 1 else f"{ratios[0]:.0f} %"
-    parameters = counted(len(ratios), "parameter")
+    narrowed = (
+        f"The data narrow the parameter to {ratios[0]:.0f} % of its prior standard deviation."
+    )
+    if len(ratios) > 1:
+        narrowed = (
+            f"The data narrow {len(ratios)} parameters to between {ratios[0]:.0f} and "
+            f"{ratios[-1]:.0f} % of their prior standard deviations."
+        )
     agreement = "The residuals agree with noise and priors."
     if result.findings:
-        disagree = "says" if len(result.findings) == 1 else "say"
+        say = "says" if len(result.findings) == 1 else "say"
         agreement = (
-            f"{counted(len(result.findings), 'finding')} below {disagree} where data and model "
-            "disagree."
+            f"{counted(len(result.findings), 'finding')} below {say} where data and model disagree."
         )
-    return (
-        f"The data narrow {parameters} to {narrowed} of the prior standard deviation. {agreement}"
-    )
+    return f"{narrowed} {agreement}"
 
 
 def printed_calibration(

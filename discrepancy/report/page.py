@@ -197,7 +197,7 @@ def _highlights(investigation: Investigation) -> list[tuple[str, str]]:
         )
         values.append((percent_with_interval(proof.closed), meaning))
     if force is not None and force.ordered_by and not tested_trials(force):
-        meaning = f"what it follows: {force.followed_percent} % of its variance"
+        meaning = f"what the force follows, with {force.followed_percent} % of its variance"
         values.append((listing(force.ordered_by), meaning))
     if proof is not None and force is None:
         before, _, trials = proof_scores(proof)

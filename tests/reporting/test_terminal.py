@@ -63,6 +63,21 @@ def test_a_column_with_a_value_stays(width):
     assert "unit" in "".join(lines)
 
 
+@pytest.mark.parametrize("width", [80, 100])
+def test_a_table_whose_values_do_not_fit_is_folded(width):
+    headings = ("parameter", "unit", "prior", "posterior", "90 % interval", "left of the prior")
+    values = ["0.00120 ± 0.00090", "0.00076 ± 0.00019", "0.00044 to 0.00105", "21 %"]
+    name = "stiffness-proportional Rayleigh damping of the whole structure, beta"
+
+    lines = print_table(headings, [(name, "s", *values)], width)
+
+    text = "\n".join(lines)
+    assert max(map(len, lines)) <= width
+    assert "unit: s" in text
+    for heading, value in zip(headings[2:], values, strict=True):
+        assert f"{heading}: {value}" in text
+
+
 # ---------------------------------------------------------------- progress
 
 

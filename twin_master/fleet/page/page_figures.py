@@ -13,6 +13,7 @@ from twin_master.report.reading import NORMAL_95, printed_factors
 from twin_master.scenario.schema import Scenario
 
 _LETTERS = "abcdefgh"
+_MAPS_IN_A_ROW = 2
 
 
 @style.publication_style()
@@ -33,15 +34,25 @@ def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
     """
     factors = printed_factors(scenario)
     count = len(mean) + failed
-    # About twice as many columns as rows, because a panel is wider than it is high.
-    columns = max(1, int(np.ceil(np.sqrt(2.0 * count))))
+    # More columns than rows, because a panel is wider than it is high.
+    columns = max(1, int(np.ceil(np.sqrt(1.6 * count))))
     rows = -(-count // columns)  # rounded up
     order = np.argsort(-severity(scenario, mean), kind="stable")
     is_asset = np.where(np.arange(rows * columns) < count, 1.0, np.nan).reshape(rows, columns)
-    figure, panels = style.panels(
-        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
+    panel_rows = -(-len(factors) // _MAPS_IN_A_ROW)
+    figure, grid = style.panels(
+        panel_rows,
+        min(len(factors), _MAPS_IN_A_ROW),
+        0.4 + 1.9 * panel_rows,
+        0.3,
+        0.1,
+        left=0.06,
+        right=0.99,
+        hspace=0.25,
+        wspace=0.2,
     )
-    for number, (factor, (axes,)) in enumerate(zip(factors, panels, strict=True)):
+    panels = style.keep_first_panels(grid, len(factors))
+    for number, (factor, axes) in enumerate(zip(factors, panels, strict=True)):
         cells = np.full(rows * columns, np.nan)
         cells[: len(mean)] = factor.scale * mean[order, number]
         axes.imshow(

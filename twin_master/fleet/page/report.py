@@ -254,7 +254,7 @@ def _damage_sentence(overviews: Sequence[GroupOverview]) -> str:
     worst = max(with_state, key=lambda candidate: float(candidate.severity[0]))
     states = []
     for factor, mean in zip(printed_factors(worst.scenario), worst.mean[0], strict=True):
-        states.append(f"{factor.title} {factor.scale * mean:.3g} {factor.unit}".rstrip())
+        states.append(f"{factor.title} at {factor.scale * mean:.3g} {factor.unit}".rstrip())
     name = worst.names[0]
     return f"The asset with the most damage is {name} of {worst.group}: {', '.join(states)}."
 
