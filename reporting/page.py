@@ -83,15 +83,22 @@ class Fold(NamedTuple):
     blocks: "Sequence[Block]"
 
 
-Block = str | Notice | Highlights | Fold | PageFigure | Table | None
-"""A part of a page. A string is a paragraph; None and whatever is empty are left out."""
+Block = str | Markup | Notice | Highlights | Fold | PageFigure | Table | None
+"""A part of a page. A string is a paragraph; None and whatever is empty are left out.
+
+`Markup` is an element as HTML, which the script of a live page fills.
+"""
 
 
 class Section(NamedTuple):
-    """A part of a page with a heading, which appears in the contents; left out without blocks."""
+    """A part of a page with a heading, which appears in the contents; left out without blocks.
+
+    A live page gives the sections that its script finds an identifier.
+    """
 
     title: str
     blocks: Sequence[Block]
+    identifier: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class Page:
     ----------
     title, subtitle : str
         The title, also of the browser's window, and one line below it.
-    sentence : str
+    sentence : str or Markup
         What a reader must know, in one or two sentences in large print.
     picture : PageFigure or None
         The picture that shows it.
@@ -112,8 +119,9 @@ class Page:
         Everything else.
     footer : sequence of str
         The lines at the end, such as the sources cited.
-    script : str
-        The address of a further script, for a page that a server keeps up to date; empty for none.
+    scripts, style : sequence of str, str
+        The addresses of further scripts and of a further style sheet, for a page that a server
+        keeps up to date.
     """
 
     title: str
@@ -123,7 +131,8 @@ class Page:
     outcome: Sequence[Block] = ()
     sections: Sequence[Section] = ()
     footer: Sequence[str] = ()
-    script: str = ""
+    scripts: Sequence[str] = ()
+    style: str = ""
 
 
 _WITH_VALUES = "figures with values under the pointer"
@@ -165,11 +174,12 @@ def render_page(page: Page) -> str:
     """
     counts: Counter[str] = Counter()
     opening = _number_blocks((page.picture, *page.outcome), counts)
-    sections = []
+    sections: list[tuple[str, list[_NumberedBlock], str]] = []
     for section in page.sections:
         blocks = _number_blocks(section.blocks, counts)
         if blocks:
-            sections.append((section.title, blocks))
+            identifier = section.identifier or f"section-{len(sections) + 1}"
+            sections.append((section.title, blocks, identifier))
     template = html_environment().from_string(_read_resource("page.html"))
     return template.render(
         page=page,

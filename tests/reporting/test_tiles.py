@@ -121,7 +121,7 @@ def page_with_a_fold() -> str:
 
 def test_a_card_stands_open(page_with_a_fold):
     parse(page_with_a_fold)
-    assert '<p class="card">Friction at the joint &lt; 3\u00a0N</p>' in page_with_a_fold
+    assert '<div class="card">Friction at the joint &lt; 3\u00a0N</div>' in page_with_a_fold
 
 
 def test_a_fold_is_closed_and_ends_where_it_was_ended(page_with_a_fold):

@@ -6,9 +6,10 @@ the server keeps no state for it.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib import resources
+from typing import Any
 
 import numpy as np
 from jinja2 import Template
@@ -18,6 +19,7 @@ from pydantic import BaseModel
 from reporting.arrays import Float
 from reporting.errors import ReportingError
 from reporting.json_file import plain
+from reporting.page import Page, Section, render_page
 from twin_master.errors import TwinMasterError
 from twin_master.report.reading import (
     NORMAL_95,
@@ -119,11 +121,7 @@ class FlightPage:
                 "tallest_bar": TALLEST_BAR,
             }
         )
-        # Inside a script element only the beginning of a tag could end it
-        content = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
-        template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
-        html: str = Template(template, autoescape=True).render(scene=scene, content=Markup(content))
-        return html
+        return render_page(_page_of_scene(scene))
 
     def _sensor_range(self) -> tuple[float, float]:
         """Return the lowest and the highest reading on the axis of the sensors, as printed.
@@ -319,6 +317,60 @@ class FlightPage:
             # The margin is two standard deviations
             "state_deviation": np.where(np.isnan(mean), np.nan, 0.5 * margin),
         }
+
+
+def _page_of_scene(scene: Mapping[str, Any]) -> Page:
+    """Return the page of a flight, whose elements the script fills from the scene and the answers.
+
+    `scene` has all that does not change during a flight, as plain JSON.
+    """
+    controls = resources.files(__package__).joinpath("controls.html").read_text(encoding="utf-8")
+    sensors = scene["sensors"]
+    step = scene["step_name"]
+    options = Markup("").join(
+        Markup('<option value="{}">{}</option>').format(index, title)
+        for index, title in enumerate(sensors["titles"])
+    )
+    choice = Markup(
+        '<label class="choice">{} shown over the {}s <select id="chosen">{}</select></label>'
+    ).format(sensors["word"], step, options)
+    # Inside a script element only the beginning of a tag could end it
+    content = Markup(json.dumps(scene, allow_nan=False).replace("<", "\\u003c"))
+    return Page(
+        scene["title"],
+        sentence=Markup(Template(controls, autoescape=True).render(scene=scene)),
+        outcome=[
+            Markup('<script id="content" type="application/json">{}</script>').format(content),
+            Markup('<div id="structure"></div>'),
+        ],
+        sections=[
+            Section("Notices", [Markup('<ul id="notices" class="notice"></ul>')], "told"),
+            Section("The missing force", [_FORCE_PICTURE], "force"),
+            Section("Health", [Markup('<div id="states"></div>')], "health"),
+            Section("Sensors", [Markup('<div id="plots"></div>'), choice], "gauges"),
+            Section("Rewards", [Markup('<div id="rows"></div>')], "rewards"),
+            Section("Learnt, with 90 % interval", [Markup('<dl id="learnt"></dl>')], "learning"),
+        ],
+        footer=[
+            _LEGEND,
+            f"Keys: left and right for one {step}, Page up and Page down for ten, Home and End, "
+            "Space to play, L for the latest.",
+        ],
+        scripts=["plots.js", "view.js"],
+        style="view.css",
+    )
+
+
+_FORCE_PICTURE = Markup(
+    '<figure><img id="picture" alt="The missing force over displacement, speed and time">'
+    '<figcaption id="verdict"></figcaption></figure>'
+)
+_LEGEND = Markup(
+    '<span class="key present"></span>as believed at the time, <span class="key prediction"></span>'
+    "predicted, both with their 95 % interval (health: two standard deviations); "
+    '<span class="key truth"></span>truth, which the twin does not know. Grey dots are '
+    "observations; the interval of a sensor includes its noise."
+)
 
 
 def _first_missing_step(request: Request, step: int, *, has_same_flight: bool) -> int:

@@ -333,6 +333,7 @@ function build() {
   });
 }
 
+for (const name of ["told", "force", "learning"]) element(name).hidden = true; // until there is something to show
 build();
 listen();
 connect();

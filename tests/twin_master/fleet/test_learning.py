@@ -613,7 +613,7 @@ def test_the_report_begins_with_fallbacks_and_the_worst_off(grown_group):
     worst_off = grown_group.plan.members[int(np.argmax(grown_group.loss))].name
     opening = (
         f"60 of 60 assets have flown. In {len(delays)} assets the damage called for another control; the "
-        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%.</p>"
+        f"fallback came within 2 steps of it in {100 * np.mean(delays <= 2):.0f}\u00a0%.</div>"
     )
     worst = f"<p>The asset with the most damage is {worst_off} of growing_damage: "
     map_title = "The assets of group growing_damage by health"

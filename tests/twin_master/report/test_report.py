@@ -67,7 +67,7 @@ def test_a_policy_of_both_regions_left_a_control(run):
 def test_the_page_has_its_opening_sentences(run):
     page = html.unescape(page_of(run)).replace("\N{NO-BREAK SPACE}", " ")
     decided, *others = opening_sentences(run)
-    assert f'<p class="card">{decided}</p>' in page
+    assert f'<div class="card">{decided}</div>' in page
     assert " ".join(others) in " ".join(page.split())
 
 

@@ -74,7 +74,7 @@ class _CurrentPage:
     def _render(self, version: int) -> str:
         """Render the page with a script that asks the server for newer versions."""
         page = fleet_page(self._folder, ATTENTION_ROWS)
-        return render_page(replace(page, script=f"/view.js?version={version}"))
+        return render_page(replace(page, scripts=[f"/view.js?version={version}"]))
 
     def version(self) -> str:
         """Render the page again if the fleet's files have changed, and return its version number.
