@@ -153,7 +153,7 @@ class Origin:
         return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
-def document_schema(kind: type, schema: str) -> JsonSchema:
+def document_schema(record_class: type, schema: str) -> JsonSchema:
     """Return the JSON Schema of a document, such as a verdict file.
 
     A document is the JSON text of a record with an attribute `origin`. The attributes of the origin
@@ -162,12 +162,12 @@ def document_schema(kind: type, schema: str) -> JsonSchema:
 
     Parameters
     ----------
-    kind : type
+    record_class : type
         Class of the record.
     schema : str
         Name of the schema, which a document states under its key `schema`.
     """
-    record_schema = format_schema(kind, schema)
+    record_schema = format_schema(record_class, schema)
     # nested objects: all keys are required
     definitions = record_schema["$defs"]
     origin_properties = definitions.pop("Origin")["properties"]

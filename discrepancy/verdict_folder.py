@@ -128,7 +128,9 @@ def _write_files(folder: Path, content: ReportInput, *, report: bool) -> None:
 
 
 def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:
-    """Write the patch of a verdict and, if one effect or set is named and it is asked for, its FMU.
+    """Write the patch of a verdict into a folder and, if `content.pack` is given, an FMU.
+
+    The FMU is written only if the verdict names one effect or one set of effects.
 
     Returns
     -------

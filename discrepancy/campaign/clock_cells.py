@@ -82,18 +82,18 @@ def _clock_time(cell: str) -> _ClockTime | None:
     period = _DAY
     if not hours and bool(day) == bool(fraction):
         return None
-    if not hours and day:
+    if not hours and day:  # the two numbers are hours and minutes
         hours, minutes, seconds = minutes, seconds, "0"
-    elif not hours:
+    elif not hours:  # minutes and seconds, which start again at each full hour
         period = _HOUR
     hour_count = int(hours or 0)
-    if half:
+    if half:  # the A or P of AM or PM
         if not 1 <= hour_count <= 12:
             return None
         hour_count = hour_count % 12 + (12 if half in "Pp" else 0)
     whole_seconds = _HOUR * hour_count + 60 * int(minutes) + int(seconds)
     time_of_day = whole_seconds + Decimal(f"0{fraction.replace(',', '.')}")
-    is_past_midnight = bool(day) and time_of_day > _DAY
+    is_past_midnight = bool(day) and time_of_day > _DAY  # 24:00:00 is allowed
     if is_past_midnight or int(minutes) > 59 or int(seconds) > 59:
         return None
     return _ClockTime(day, time_of_day - _offset_seconds(offset), period)

@@ -96,7 +96,8 @@ class NoiseModel:
             return columns
         filter_taps = np.r_[1.0, -self.autoregression]
         white_residuals = np.asarray(lfilter(filter_taps, [1.0], columns, axis=-1))
-        # the first samples, for which the filter would need samples before the record
+        # `lfilter` takes samples before the record as zero, which is wrong for the first p samples:
+        # they are replaced by their own weighted sums
         sample_count = columns.shape[-1]
         for sample, weights in enumerate(self._start_up_weights[:sample_count]):
             white_residuals[..., sample] = columns[..., : sample + 1] @ weights

@@ -247,15 +247,16 @@ def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
         The number of lags in the statistic.
     """
     generator = np.random.default_rng(20260101)
-    draws_at_once = max(20, 400_000 // count)
+    draws_at_once = max(20, 400_000 // count)  # limits the memory
     batches = ceil(LEAST_DRAWS / draws_at_once)
-    pairs = count - np.arange(1.0, lags + 1)
+    pairs = count - np.arange(1.0, lags + 1)  # pairs of samples at each lag
     statistics = []
     for _ in range(batches):
         noise = generator.standard_normal((draws_at_once, count))
         statistics.append(_portmanteau(noise, count, pairs))
-    values = np.concatenate(statistics)
-    # the mean is known: E rho_k^2 = (n - k) / (n (n + 2)) if the mean of the series is zero
+    values = np.concatenate(statistics)  # (draws,)
+    # the mean of Q is known and equals the number of lags, because the squared autocorrelation at
+    # lag k has the mean (n - k) / (n (n + 2)) if the mean of the series is known to be zero
     deviation = float(np.sqrt(np.mean((values - lags) ** 2)))
     return float(lags), deviation, float(stats.skew(values))
 

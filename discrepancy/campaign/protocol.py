@@ -177,9 +177,9 @@ class Event:
             )
 
     @property
-    def moments(self) -> dict[str, float]:
+    def times_by_name(self) -> dict[str, float]:
         """Times of its start and, if it is stated, of its end [s], by the names in expressions."""
-        moments = {self.name: self.time}
+        times = {self.name: self.time}
         if self.until is not None:
-            moments[f"{self.name}_until"] = self.until
-        return moments
+            times[f"{self.name}_until"] = self.until
+        return times

@@ -190,10 +190,10 @@ def complete_events(events: Iterable[Event], trials: tuple[Trial, ...], source: 
     for event in completed:
         for name in event.trials:
             _check_trial_of_event(event, name, trials_by_name, source)
-            _check_moments(event, trials_by_name[name])
+            _check_event_in_record(event, trials_by_name[name])
     for name in recorded_in_time:
         events_of_trial = [event for event in completed if name in event.trials]
-        _check_names_of_moments(events_of_trial, name, source)
+        _check_names_of_event_times(events_of_trial, name, source)
         _check_occurrences(events_of_trial, name, source)
     return completed
 
@@ -215,7 +215,7 @@ def _check_trial_of_event(
         )
 
 
-def _check_moments(event: Event, trial: Trial) -> None:
+def _check_event_in_record(event: Event, trial: Trial) -> None:
     """Raise an error if an event begins or ends outside the record of a trial."""
     first_time, last_time = trial.time[[0, -1]].tolist()
     for key, time in (("time", event.time), ("until", event.until)):
@@ -227,14 +227,14 @@ def _check_moments(event: Event, trial: Trial) -> None:
             )
 
 
-def _check_names_of_moments(events: Sequence[Event], trial: str, source: str) -> None:
+def _check_names_of_event_times(events: Sequence[Event], trial: str, source: str) -> None:
     """Raise an error if two events of a trial use one name in expressions.
 
     `pump_until` is both an event of this name, and the end of the event `pump`.
     """
     event_of_name: dict[str, str] = {}
     for event in events:
-        for name in event.moments:
+        for name in event.times_by_name:
             if event_of_name.setdefault(name, event.name) != event.name:
                 raise CampaignFileError(
                     f"{source}: two events have a moment {name!r} in the trial {trial!r}: rename "

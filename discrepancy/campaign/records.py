@@ -317,42 +317,45 @@ class Campaign:
                 faults.update(candidate.accept)
         return frozenset(faults)
 
-    def moment_names(self, trial: str) -> frozenset[str]:
-        """Return the names that expressions use for the moments of the events in a trial."""
+    def names_of_event_times(self, trial: str) -> frozenset[str]:
+        """Return the names that expressions use for the times of the events in a trial.
+
+        An event `pump` has the time `pump` and, if its end is stated, the time `pump_until`.
+        """
         names: set[str] = set()
         for event in self.events:
             if trial in event.trials:
-                names |= event.moments.keys()
+                names |= event.times_by_name.keys()
         return frozenset(names)
 
-    def event_moments(self, trial: str, names: Collection[str]) -> list[dict[str, float]]:
-        """Return the moments of a trial's events, once for each time that the events happened.
+    def event_times(self, trial: str, names: Collection[str]) -> list[dict[str, float]]:
+        """Return the start and end times of a trial's events, once for each occurrence.
 
         Parameters
         ----------
         trial : str
             The name of the trial.
         names : collection of str
-            Names of the moments that an expression uses, such as `pump_on` and `pump_on_until`.
+            Names of the times that an expression uses, such as `pump_on` and `pump_on_until`.
 
         Returns
         -------
         list of dict of str to float
-            Moments by name [s]. If several events are used, every occurrence of one is combined
-            with every occurrence of the other. Empty if a name has no moment in the trial.
+            Times by name [s]. If several events are used, every occurrence of one is combined with
+            every occurrence of the others. Empty if a name has no time in the trial.
         """
         occurrences: dict[str, list[dict[str, float]]] = {}
         for event in self.events:
-            is_used = not event.moments.keys().isdisjoint(names)
+            is_used = not event.times_by_name.keys().isdisjoint(names)
             if trial in event.trials and is_used:
-                occurrences.setdefault(event.name, []).append(event.moments)
+                occurrences.setdefault(event.name, []).append(event.times_by_name)
         combined = []
         for combination in product(*occurrences.values()):
-            moments: dict[str, float] = {}
-            for moments_of_event in combination:
-                moments |= moments_of_event
-            if moments.keys() >= set(names):
-                combined.append(moments)
+            times: dict[str, float] = {}
+            for times_of_event in combination:
+                times |= times_of_event
+            if times.keys() >= set(names):
+                combined.append(times)
         return combined
 
     def records(self, channel: str) -> Iterator[tuple[Trial, FloatArray, BoolArray]]:
@@ -382,8 +385,9 @@ class Campaign:
         """The largest loads and times of the campaign, which scale the parameters of effects.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
-        ``duration`` the longest record of a motion [s], ``campaign_time`` the time from the first
-        sample to the last [s]. Durations that no trial has are one second.
+        ``duration`` the longest record of a dynamic trial [s], ``campaign_time`` the time from the
+        first sample to the last [s]. Without a dynamic trial ``duration`` is 1 s; if all samples
+        have the same time, ``campaign_time`` is 1 s. Loads that do not occur are 0.
         """
         force = load_factor = 0.0
         durations: list[float] = []

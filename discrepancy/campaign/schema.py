@@ -266,7 +266,7 @@ class CampaignSection(Section):
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
     """The records."""
     event: Annotated[tuple[Event, ...], LIST] = ()
-    """What happened at known moments."""
+    """What happened at known times."""
     remarks: Annotated[tuple[str, ...], LIST] = ()
     """Sentences that are kept with the campaign, and that commands and reports repeat."""
     provenance: Annotated[tuple[str, ...], LIST] = ()

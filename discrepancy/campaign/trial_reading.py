@@ -69,7 +69,7 @@ def read_trial(
     return Trial(
         **section.keys_in_file,
         channels=tuple(channel.name for channel in channels),
-        values=np.stack(values, axis=1),
+        values=np.stack(values, axis=1),  # (rows, channels)
         used=np.stack(is_used, axis=1),
         time=time,
         force=_read_force(section, table, campaign, inputs),
@@ -237,7 +237,10 @@ def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArra
 def _channels_of_trial(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection
 ) -> tuple[Channel, ...]:
-    """Return the channels that a trial names; if it names none, all with a column in its table."""
+    """Return the channels that a trial names; if it names none, all with a column in its table.
+
+    Raises `CampaignFileError` if there is no channel, or if a named one has no column.
+    """
     if section.channels is None:
         channels = tuple(
             channel for channel in campaign.channel if channel.table_column in table.columns
@@ -245,7 +248,7 @@ def _channels_of_trial(
     else:
         by_name = {channel.name: channel for channel in campaign.channel}
         channels = tuple(by_name[name] for name in section.channels)
-    # refuses a channel without a column
+    # only for its error if a channel has no column
     for channel in channels:
         table.cells(channel.table_column, f"the channel {channel.name!r}")
     if not channels:

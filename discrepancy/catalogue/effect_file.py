@@ -98,29 +98,19 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
 
 
 def _parse_effect(table: object, place: str) -> Effect:
-    """Return the effect that a table describes.
+    """Return the effect that a table describes; raise `CatalogueError` if it is not valid.
 
-    Parameters
-    ----------
-    table : object
-        Content of the table.
-    place : str
-        File and number of the effect, for messages.
-
-    Raises
-    ------
-    CatalogueError
-        If the table is not a valid effect.
+    `place` is the file and the number of the effect, for messages.
     """
     section = validate(EffectSection, table, place, CatalogueError, what="an effect")
     names_of_parameters = [parameter.name for parameter in section.parameters]
     names_of_shape = [parameter.name for parameter in section.shape]
     names = frozenset(names_of_parameters + names_of_shape)
-    moments = frozenset(moment for event in section.events for moment in (event, f"{event}_until"))
+    event_times = frozenset(name for event in section.events for name in (event, f"{event}_until"))
     _check_names(section, names, place)
     _check_places_and_needs(section, place)
     templates = tuple(
-        _parse_primitive(row, names, moments, f"{place}, primitives {number}")
+        _parse_primitive(row, names, event_times, f"{place}, primitives {number}")
         for number, row in enumerate(section.primitives, start=1)
     )
     _check_acts_on_dynamic_trials(section, templates)
@@ -139,7 +129,10 @@ _REASON_OF_NAME = (
 
 
 def _check_names(section: EffectSection, names: frozenset[str], place: str) -> None:
-    """Refuse names of parameters and events that mean something else in an expression."""
+    """Raise an error if a parameter or event has a name that means something else in expressions.
+
+    `names` are those of parameters and shape parameters.
+    """
     used_names = {*SCALES, *RESERVED}
     for name in names:
         if not name.isidentifier() or name in used_names:
@@ -154,7 +147,10 @@ def _check_names(section: EffectSection, names: frozenset[str], place: str) -> N
 
 
 def _check_places_and_needs(section: EffectSection, place: str) -> None:
-    """Refuse an effect with an unknown word for its places or needs, or without primitives."""
+    """Raise an error for an unknown word for places or needs, or if there are no primitives.
+
+    A word of `PLACES` in a list, which is the name of a single place, is refused, too.
+    """
     for need in section.needs:
         if need not in NEEDS:
             raise CatalogueError(
@@ -181,7 +177,7 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
 def _check_acts_on_dynamic_trials(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
-    """Refuse an effect that depends on time, but is declared to act on static trials or flights.
+    """Raise an error if an effect depends on time, but is to act on static trials or flights.
 
     The rows of these trials are not samples of a motion in time. A primitive depends on time if it
     acts in windows or has a value that is a formula in time.
@@ -222,8 +218,8 @@ class _PrimitiveTemplate:
         Expressions for when it acts, by key: "begin" and "end" of a window, and "if".
     scales : frozenset of str
         Names in `SCALES` that the expressions use.
-    moments : frozenset of str
-        Moments of events that the expressions use.
+    event_times : frozenset of str
+        Names of the event times that the expressions use.
     """
 
     place: str
@@ -231,7 +227,7 @@ class _PrimitiveTemplate:
     values: Mapping[str, str | float | Expression]
     conditions: Mapping[str, Expression]
     scales: frozenset[str]
-    moments: frozenset[str]
+    event_times: frozenset[str]
 
     @property
     def acts_in_windows(self) -> bool:
@@ -239,55 +235,42 @@ class _PrimitiveTemplate:
         return "begin" in self.conditions or "end" in self.conditions
 
     def primitives(self, context: BuildContext) -> Iterator[Primitive]:
-        """Yield the evaluated primitive, once for each occurrence of its events.
+        """Yield the evaluated primitive, once for each occurrence of its events in dynamic trials.
 
-        Without events and windows there is one primitive. If the expression `if` is zero, there is
-        none.
+        Each then acts in a window of time of its trial. Without events and windows there is one
+        primitive. If the expression `if` is zero, there is none.
         """
         values_by_name = dict(context.values)
         for name in self.scales:
             values_by_name[name] = SCALES[name](context)
         if "if" in self.conditions and self.conditions["if"].value(values_by_name) == 0.0:
             return
-        if not self.moments and not self.acts_in_windows:
+        if not self.event_times and not self.acts_in_windows:
             yield self._evaluate_primitive(values_by_name, context.target)
             return
         for trial in context.setting.campaign.trials:
             if not trial.is_dynamic:
                 continue
-            occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
-            for moments in occurrences:
-                values_and_moments = {**values_by_name, **moments}
-                begin = self._evaluate_moment("begin", values_and_moments)
-                end = self._evaluate_moment("end", values_and_moments)
-                primitive = self._evaluate_primitive(values_and_moments, context.target)
+            occurrences = context.setting.campaign.event_times(trial.name, self.event_times)
+            for times_by_name in occurrences:
+                values_and_times = {**values_by_name, **times_by_name}
+                begin = self._end_of_window("begin", values_and_times)
+                end = self._end_of_window("end", values_and_times)
+                primitive = self._evaluate_primitive(values_and_times, context.target)
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
-    def _evaluate_moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
-        """Return the start or end of the primitive's window [s]; None if it is open on that side.
-
-        Parameters
-        ----------
-        key : str
-            "begin" or "end".
-        values_by_name : mapping of str to float
-            Values of the names in expressions.
-        """
+    def _end_of_window(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
+        """Return the "begin" or "end" of the primitive's window [s]; None if it is open there."""
         expression = self.conditions.get(key)
         return None if expression is None else expression.value(values_by_name)
 
     def _evaluate_primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
         """Return the primitive with its expressions evaluated.
 
-        Parameters
-        ----------
-        values_by_name : mapping of str to float
-            Values of the names in expressions.
-        target : Target
-            What the place stands for.
+        A formula in time stays a formula, with numbers in the place of all other names. Texts that
+        stand for the place of the effect are replaced by the names of the target.
         """
-        # texts of a primitive that stand for the place of the effect
-        words = {
+        texts_of_place = {
             "place": target.name,
             "quantity of the place": target.quantity,
             "motion of the place": target.motion,
@@ -296,10 +279,10 @@ class _PrimitiveTemplate:
         row: dict[str, str | float] = {}
         for name, value in self.values.items():
             if isinstance(value, str):
-                row[name] = words.get(value, value)
+                row[name] = texts_of_place.get(value, value)
             elif not isinstance(value, Expression):
                 row[name] = value
-            elif name in formulas:  # a formula in time stays a formula
+            elif name in formulas:
                 used_numbers = {
                     key: values_by_name[key] for key in value.used_names() if key in values_by_name
                 }
@@ -312,17 +295,19 @@ class _PrimitiveTemplate:
 def _parse_primitive(
     row: Mapping[str, str | float],
     parameters: frozenset[str],
-    moments: frozenset[str],
+    event_times: frozenset[str],
     place: str,
 ) -> _PrimitiveTemplate:
     """Parse a table `[[primitives]]` into a template with expressions.
+
+    Numbers, and texts of fields that hold texts, stay as they are.
 
     Parameters
     ----------
     row : mapping of str to (str or float)
         The table.
-    parameters, moments : frozenset of str
-        Names of parameters and of moments of events that expressions may use.
+    parameters, event_times : frozenset of str
+        Names of parameters and of event times that expressions may use.
     place : str
         File, effect and number of the primitive, for messages.
 
@@ -356,10 +341,10 @@ def _parse_primitive(
             if key == "kind":
                 continue
             if key not in types:
-                names = known_names | moments if key in window_keys else known_names
+                names = known_names | event_times if key in window_keys else known_names
                 conditions[key] = Expression(text, names, repr(key))
             elif key in primitive.formula_fields:
-                values[key] = Expression(text, known_names | moments | {"time"}, repr(key))
+                values[key] = Expression(text, known_names | event_times | {"time"}, repr(key))
             elif isinstance(value, str) and types[key] is not str:
                 values[key] = Expression(text, known_names, repr(key))
             else:
@@ -375,14 +360,15 @@ def _parse_primitive(
         values=values,
         conditions=conditions,
         scales=frozenset(used & SCALES.keys() - parameters),
-        moments=frozenset(used & moments),
+        event_times=frozenset(used & event_times),
     )
 
 
 def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> None:
-    """Refuse a primitive that lacks a value.
+    """Raise an error if a primitive lacks a value.
 
-    It is built with the number one in place of each expression, which raises if a value is missing.
+    It is built with the number one in the place of each expression, which raises if a value is
+    missing.
     """
     row: dict[str, str | float] = {}
     for key, value in values.items():
@@ -411,10 +397,10 @@ class _EffectFunctions:
     def _in_setting(self, setting: Setting) -> EffectInSetting:
         """Return the effect in a setting."""
         kinds = tuple(PRIMITIVES[template.kind] for template in self.templates)
-        moments: set[str] = set()
+        event_times: set[str] = set()
         for template in self.templates:
-            moments |= template.moments
-        return EffectInSetting(setting, self.section, kinds, frozenset(moments))
+            event_times |= template.event_times
+        return EffectInSetting(setting, self.section, kinds, frozenset(event_times))
 
     def places(self, setting: Setting) -> tuple[str, ...]:
         """Return the places where the effect may act in a setting."""

@@ -93,15 +93,15 @@ class EffectInSetting:
         Content of the effect's file.
     primitives : tuple of type
         Kinds of primitives that the effect consists of.
-    moments : frozenset of str
-        Names of the events whose times the effect's expressions use. The effect acts only in trials
-        that have all these events.
+    event_times : frozenset of str
+        Names of the event times that the effect's expressions use, such as `pump` and `pump_until`.
+        The effect acts only in trials that have all of them.
     """
 
     setting: Setting
     section: EffectSection
     primitives: tuple[type[Primitive], ...]
-    moments: frozenset[str]
+    event_times: frozenset[str]
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -179,12 +179,13 @@ class EffectInSetting:
         ----------
         place : str
             Name of one of the effect's places, such as a port, "root, lower skin", "rail, open at
-            positive x" or "all strain".
+            positive x" or "all strain"; empty if there is no choice.
 
         Returns
         -------
         tuple of Target
-            One target for each primitive; several only for `EVERY_PORT`.
+            Targets, at each of which all primitives of the effect act; several only for
+            `EVERY_PORT`.
         """
         if self.section.places == "skins at ports":
             port, _, skin = place.rpartition(", ")

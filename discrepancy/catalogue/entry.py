@@ -79,14 +79,14 @@ class Prior:
         return (value - mean) / deviation
 
     def multiply(self, u: float, factor: float, lowest: float, highest: float) -> float:
-        """Return the standard normal variable after its value is multiplied by a factor.
+        """Return the standard normal variable of a value times a factor.
 
         A log-normal value cannot change its sign: zero and less become the value at `lowest`.
 
         Parameters
         ----------
         u : float
-            Standard normal variable of the value before.
+            Standard normal variable of the value.
         factor : float
             The factor on the value.
         lowest, highest : float

@@ -43,9 +43,11 @@ VARIABLES: tuple[Variable, ...] = ("displacement", "velocity")
 
 @cache
 def curve_functions(correlation_length: float) -> FloatArray:
-    """Return the functions (P, K) of the expansion of a process with unit variance at P points.
+    """Return the K functions (P, K) of the expansion of a curve with unit variance at P points.
 
-    Each is multiplied by the prior standard deviation of its amplitude.
+    They are the eigenvectors of the squared exponential covariance, largest variance first, each
+    multiplied by the prior standard deviation of its amplitude. Those with less than
+    `NEGLECTED_VARIANCE` of the total variance are left out.
 
     Parameters
     ----------
@@ -62,16 +64,23 @@ def curve_functions(correlation_length: float) -> FloatArray:
 
 
 def curve_points(variable: Variable, low: float, high: float) -> FloatArray:
-    """Return the points (P,) of a curve between two ends, dense around zero for velocities."""
+    """Return the points (P,) of a curve between two ends.
+
+    They are evenly spaced for displacements, and dense around zero for velocities; see
+    `DENSE_VELOCITY`.
+    """
     if variable == "displacement":
         return np.linspace(low, high, POINT_COUNT)
-    dense = DENSE_VELOCITY * max(abs(low), abs(high))
-    ends = np.arcsinh(low / dense), np.arcsinh(high / dense)
-    return np.asarray(dense * np.sinh(np.linspace(*ends, POINT_COUNT)))
+    dense_velocity = DENSE_VELOCITY * max(abs(low), abs(high))
+    first = np.arcsinh(low / dense_velocity)
+    last = np.arcsinh(high / dense_velocity)
+    return np.asarray(dense_velocity * np.sinh(np.linspace(first, last, POINT_COUNT)))
 
 
 def variance_along_curve(variable: Variable, values: FloatArray, force: FloatArray) -> float:
-    """Return the share of a force's mean square that a curve over a variable explains.
+    """Return the fraction of a force's mean square that a curve over a variable explains.
+
+    The curve is fitted by least squares, without its prior.
 
     Parameters
     ----------
@@ -82,10 +91,11 @@ def variance_along_curve(variable: Variable, values: FloatArray, force: FloatArr
     """
     points = curve_points(variable, float(values.min()), float(values.max()))
     functions = curve_functions(CORRELATION_LENGTHS[0])
+    # the functions at the values of the variable (N, K)
     at_values = np.column_stack([np.interp(values, points, shape) for shape in functions.T])
     amplitudes = np.linalg.lstsq(at_values, force, rcond=None)[0]
-    left = force - at_values @ amplitudes
-    return 1.0 - float(left @ left) / float(force @ force)
+    unexplained = force - at_values @ amplitudes
+    return 1.0 - float(unexplained @ unexplained) / float(force @ force)
 
 
 def force_curve(

@@ -201,11 +201,11 @@ def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effe
 def with_prior_weights(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return the effects that are compared, with prior weights by their stated frequencies.
 
-    Effects that state a frequency share as much prior probability as the same number of other
-    effects. A kind, which is an effect with its variants in events, gets the share of its
-    frequency, however many variants it has.
+    An effect without a frequency keeps its weight. Those with a frequency have, in total, the
+    weight of the same number of effects without one. It is divided among kinds by their
+    frequencies, and within a kind evenly among the effect and its variants in events.
     """
-    frequencies: dict[str, float] = {}
+    frequencies: dict[str, float] = {}  # by kind, as the counts
     variant_counts: Counter[str] = Counter()
     for effect in effects:
         if effect.relative_frequency is not None:
@@ -225,7 +225,10 @@ def with_prior_weights(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
 
 def check_effects(effects: Iterable[Effect]) -> None:
-    """Raise `CatalogueError` for the first effect that is not valid, or if identifiers clash."""
+    """Raise `CatalogueError` for the first effect that is not valid, or if identifiers clash.
+
+    An effect that names an unknown effect as confusable is not valid either.
+    """
     effects = tuple(effects)
     counts = Counter(effect.identifier for effect in effects)
     for effect in effects:
@@ -246,7 +249,7 @@ def check_effects(effects: Iterable[Effect]) -> None:
 
 
 def _effect_faults(effect: Effect) -> Iterator[str]:
-    """Yield the faults of an effect, each as the end of a sentence that begins with the effect."""
+    """Yield the faults of an effect, each as the end of the sentence "The effect 'NAME' ..."."""
     if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
         yield " must have a name, and an identifier of lower-case letters, digits and underscores."
     if not effect.acts_on:

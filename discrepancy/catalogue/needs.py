@@ -32,7 +32,7 @@ INPUTS = DYNAMIC - {TrialKind.RINGDOWN}
 def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None:
     """Return the reason if no fitted trial is of these kinds, else None.
 
-    By default the kinds are those that the effect acts on.
+    Without kinds, they are those that the effect acts on.
     """
     needed_kinds = kinds or effect.section.acts_on
     fitted_kinds = {trial.kind for trial in effect.setting.campaign.fitted}
@@ -45,12 +45,13 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
 def _no_event(effect: EffectInSetting) -> str | None:
     """Return the reason if no fitted trial has the events that an effect needs, else None."""
     campaign = effect.setting.campaign
-    names_of_trials = [campaign.moment_names(trial.name) for trial in campaign.fitted]
-    if not effect.moments or any(effect.moments <= names for names in names_of_trials):
+    names_of_trials = [campaign.names_of_event_times(trial.name) for trial in campaign.fitted]
+    if not effect.event_times or any(effect.event_times <= names for names in names_of_trials):
         return None
     known_events = sorted({name for names in names_of_trials for name in names})
+    needed_events = " and ".join(sorted(effect.event_times))
     return (
-        f"No trial to fit has {' and '.join(sorted(effect.moments))} as [[event]]; those that are "
+        f"No trial to fit has {needed_events} as [[event]]; those that are "
         f"fitted have {', '.join(known_events) or 'none'}."
     )
 
@@ -136,7 +137,8 @@ def _no_channel(effect: EffectInSetting) -> str | None:
 def _no_second_clock(effect: EffectInSetting) -> str | None:
     """Return the reason if motion and inputs were recorded by the same logger, else None.
 
-    None also if no trial has inputs, because another need reports that.
+    This is so if the campaign names exactly one logger. The result is also None if no trial has
+    inputs, because another need reports that.
     """
     if len(effect.setting.campaign.loggers) != 1 or _no_trial(effect, INPUTS):
         return None
@@ -186,9 +188,9 @@ NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
 
 
 def untestable_reason(effect: EffectInSetting) -> str | None:
-    """Return the reason why an effect cannot be tested: its first need that is not met.
+    """Return the reason why an effect cannot be tested: its first need that is not met, or None.
 
-    None if all needs are met.
+    Needs are checked at all ports of a model, not only at the preferred ones.
     """
     at_any_port = replace(effect, section=replace(effect.section, preferred=()))
     for need in effect.section.needs:

@@ -81,7 +81,11 @@ def _supports(effect: EffectInSetting) -> Names:
 
 
 def _changes_of_loads(effect: EffectInSetting, change: str, places: str) -> Names:
-    """Return the changes of forces that act in fitted trials, such as "pull, along x"."""
+    """Return the changes of forces that act in fitted trials, such as "pull, along x".
+
+    `change` is "offset" or "tilt", and `places` the word of the file for such places. The only
+    force of a model counts as acting even if no trial names it.
+    """
     setting = effect.setting
     used_controls = {str(trial.load_place) for trial in effect.trials}
     controls = [control for control, _, _ in setting.model.load_changes]
@@ -136,13 +140,15 @@ def _is_read_repeatedly(effect: EffectInSetting, name: str) -> bool:
 
 
 def _zeroed_runs(effect: EffectInSetting) -> Names:
-    """Return the runs with a displacement channel whose zero is known."""
-    with_zero = effect.channels_of(
+    """Return the runs with a displacement channel whose zero is known, so that it may be wrong."""
+    channels_with_zero = effect.channels_of(
         lambda channel: (
             channel.quantity is Quantity.DISPLACEMENT and not isinf(channel.offset_deviation)
         )
     )
-    runs = [trial.run for trial in effect.trials if {*with_zero}.intersection(trial.channels)]
+    runs = [
+        trial.run for trial in effect.trials if {*channels_with_zero}.intersection(trial.channels)
+    ]
     return tuple(dict.fromkeys(runs))
 
 
@@ -189,7 +195,7 @@ def mains_lines(setting: Setting) -> Names:
 
 
 def _alias_clause(frequency: float, trials: Sequence[Trial]) -> str:
-    """Return at which frequency a line is seen, for a name; empty where it is not shifted."""
+    """Return the part of a name on the alias of a line [Hz]; empty if it is not shifted."""
     aliases = {float(f"{aliased_frequency(frequency, trial.interval):.3g}") for trial in trials}
     if not aliases or max(aliases) >= frequency * (1.0 - _SAME_FREQUENCY):
         return ""

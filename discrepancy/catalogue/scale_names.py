@@ -25,7 +25,7 @@ LARGEST_LOSS = 0.9
 class BuildContext:
     """The effect, place and values for which a patch is built.
 
-    The names in the expressions of the effect are evaluated from it.
+    The functions in `SCALES` compute from it the values of the names in the effect's expressions.
 
     Attributes
     ----------
@@ -77,7 +77,8 @@ def loss_integral(velocity_exponent: float, displacement_exponent: float) -> flo
 def _cycle_loss(context: BuildContext) -> float:
     """Return the energy that a force |v|^p |x|^a dissipates in a cycle, over 2 F_0 A.
 
-    A force that is spread over an area is summed over its places.
+    At a free port the exponent a counts as zero. A force that is spread over an area is summed over
+    its places.
     """
     p = max(context.values["velocity_exponent"], 0.0)
     a = max(context.values["displacement_exponent"], 0.0) * _is_held(context)
@@ -104,14 +105,9 @@ def _holding_force(context: BuildContext) -> float:
 
 
 def _port_scale(name: str, fallback: str) -> Callable[[BuildContext], float]:
-    """Return a function for a natural scale of the port.
+    """Return a function that returns a natural scale of the port, an attribute of `PortScale`.
 
-    Parameters
-    ----------
-    name : str
-        Name of the scale, an attribute of `PortScale`.
-    fallback : str
-        Name of the scale that replaces it if it is None.
+    If the scale is None, the function returns the scale `fallback` instead.
     """
 
     def scale(context: BuildContext) -> float:
@@ -124,14 +120,14 @@ def _port_scale(name: str, fallback: str) -> Callable[[BuildContext], float]:
 def _largest_reading(context: BuildContext) -> float:
     """Return the largest absolute reading that is used at the place [its unit]; 1 if all are zero.
 
-    It is kept in the setting, because a fit builds patches at every step.
+    It is computed once and kept in the setting, because a fit builds patches at every step.
     """
-    cache = context.setting.largest
+    cached_readings = context.setting.largest
     key = (context.target, context.effect.section.acts_on)
-    if key not in cache:
+    if key not in cached_readings:
         largest = _compute_largest_reading(context)
-        cache[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
-    return cache[key]
+        cached_readings[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    return cached_readings[key]
 
 
 def _compute_largest_reading(context: BuildContext) -> float:
@@ -158,15 +154,15 @@ def _compute_largest_reading(context: BuildContext) -> float:
 
 
 def _sampling_interval(context: BuildContext) -> float:
-    """Return the median time between two samples of the trials that the effect changes [s]."""
+    """Return the median time between samples of the trials that the effect acts on [s], or 0."""
     intervals = [np.diff(trial.time) for trial in context.effect.trials if len(trial.time) > 1]
     return float(np.median(np.concatenate(intervals))) if intervals else 0.0
 
 
 def _largest_release(context: BuildContext) -> float:
-    """Return the largest release displacement of the fitted trials that record the channel.
+    """Return the largest release displacement of the fitted trials that record the channel [m].
 
-    It is 1 if no such trial has a release displacement.
+    Its unit is V or none if that is the unit of the release. It is 1 if no such trial has one.
     """
     releases = [
         abs(trial.release.displacement)
@@ -198,7 +194,7 @@ def _largest_region_loss(context: BuildContext) -> float:
 
 
 def _support_compliance(context: BuildContext) -> float:
-    """Return the compliance of the support's motion that doubles that of the structure."""
+    """Return the compliance of the support's motion that doubles the structure's compliance."""
     target = context.target
     return context.setting.scales.support_compliance(target.name, target.motion)
 

@@ -288,8 +288,9 @@ def _quantum_in_time(values: FloatArray) -> float:
 def update_length(values: FloatArray) -> float:
     """Return how many samples a logger usually takes of each reading of a slower sensor.
 
-    The result is the median length of the runs of equal readings. It is 1 if the readings show the
-    quantum of the sensor, because they then repeat for another reason.
+    The result is the median length of the runs of equal readings. It is 1 if the readings are
+    multiples of a resolution, because a reading then repeats for another reason, and also if there
+    are fewer than two changes.
 
     Parameters
     ----------
@@ -298,5 +299,5 @@ def update_length(values: FloatArray) -> float:
     """
     if lattice_step(values) is not None:
         return 1.0
-    changes = np.flatnonzero(np.diff(values))
+    changes = np.flatnonzero(np.diff(values))  # last sample of each run
     return float(np.median(np.diff(changes))) if len(changes) > 1 else 1.0

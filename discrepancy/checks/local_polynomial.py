@@ -77,11 +77,12 @@ class LocalPolynomial:
         width, have the residual zero.
         """
         residual = np.zeros(len(values))
+        # narrow windows first: the wider ones overwrite all but the ends
         for width, weights in self._weights.items():
-            if weights.ndim == 1:
+            if weights.ndim == 1:  # evenly spaced: the same symmetric weights for all samples
                 inner_residuals = np.convolve(values, weights, mode="valid")
             else:
-                windows = sliding_window_view(values, 2 * width + 1)
+                windows = sliding_window_view(values, 2 * width + 1)  # (N - 2 width, 2 width + 1)
                 inner_residuals = np.einsum("nw,nw->n", windows, weights)
             residual[width : len(values) - width] = inner_residuals
         return residual

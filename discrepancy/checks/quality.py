@@ -87,8 +87,8 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     """Yield a fault if a channel has no noise record, or if its readings contradict the record.
 
     The record is contradicted by dynamic readings that are too smooth, or by repeated trials whose
-    scatter differs significantly (F test) and by a factor of two. One made from repeats is not
-    tested.
+    scatter differs significantly (F test) and by a factor of two. A record that was made from
+    repeats is not tested.
     """
     record = channel.noise
     if record is None:
@@ -111,7 +111,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     if repeats is not None:
         variance_ratio = (repeats.standard_deviation / stated_deviation) ** 2
         freedom = repeats.degrees_of_freedom
-        record_freedom = min(record.degrees_of_freedom, 1e9)
+        record_freedom = min(record.degrees_of_freedom, 1e9)  # the distribution takes no infinity
         probability_of_larger = f_distribution.sf(variance_ratio, freedom, record_freedom)
         probability_of_smaller = f_distribution.cdf(variance_ratio, freedom, record_freedom)
         p_value = 2.0 * min(probability_of_larger, probability_of_smaller)

@@ -283,8 +283,8 @@ class IdentifiedFmu(FmuRuns):
             for name in excitation.inputs
         }
         forces |= run.offsets
-        motion = self._motion_of_run(excitation, run._replace(offsets=forces))
-        # the same motion by the linear system
+        motion = self._motion_of_run(excitation, run._replace(offsets=forces))  # (steps + 1, C)
+        # the same motion by the linear system; each force is constant during a step
         time = excitation.step * np.arange(run.steps + 1.0)
         loads = []
         for direction, values in zip(np.eye(len(forces)), forces.values(), strict=True):
@@ -295,8 +295,10 @@ class IdentifiedFmu(FmuRuns):
         by_states = states @ system.output_matrix.T
         by_inputs = acting @ system.feedthrough.T
         prediction_error = motion - by_states - by_inputs
-        largest_error = np.max(np.abs(prediction_error)[1:], axis=0)
+        # the first row, before any step, does not count
+        largest_error = np.max(np.abs(prediction_error)[1:], axis=0)  # (C,)
         largest_motion = np.max(np.abs(motion), axis=0)
+        # the tiny summand lets an output pass that never moves
         return bool(np.all(largest_error <= tolerance * largest_motion + 1e-300))
 
     # ------------------------------------------------------------ releases

@@ -20,8 +20,9 @@ from fe.runtime.time_steps import Boundaries, loaded_steps
 
 
 class PortCoupling:
-    """Masses at P ports of an FMU, on which J laws act.
+    """J laws that act on P ports of an FMU, integrated within each step of the FMU.
 
+    Within a step the FMU is replaced by one mass for each port, with the responses `speed_gain`.
     The object keeps the memory of the laws from step to step.
 
     Parameters
@@ -47,7 +48,8 @@ class PortCoupling:
         memory: FloatArray | None,
     ) -> None:
         count = len(ports)
-        # one coordinate for each port, without stiffness and damping
+        # One coordinate for each port, without stiffness and damping. A unit force at a port gives
+        # all coordinates the accelerations speed_gain / step.
         masses = ModalSystem(
             np.zeros(count),
             np.zeros((count, count)),
@@ -57,20 +59,19 @@ class PortCoupling:
         # arrays of a single step, into which each call of `speed_loss` writes its forces
         self._step = step
         boundaries = Boundaries(np.array([0.0, step]), np.arange(2), np.array([step]))
+        no_force = np.zeros((1, count))
         no_displacement = np.zeros((2, len(laws)))
-        self._steps = loaded_steps(
-            masses, boundaries, np.zeros((1, count)), np.zeros((1, count)), no_displacement
-        )
+        self._steps = loaded_steps(masses, boundaries, no_force, no_force, no_displacement)
         self._law_arrays = tuple(
             laws.port_arrays(
-                laws.port_rows(masses.ports, count),
-                laws.port_rows(masses.actions, count),
-                np.zeros(len(laws)),
-                0.0,
-                self._steps.transition,
+                motion_rows=laws.port_rows(masses.ports, count),
+                force_rows=laws.port_rows(masses.actions, count),
+                flexibility=np.zeros(len(laws)),
+                relaxation=0.0,
+                transition=self._steps.transition,
             )
         )
-        # arrays of state and results, which each step overwrites
+        # arrays of state and results, which each step overwrites: rows for its start and its end
         self._has_memory = memory is not None
         memory = laws.unloaded_memory() if memory is None else memory
         self._state = ModalState(np.zeros(count), np.zeros(count), memory)
@@ -103,6 +104,7 @@ class PortCoupling:
         self._state.v[:] = speeds
         # changes (2 P,) of position and speed of the ports under a constant acceleration
         self._steps.increment[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
+        # each coordinate has a unit mass, so that forces are accelerations
         self._steps.begin_force[:] = accelerations
         self._steps.end_force[:] = accelerations
         # compiled code takes no keywords

@@ -130,7 +130,7 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
         interval_ratio = trial.interval / longest_trial.interval
         if len(trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
-        values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)
+        values = fitted_trial.prediction - fitted_trial.prediction.mean(axis=0)  # (N, C)
         transform = np.fft.rfft(values * taper, axis=0)
         spectra = np.abs(transform) ** 2 / fitted_trial.noise_deviation**2
         power += spectra[1 : frequency_count + 1].sum(axis=1)
@@ -332,7 +332,9 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
         power = np.zeros(frequencies.size)  # explained sum of squares, in units of the noise
         for fitted_trial in evenly_sampled:
             weight = np.exp(-decay * interval * np.arange(len(fitted_trial.trial.time)))
+            # samples that are not used are nan, and become zero
             weighted_residuals = np.nan_to_num(fitted_trial.standardised) * weight[:, np.newaxis]
+            # (frequencies, C)
             spectra = np.abs(np.fft.rfft(weighted_residuals, 4 * length, axis=0)) ** 2
             # A cosine and a sine under this weight each have about half the squared norm of the
             # weight, so that the explained sum of squares is 2 |spectrum|^2 / |weight|^2.
@@ -438,10 +440,12 @@ class _UsedSamples:
     def prediction_features(self, *names: str) -> FloatArray:
         """Return functions of the prediction at the n used samples of all trials, side by side.
 
-        They are zero in a trial that lacks them. The names, such as "x", are those of
+        The result has the shape (n, functions x width), where the width is the largest number of
+        columns of one function (2 for a harmonic: cosine and sine). A function is zero in a trial
+        that lacks it. The names, such as "x", are those of
         `discrepancy.location.map.dependence_functions`.
         """
-        width = 1  # columns of a function: a harmonic has a cosine and a sine
+        width = 1
         for features_of_trial in self._features:
             for name in features_of_trial.keys() & set(names):
                 width = max(width, features_of_trial[name].shape[1])

@@ -67,24 +67,24 @@ def normal_equations_of(
     norms = np.linalg.norm(basis, axis=0)
     basis = basis[:, norms > 0.0] / norms[norms > 0.0]
     function_count = basis.shape[1]
-    residual = np.concatenate(
+    residual = np.concatenate(  # (n,), in units of the noise
         [fitted_trial.standardised[is_used, column] for fitted_trial, is_used in rows]
     )
     if not 0 < function_count < max(residual.size, 2):
         return None
-    sensitivities = [
+    sensitivities = [  # (rows of the trial, P) each
         fitted_trial.sensitivity[is_used, column]
         for fitted_trial, is_used in rows
         if fitted_trial.sensitivity is not None
     ]
     if len(sensitivities) == len(rows):
-        absorbed = np.vstack(sensitivities).T @ basis
+        absorbed = np.vstack(sensitivities).T @ basis  # S^T B
         return NormalEquations(basis.T @ basis, basis.T @ residual, absorbed)
     # without sensitivities the residuals count as independent, with their expected variances
     variance = np.concatenate(
         [fitted_trial.expected_variance[is_used, column] for fitted_trial, is_used in rows]
     )
-    gram = (basis.T * variance) @ basis
+    gram = (basis.T * variance) @ basis  # B^T V B
     return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
 

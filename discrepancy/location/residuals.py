@@ -45,9 +45,9 @@ class FittedTrial:
     rates : (N, C) ndarray or None
         The time derivatives of the prediction of a dynamic trial [channel's unit / s].
     sensitivity : (N, C, P) ndarray or None
-        S of the module's text for the P parameters of the whole fit (in held-out trials without
-        those that were fitted to the trial itself). With it tests allow exactly for what the fit
-        has absorbed, without it for the leverage only.
+        The matrix S = J L / s0 at the top of this module, for the P parameters of the whole fit; in
+        a held-out trial without the parameters that were fitted to this trial itself. With S, tests
+        allow exactly for what the fit has absorbed; if it is None, for the leverage only.
 
     Raises
     ------

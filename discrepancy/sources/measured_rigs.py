@@ -212,7 +212,7 @@ def _pendulum_files(data: Path) -> RigFiles:
         # means of successive groups of samples; an incomplete group at the end is dropped
         group_count = len(samples) // group_size
         groups = samples[: group_count * group_size].reshape(group_count, group_size, 3)
-        time, angle, torque = groups.mean(axis=1).T
+        time, angle, torque = groups.mean(axis=1).T  # (groups,) each
         angle = savgol_filter(angle, SMOOTHED_SAMPLES, 3)
         tables[f"{name}.csv"] = table_text(
             {"time": np.round(time, 9), "angle": angle, "torque": torque}

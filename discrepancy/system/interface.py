@@ -35,12 +35,12 @@ MOST_RESPONSES = 400
 NO_PATCH = ModelPatch()
 
 
-def _weight_of_response(kept: object) -> int:
-    """Return the weight [B] of a trial with its response in the cache of a model.
+def _weight_of_response(cached: object) -> int:
+    """Return the weight [B] of an entry of a model's cache, a trial with its response.
 
     A short response weighs as much as if `MOST_RESPONSES` of its kind filled the cache.
     """
-    _, response = cast(tuple[Trial, Response], kept)
+    _, response = cast(tuple[Trial, Response], cached)
     size = response.values.nbytes + (0 if response.rates is None else response.rates.nbytes)
     return max(size, RESPONSE_CACHE_BYTES // MOST_RESPONSES)
 
@@ -92,9 +92,9 @@ class Model(ABC):
     follows_windows : bool
         Whether it can follow laws that act in windows only.
     linear : bool
-        Whether the internal forces that the model has itself (`own_laws`) are left out.
+        Whether the internal forces that the model has itself (`built_in_laws`) are left out.
     shows_ports : bool
-        Whether the motion of its ports can be computed (`ported` and `port_motion`).
+        Whether the motion of its ports can be computed (`ported_system` and `port_motion`).
     """
 
     name: str
@@ -186,7 +186,8 @@ class Model(ABC):
         conditions : Conditions
             Parameters, initial state, clock and health.
         parts : int
-            Samples are this many times as dense as those of the trial.
+            Each interval between samples of the trial is divided into this many, and N grows
+            accordingly.
         """
         raise NotImplementedError
 
@@ -201,7 +202,10 @@ class Model(ABC):
         raise NotImplementedError
 
     def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
-        """Return the internal forces of a patch, expressed at the ports of `ported`."""
+        """Return the internal forces of a patch as forces at the ports of the model's system.
+
+        A force that is spread over a wing becomes forces at several ports.
+        """
         return forces
 
     def port_units(self, port: str) -> tuple[str, str]:
@@ -220,7 +224,7 @@ class Model(ABC):
     # ------------------------------------------------------------ checks
 
     def check_trial(self, trial: Trial) -> None:
-        """Refuse a trial that the model cannot follow.
+        """Raise an error if the model cannot follow a trial.
 
         Raises
         ------
@@ -255,7 +259,7 @@ class Model(ABC):
             )
 
     def check_outputs(self, outputs: Outputs) -> None:
-        """Refuse outputs that do not exist, or that a channel of its quantity cannot measure."""
+        """Raise an error if an output does not exist, or lacks the quantity of its channel."""
         for output, measured_kind in outputs:
             quantity = self.output_quantity(output)
             if quantity is None:
@@ -270,7 +274,7 @@ class Model(ABC):
                 )
 
     def _check_primitives(self, patch: ModelPatch) -> None:
-        """Refuse a patch with a primitive that the model cannot carry."""
+        """Raise an error if a patch has a primitive that the model cannot carry."""
         for primitive in patch:
             if isinstance(primitive, SENSORS) or self.supports(type(primitive)):
                 continue
@@ -284,7 +288,7 @@ class Model(ABC):
     def region_losses(
         self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> list[Losses]:
-        """Return the stiffness losses of the model's regions in each row.
+        """Return the stiffness losses of the model's regions, a tuple of them for each row.
 
         Parameters
         ----------
@@ -331,9 +335,9 @@ class Model(ABC):
         return self._unpatched_parameters
 
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
-        """Return mean and standard deviation of each parameter.
+        """Return mean and standard deviation of the prior of each parameter.
 
-        The campaign states them; if it does not, they are those of the model.
+        They are those that the campaign states, or else those of the model.
         """
         campaign_parameters = campaign.parameters
         return [
@@ -342,7 +346,7 @@ class Model(ABC):
         ]
 
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
-        """Return the means (P,) of the declared parameters.
+        """Return the prior means (P,) of the parameters of the model without its patch.
 
         The campaign's mean is taken if it states one, else the model's.
         """
@@ -442,7 +446,10 @@ class Model(ABC):
     # ------------------------------------------------------------ the model with changes
 
     def with_response_cache(self) -> Self:
-        """Return the model as one that keeps responses: many sensors are tried on one motion."""
+        """Return a copy of the model that keeps its responses; the model itself if it does already.
+
+        A search tries many faults of sensors on one motion.
+        """
         if self._responses is not None:
             return self
         return self._copy_with(_responses=ResultCache(RESPONSE_CACHE_BYTES, _weight_of_response))
@@ -452,7 +459,7 @@ class Model(ABC):
         patch: ModelPatch,
         calibrated: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> Self:
-        """Return the model with a patch that acts in every response.
+        """Return a copy of the model with a patch that acts in every response.
 
         Parameters
         ----------
@@ -474,7 +481,10 @@ class Model(ABC):
         )
 
     def without_laws(self) -> tuple[Self, ModelPatch]:
-        """Return the model without laws at its ports, and these laws at the prior means."""
+        """Return a copy without laws at its ports, and these laws at the prior means.
+
+        The laws are those of the model itself, and those of its patch.
+        """
         laws = self.built_in_laws(self.prior_mean()) + self.patch.of(PortForce)
         without_laws = self._copy_with(
             patch=self.patch.without(PortForce), linear=True, _responses=None

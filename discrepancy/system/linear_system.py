@@ -177,18 +177,22 @@ class LinearSystem:
     def modes(self) -> Modes:
         """Modes of the motions that no drive prescribes."""
         if self.solved is not None:
-            frequency = 2.0 * np.pi * self.solved.modes.frequency
-            return Modes(frequency, np.ascontiguousarray(self.solved.mode_shapes), len(frequency))
+            angular_frequency = 2.0 * np.pi * self.solved.modes.frequency
+            shapes = np.ascontiguousarray(self.solved.mode_shapes)
+            return Modes(angular_frequency, shapes, len(angular_frequency))
+        # omega^2 (M,), and shapes (displacement_count, M)
         squares, displacement_shapes = self._displacement_modes()
         n = self.displacement_count
         count = len(squares)
-        state_shapes = self._state_shapes()
+        state_shapes = self._state_shapes()  # (state_count, K)
         state_mode_count = state_shapes.shape[1]
+        # displacements and states do not share a mode: two diagonal blocks
         shapes = np.zeros((self.unknown_count, count + state_mode_count))
         shapes[:n, :count] = displacement_shapes
         shapes[n:, count:] = state_shapes
-        frequency = np.sqrt(np.maximum(squares, 0.0))
-        return Modes(np.concatenate((frequency, np.zeros(state_mode_count))), shapes, count)
+        # modes of states do not oscillate: their frequency is zero
+        angular_frequency = np.pad(np.sqrt(np.maximum(squares, 0.0)), (0, state_mode_count))
+        return Modes(angular_frequency, shapes, count)
 
     def _state_shapes(self) -> FloatArray:
         """Return the shapes (state_count, K) of the K independent states that no drive prescribes.
@@ -229,7 +233,7 @@ class LinearSystem:
             undriven_motions = null_space(drives)
             mass = undriven_motions.T @ mass @ undriven_motions
             stiffness = undriven_motions.T @ stiffness @ undriven_motions
-        # eigenvalue problem
+        # generalised eigenvalue problem: stiffness @ shape = square * mass @ shape
         squares = np.zeros(0)
         shapes = np.zeros((0, 0))
         if len(mass):
@@ -292,8 +296,9 @@ class LinearSystem:
         """
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
+        # the coordinates are the modes, then the drives, which count as modes of frequency zero
         frequency = np.pad(self.angular_frequency, (0, drive_count))
-        shapes = self.shapes_with_drives
+        shapes = self.shapes_with_drives  # (unknowns, modes + drives)
         damping = shapes.T @ self.damping @ shapes
         stiffness = shapes.T @ self.stiffness @ shapes
         # the motion of a drive is prescribed: no damping or stiffness acts on it

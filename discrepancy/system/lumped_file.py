@@ -174,7 +174,7 @@ class LumpedDescription(ModelDescription):
         return self.displacement_count + self.state_count + len(integrals)
 
     def pad_to_all_unknowns(self, row: Sequence[float] | FloatArray) -> FloatArray:
-        """Return a vector of the file, extended by zeros for the integrals of controllers."""
+        """Return a vector (n + m,) of the file as (N,), with zeros for integrals of controllers."""
         padded_row = np.zeros(self.unknown_count)
         padded_row[: len(row)] = row
         return padded_row
@@ -201,7 +201,10 @@ class LumpedDescription(ModelDescription):
         return not any(port.acts for port in self.port)
 
     def matrices_of(self, kind: str) -> dict[str, Rows]:
-        """Return the base matrix of a kind, if there is one, and its parts, by their names."""
+        """Return the base matrix of a kind, by the name of the kind, and its parts, by their names.
+
+        Without a base matrix, or with damping that is not stated as a matrix, there are parts only.
+        """
         base = getattr(self if kind in KINDS else self.coupling, kind)
         if isinstance(base, Damping):
             base = base.matrix
@@ -241,9 +244,9 @@ class LumpedDescription(ModelDescription):
                 padded_matrix *= 1.0 if name == kind else factors.get(name, 1.0)
                 matrices[name] = padded_matrix
                 sum_of_parts += padded_matrix
-            # Couplings stand on the right: M a + D v + K x = coupling states + forces. All matrices
-            # are returned for the left-hand side, so that couplings change their sign. This
-            # assignment also replaces the base matrix, which was stored under the same name.
+            # In the file, couplings stand on the right-hand side of the equation. All matrices are
+            # returned for the left-hand side, so that couplings change their sign. This assignment
+            # also replaces the base matrix, which was stored under the same name.
             sign = -1.0 if block.is_coupling else 1.0
             matrices[kind] = sign * factors.get(kind, 1.0) * sum_of_parts
         return matrices
@@ -293,8 +296,8 @@ class LumpedDescription(ModelDescription):
     def _matrix_checks(self, kind: str) -> Iterator[Check]:
         """Yield the checks on the size, symmetry and definiteness of the matrices of a kind.
 
-        Several matrices of a kind are parts of one, which is their sum. The first check that fails
-        ends those of a file, so that a later one may rely on the size.
+        Size and symmetry concern each matrix, definiteness the sum of a base matrix and its parts.
+        The first check of a file that fails is the last, so that later ones may rely on the size.
         """
         matrices = self.matrices_of(kind)
         for name, matrix in matrices.items():
@@ -334,7 +337,7 @@ class LumpedDescription(ModelDescription):
 
     @staticmethod
     def _label_of_matrix(kind: str, name: str) -> str:
-        """Return where a matrix stands in the file, for a sentence."""
+        """Return the key of a matrix in the file for a message, such as "mass_part 'rotor'"."""
         if name != kind:
             return f"{kind}_part {name!r}"
         if kind == "damping":
@@ -342,10 +345,11 @@ class LumpedDescription(ModelDescription):
         return kind if kind in KINDS else f"coupling.{kind}"
 
     def _vanishing_matrix_checks(self) -> Iterator[Check]:
-        """Yield the parameters whose lower bound of zero makes a required matrix singular.
+        """Yield the parameters whose lower bound of zero would make a required matrix singular.
 
-        The mass and the capacity must be positive definite, and the stiffness too unless the file
-        states a free structure. The parts that the parameter does not scale must be so alone.
+        The mass and the capacity must stay positive definite, and the stiffness too unless the file
+        states a free structure. If a parameter that may be zero scales parts of such a matrix, the
+        sum of the other parts must be positive definite alone.
         """
         needed_kinds = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
         for parameter in self.parameter:
@@ -353,9 +357,9 @@ class LumpedDescription(ModelDescription):
                 continue
             for kind in needed_kinds:
                 matrices = self.matrices_of(kind)
-                scales_all = kind in parameter.terms
+                scales_all = kind in parameter.terms  # the whole matrix of this kind
                 unscaled = [
-                    value for name, value in matrices.items() if name not in parameter.terms
+                    matrix for name, matrix in matrices.items() if name not in parameter.terms
                 ]
                 scales_some = scales_all or len(unscaled) < len(matrices)
                 remains_nonzero = (
@@ -372,9 +376,9 @@ class LumpedDescription(ModelDescription):
     ) -> Iterator[Check]:
         """Yield the checks on the vectors of a section.
 
-        A vector must have the right length and must not be zero. That of a port or a controller
-        must not read displacements and states at once. The direction `acts` of a port is checked by
-        `_flow_check`, and a controller must not need an acceleration.
+        A vector must have an entry for each displacement and state, and must not be zero (but a
+        `station_derivative` may be). That of a port or a controller must not read displacements and
+        states at once. A controller must not need the derivative of a speed or of a state.
         """
         n = self.displacement_count
         unknowns = n + self.state_count
@@ -409,7 +413,7 @@ class LumpedDescription(ModelDescription):
             )
 
     def _prescribed_state_check(self, section: InputSection, row: FloatArray) -> Check:
-        """Return the rule that a prescribed state is one of the states, and no motion or load."""
+        """Return the check that an input with `prescribes_state` prescribes states, and no load."""
         n = self.displacement_count
         is_of_states = not any(row[:n])
         is_load = section.through is not None or section.station_derivative is not None
@@ -420,7 +424,7 @@ class LumpedDescription(ModelDescription):
         )
 
     def _flow_check(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Check:
-        """Return the rule that a flow at a port of states lowers the reading of the port.
+        """Return the check that a flow at a port of states lowers the reading of the port.
 
         A unit flow along `acts` changes the states at the rate capacity^-1 acts, and the reading
         row . states of the port at the rate row . capacity^-1 acts, which must be positive.
@@ -428,9 +432,9 @@ class LumpedDescription(ModelDescription):
         n = self.displacement_count
         is_of_states = not any(row[:n]) and not any(acts[:n])
         capacity = np.sum([*self.matrices_of("capacity").values()], axis=0)
-        takes = is_of_states and row[n:] @ np.linalg.solve(capacity, acts[n:]) > 0.0
+        lowers_reading = is_of_states and row[n:] @ np.linalg.solve(capacity, acts[n:]) > 0.0
         return (
-            not takes,
+            not lowers_reading,
             f"`acts` of the port {port.name!r} is for states, and must take from what its vector "
             "sees",
         )
@@ -473,7 +477,10 @@ class LumpedDescription(ModelDescription):
             yield from self._reference_checks(kind, key, verb, allowed_names)
 
     def _ambiguous_term_checks(self, scalable: Mapping[str, Sequence[str]]) -> Iterator[Check]:
-        """Yield the terms of parameters that name two things, both of which would be scaled."""
+        """Yield the terms of parameters that name two things, both of which would be scaled.
+
+        `scalable` holds the names of what a parameter can scale, by what it is ("an input").
+        """
         for parameter in self.parameter:
             for term in parameter.terms:
                 meanings = [kind for kind, names in scalable.items() if term in names]
@@ -487,7 +494,10 @@ class LumpedDescription(ModelDescription):
     def _reference_checks(
         self, kind: str, key: str, verb: str, known_names: Sequence[str]
     ) -> Iterator[Check]:
-        """Yield the names that sections of a kind state under a key and that do not exist."""
+        """Yield the names that sections of a kind state under a key and that do not exist.
+
+        `verb` says in the message what the section does with the name, such as "scales".
+        """
         listed = ", ".join(known_names) or "none"
         for section in getattr(self, kind):
             for name in as_list(getattr(section, key)):

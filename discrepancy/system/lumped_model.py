@@ -108,7 +108,7 @@ class LumpedModel(DescribedModel, SystemModel):
     def region_losses(
         self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> list[Losses]:
-        """Return one row without losses: health has no meaning here."""
+        """Return one row without losses, whatever the campaign states: there are no regions."""
         return [()]
 
     @property
@@ -118,7 +118,10 @@ class LumpedModel(DescribedModel, SystemModel):
         return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
     def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws that the model itself has at ports, multiplied by their factors."""
+        """Return the laws that the model itself has at ports, multiplied by their factors.
+
+        They are none if the model is a copy without laws (`linear`).
+        """
         if self.linear:
             return NO_PATCH
         factors = self._term_factors(parameters.tolist())
@@ -131,12 +134,19 @@ class LumpedModel(DescribedModel, SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (N,) of 1 N at a place, or of one unit of another input."""
+        """Return the load (N,) of 1 N at a place, or of one unit of another input.
+
+        A place is the name of an input; a patch may move it along the structure.
+        """
         load_change = LoadChange.from_patch(change)
         return self._input_direction(self.rig_in_state(state), self._input_at(place), load_change)
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
-        """Return the loads and the prescribed motions in a trial."""
+        """Return the loads and the prescribed motions in a trial.
+
+        Loads are the constant ones, the references of controllers, the recorded inputs, and forces
+        of the patch by a formula in time.
+        """
         trial = case.trial
         rig = self.rig_in_state(case.state)
         inputs = self._offset_inputs(case)
@@ -202,7 +212,10 @@ class LumpedModel(DescribedModel, SystemModel):
         return Load(self.law_directions[primitive.port], history)
 
     def _offset_inputs(self, case: PatchedTrial) -> dict[str, OffsetInput]:
-        """Return the recorded inputs of a trial, or its force at its load place, by name."""
+        """Return the recorded inputs of a driven trial, with their offsets, by name.
+
+        For another kind of trial the only input is its force at its load place.
+        """
         trial = case.trial
         recorded_inputs = trial.inputs
         if trial.kind is not TrialKind.DRIVEN:
@@ -249,7 +262,10 @@ class LumpedModel(DescribedModel, SystemModel):
         return section
 
     def _input_at(self, place: Place) -> InputSection:
-        """Return the input of a load place; raises `ModelError` if there is none."""
+        """Return the input of a load place; raises `ModelError` if there is none.
+
+        A prescribed motion is a load place only if the trial names it.
+        """
         candidates = [
             name
             for name, section in self._inputs.items()
@@ -258,7 +274,10 @@ class LumpedModel(DescribedModel, SystemModel):
         return self._inputs[choose_load_place(candidates, place, self.quoted_name)]
 
     def _input_direction(self, rig: Rig, section: InputSection, change: LoadChange) -> FloatArray:
-        """Return the load (N,) of one unit of an input whose place may have been moved."""
+        """Return the load (N,) of one unit of an input whose place may have been moved.
+
+        Raises `ModelError` if its place moves, but the file does not say how the load then changes.
+        """
         row = np.array(section.vector)
         if change.along_span or change.along_chord:
             if section.station_derivative is None:
@@ -311,7 +330,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def _controller_equation(
         self, controller: str, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
-        """Return the equation of an output that is the output of a controller."""
+        """Return the equation of an output that is the output of a controller.
+
+        In a static trial, without an excitation, the references of the controller are zero.
+        """
         loop = self.rig_in_state(case.state).loops[controller]
         # gives the factor x of a load x direction (pseudo-inverse of a vector)
         inverse_direction = loop.direction / float(loop.direction @ loop.direction)
@@ -329,7 +351,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the equation of an output that is the force that a prescribed motion needs.
 
         By the equation of motion along the drive it is K u + C u' + M u'' minus the loads, plus the
-        forces of laws there.
+        forces of laws there. Raises `ModelError` if the trial does not prescribe the motion.
         """
         drive_names = [] if excitation is None else list(excitation.prescribed_motions)
         if excitation is None or section.reaction not in drive_names:
@@ -358,7 +380,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return EITHER if row is None else units_at_port(self.description, row)
 
     def _term_factors(self, parameters: Sequence[float]) -> dict[str, float]:
-        """Return the factors of the terms at values of the parameters."""
+        """Return the factor of each term by name; parameters that scale the same term multiply."""
         factors: dict[str, float] = {}
         for section, value in zip(self.description.parameter, parameters, strict=True):
             for term in section.terms:
@@ -378,10 +400,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def build_system(self, state: SystemState) -> LinearSystem:
         """Return the linear system in a state, with its prescribed motions and controllers.
 
-        A controller adds to the matrices K, D and M (of z, z', z''): its output on the right-hand
-        side goes to the left with a minus. The integral s of its error, s' = reference - measured,
-        is a further state, the speed of its unknown in z; hence it has a one in M, and the measured
-        quantity goes to the left with a plus.
+        A controller adds to the matrices K, D and M of the left-hand side K z + D z' + M z'': minus
+        its output, which is a load. The integral s of its error, s' = reference - measured, is a
+        further state, the speed of its unknown in z. So M has a one there, and the measured
+        quantity is added on the left-hand side.
         """
         description = self.description
         rig = self.rig_in_state(state)
@@ -432,7 +454,7 @@ def _trial_kinds(description: LumpedDescription) -> frozenset[TrialKind]:
 def _prescribed_motion(
     trial: Trial, offset_input: OffsetInput, section: InputSection, factor: float
 ) -> RecordedHistory:
-    """Return the motion that an input prescribes, times a factor of it.
+    """Return the motion that an input prescribes, multiplied by a factor.
 
     A state is the speed of its coordinate, so that a prescribed state is a recorded velocity.
     """
@@ -443,7 +465,7 @@ def _prescribed_motion(
 
 
 def _load_history(trial: Trial, offset_input: OffsetInput, change: LoadChange) -> RecordedHistory:
-    """Return a recorded load over time; to a force, the gain and tare of a patch are applied."""
+    """Return a recorded load over time, changed by a patch if it is a force or a torque."""
     recorded_input = offset_input.recorded
     values = offset_input.values
     if recorded_input.quantity in (Quantity.FORCE, Quantity.TORQUE):

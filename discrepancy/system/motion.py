@@ -118,7 +118,7 @@ class Motion:
         displacement = np.zeros((len(self.time), len(rows)))
         if self.excitation.loads:
             displacement += self.excitation.loads_at(self.time, residual_flexibility)
-        if len(self.laws):
+        if len(self.laws):  # (N, J) @ (J, C)
             displacement -= self.lagged_forces @ (
                 system.rows_of_laws(self.laws) @ residual_flexibility
             )
@@ -268,7 +268,7 @@ def _motion_from_release(
     if held_count >= len(times) - 1:
         stamps = np.append(stamps, abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
-        # the transition matrix of the linear system over a negative time step
+        # the transition matrix (2 M, 2 M) of the linear system over a negative time step
         transition_back = system.modal_system.exact_steps(stamps[:1])[0][0]
         begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
     motion = _integrate_from(system, excitation, laws, 0.0, stamps, begin, refinement)

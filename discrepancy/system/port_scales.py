@@ -64,20 +64,16 @@ def displacement_readings(
 ) -> DisplacementReadings:
     """Return the readings of the channels of a trial that show displacements alone.
 
-    Parameters
-    ----------
-    trial : Trial
-        A trial in motion.
-    equations : sequence of OutputEquation
-        The equation of the output of each channel; there is at least one.
+    `equations` are those of the output of each channel. The constant of an output is subtracted. A
+    channel that also shows a rate, a state or a load directly is left out.
     """
     columns = []
     for column, equation in enumerate(equations):
         shows_displacement = np.any(equation.rows[0]) and not np.any(equation.rows[1:])
         if shows_displacement and not equation.feedthrough:
             columns.append(column)
-    readings = np.where(trial.used, trial.values, np.nan)
-    rows = np.array([equation.rows[0] for equation in equations])
+    readings = np.where(trial.used, trial.values, np.nan)  # (samples, channels)
+    rows = np.array([equation.rows[0] for equation in equations])  # (channels, unknowns)
     constants = np.array([equation.constant for equation in equations])
     return DisplacementReadings(rows[columns], readings[:, columns] - constants[columns])
 
@@ -86,6 +82,11 @@ def scales_of_moving_structure(
     system: LinearSystem, largest: LargestMotion, duration: float
 ) -> GlobalScales:
     """Return the scales of a whole structure from the loads and motions of the trials.
+
+    The angular frequency omega is the lowest one of the system above zero, or else the largest
+    speed over the largest displacement, or else one over the duration of the longest record. The
+    mass is the mean of the diagonal of the mass matrix. The stiffness is the largest load over the
+    largest displacement, or else the mass times omega squared.
 
     Parameters
     ----------
@@ -96,20 +97,20 @@ def scales_of_moving_structure(
     duration : float
         The duration of the longest dynamic record [s].
     """
-    elastic = system.angular_frequency[system.angular_frequency > 0.0]
+    angular_frequencies = system.angular_frequency[system.angular_frequency > 0.0]
     moves = largest.displacement > 0.0
-    if len(elastic):
-        frequency = float(elastic[0])
+    if len(angular_frequencies):
+        angular_frequency = float(angular_frequencies[0])
     elif moves and largest.speed > 0.0:
-        frequency = largest.speed / largest.displacement
+        angular_frequency = largest.speed / largest.displacement
     else:
-        frequency = 1.0 / duration
+        angular_frequency = 1.0 / duration
     mass = float(np.trace(system.mass)) / max(system.unknown_count, 1)
     if moves and largest.load > 0.0:
         stiffness = largest.load / largest.displacement
     else:
-        stiffness = mass * frequency**2
-    return GlobalScales(stiffness, mass, frequency)
+        stiffness = mass * angular_frequency**2
+    return GlobalScales(stiffness, mass, angular_frequency)
 
 
 def larger_magnitude(largest: float, values: FloatArray) -> float:
@@ -118,7 +119,7 @@ def larger_magnitude(largest: float, values: FloatArray) -> float:
 
 
 def largest_measured_force(campaign: Campaign, trial: Trial) -> float:
-    """Return the largest force or moment that a channel measured in a trial [N or N m]."""
+    """Return the largest force or moment that a channel measured in a trial [N or N m], or 0."""
     is_force = [
         campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
         for name in trial.channels
@@ -149,13 +150,14 @@ class PortScaleEstimator:
         self.system = system
         self.rows = rows
         count = len(rows)
+        # of each port, over the trials that were added so far
         self.fitted_displacement = np.zeros(count)
         self.largest_displacement = np.zeros(count)
         self.largest_speed = np.zeros(count)
-        self.force_squares = np.zeros(count)
+        self.force_squares = np.zeros(count)  # sums over samples
         self.sample_count = 0
-        self.turns = np.zeros(count, bool)
-        self.follows_drives = np.ones(count, bool)
+        self.turns = np.zeros(count, bool)  # whether the motion reverses
+        self.follows_drives = np.ones(count, bool)  # whether no mode moves the port
 
     def add_displacements(self, displacements: FloatArray, *, is_fitted: bool) -> None:
         """Add displacements of the structure at rest, or those from which it is released.
@@ -197,8 +199,8 @@ class PortScaleEstimator:
         (T, N) array
             The loads on all unknowns in the motion [N].
         """
-        positions, speeds = motion.displacements_and_speeds_at(self.rows)
-        measured_ratios = self._measured_over_computed(motion, positions, readings)
+        positions, speeds = motion.displacements_and_speeds_at(self.rows)  # (T, P)
+        measured_ratios = self._measured_over_computed(motion, positions, readings)  # (P,)
         largest_positions = np.max(np.abs(positions), axis=0, initial=0.0) * measured_ratios
         largest_speeds = np.max(np.abs(speeds), axis=0, initial=0.0) * measured_ratios
         self._add_largest(largest_positions, largest_speeds, is_fitted=is_fitted)
@@ -206,19 +208,19 @@ class PortScaleEstimator:
         self.turns |= (np.min(speeds, axis=0) < -least_speed) & (
             np.max(speeds, axis=0) > least_speed
         )
-        # inertia, damping and loads (N unknowns)
+        # loads, inertia and damping (T, N) on the N unknowns
         system = motion.system
         shapes = system.shapes
         mode_count = shapes.shape[1]
         loads = motion.excitation.loads_at(motion.time, np.eye(system.unknown_count))
         inertia = motion.acceleration[:, :mode_count] @ (system.mass @ shapes).T
         damping = motion.velocity[:, :mode_count] @ (self.system.damping @ shapes).T
-        # The equivalent force at a port p excites the modes as the loads do, in
-        # projection on the port: p @ shapes @ (modal forces), over the same for a unit force at
-        # the port, which is |p @ shapes|^2 (mobility).
+        # The force at a port p that would accelerate the port as the loads do: the acceleration is
+        # p @ shapes @ (modal forces), and that by a unit force at the port is |p @ shapes|^2, the
+        # mobility (P,).
         mobility = np.sum((self.rows @ shapes) ** 2, axis=1)
         is_free_to_move = mobility > 0.0
-        port_forces_per_load = (
+        port_forces_per_load = (  # (N, P)
             shapes @ (shapes.T @ self.rows.T) / np.where(is_free_to_move, mobility, 1.0)
         )
         mean_squares = [
@@ -243,7 +245,9 @@ class PortScaleEstimator:
         """Return factors (P,) for ports whose motion was measured to be far from the computed one.
 
         A factor is the largest measured displacement of a port over the largest computed one. It is
-        one for ports that are not measured, and where both displacements have about the same size.
+        1 for ports that are not measured, for ports of states, and if the two displacements differ
+        by less than the factor `FAR_FROM_MEASURED`. A port is measured if its row is a combination
+        of those of channels and drives.
 
         Parameters
         ----------
@@ -269,7 +273,7 @@ class PortScaleEstimator:
                 continue
             # prescribed motions are the same in both: only readings differ from the computed motion
             difference = (readings.values - computed_readings) @ coefficients[:reading_count]
-            measured = positions[:, port] + difference
+            measured = positions[:, port] + difference  # (T,)
             is_measured = np.isfinite(measured)
             largest_measured = larger_magnitude(0.0, measured[is_measured])
             largest_computed = larger_magnitude(0.0, positions[is_measured, port])
@@ -283,7 +287,7 @@ class PortScaleEstimator:
     def _add_largest(
         self, displacements: FloatArray, speeds: FloatArray, *, is_fitted: bool
     ) -> None:
-        """Raise the largest displacements and speeds of the P ports to those (P,) of a trial."""
+        """Update the largest displacements and speeds of the P ports by those (P,) of a trial."""
         self.fitted_displacement = np.maximum(self.fitted_displacement, displacements * is_fitted)
         self.largest_displacement = np.maximum(self.largest_displacement, displacements)
         self.largest_speed = np.maximum(self.largest_speed, speeds)
@@ -328,12 +332,14 @@ class PortScaleEstimator:
         Parameters
         ----------
         port_index : int
-            The number of the port.
+            The index of the port.
         static_stiffness : float
             The static stiffness of the port [N/m or N m/rad]; zero if it has to be computed from
             the modes.
         force : float
             The scale of the force at the port [N or N m]; zero if nothing acted there.
+        only_driven : bool
+            Whether every trial is a motion under recorded inputs; see `port_scales`.
         """
         system = self.system
         fitted_displacement = float(self.fitted_displacement[port_index])

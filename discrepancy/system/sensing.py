@@ -186,7 +186,8 @@ def _response_in_clocks(
         trial_in_true_time = replace(
             trial, time=trial.time + rates.inputs * (trial.time - first_stamp)
         )
-    # transverse and shear strain have the clock of their gauge
+    # of each output: the channels, then the transverse strains and the shear strains of the turned
+    # gauges, which have the clock of their gauge
     output_rates = np.append(rates.channels, np.tile(rates.channels[gauges.columns], 2))
     values = np.zeros((len(trial.time), len(gauges.outputs)))
     output_slopes = np.zeros_like(values)

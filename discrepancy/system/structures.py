@@ -162,7 +162,10 @@ class StructureModel(SystemModel):
         self.ports = tuple(self.port_rows)
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
-        """Return the rows (n,) of the displacement outputs along which a force acts, by name."""
+        """Return the rows (n,) of the displacement outputs along which a force acts, by name.
+
+        The force may act in either direction of the output.
+        """
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
         unit_loads = [self._unit_load(mean_state, force) for force in self.forces]
         rows: dict[str, FloatArray] = {}
@@ -181,12 +184,9 @@ class StructureModel(SystemModel):
         }
 
     def _check_direction_is_new(self, port: str, row: FloatArray) -> None:
-        """Refuse a port of the file that has the same direction (n,) as another port.
+        """Raise `ModelError` if a port of the file moves along a row (n,) as another port does.
 
-        Raises
-        ------
-        ModelError
-            If there is such a port: readings could not distinguish the forces at both.
+        Readings could not distinguish the forces at both.
         """
         for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
@@ -197,9 +197,10 @@ class StructureModel(SystemModel):
                 )
 
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
-        """Return mean and standard deviation of each parameter.
+        """Return mean and standard deviation of the prior of each parameter.
 
-        Without a trial in motion no reading shows errors of the mesh, which are zero then.
+        Without a trial in motion no reading shows errors of the mesh, whose deviations are zero
+        then.
         """
         moments = super().prior_moments(campaign)
         if any(trial.is_dynamic for trial in campaign.trials):
@@ -232,24 +233,27 @@ class StructureModel(SystemModel):
         return lru_cache(KEPT_SUBSPACES)(rows_of)
 
     def _changes_of(self, state: SystemState) -> tuple[int, ...]:
-        """Return the numbers of the changes of the structure in a state."""
+        """Return the indices of the changes of the structure that act in a state; mostly none."""
         if not isinstance(self.model, ChangeableModel):
             return ()
         return self.model.changes_of(state.structure).numbers
 
     def _in_state(self, load: FloatArray, state: SystemState) -> FloatArray:
-        """Return a load (n,) of the reduced model in the coordinates of a state (k,)."""
+        """Return a load (n,) of the reduced model in the k coordinates of a state, (k,).
+
+        A structure with changes is solved in a subspace of its own.
+        """
         if not isinstance(self.model, ChangeableModel):
             return load
         return np.asarray(load @ self.model.subspace(self._changes_of(state)).basis)
 
     def _load_of_controls(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
-        """Return the load (n,) under controls."""
+        """Return the load (n,) under controls, of which those not given are nominal."""
         coefficients = self.model.load_coefficients(self._input_vector(state, controls))
         return np.asarray(self._unit_loads @ coefficients)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
-        """Return the load (n,) per unit of a control."""
+        """Return the load (n,) per unit of a control, without the constant loads."""
         no_controls = dict.fromkeys(self.model.controls, 0.0)
         unit_control = no_controls | {control: 1.0}
         return self._load_of_controls(state, unit_control) - self._load_of_controls(
@@ -259,7 +263,10 @@ class StructureModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return the equations of outputs, rows of the reduced model at the places of gauges."""
+        """Return the equations of outputs, with strains at the places of shifted gauges.
+
+        Strain beside a gauge follows from a Taylor series of second order in the distance.
+        """
         rows = self._rows_of_changes(self._changes_of(case.state))
         shifts = [item for item in case.patch if isinstance(item, changes.GaugeOffset)]
         equations = []
@@ -299,6 +306,8 @@ class StructureModel(SystemModel):
     ) -> FloatArray:
         """Return the load (k,) of a force of 1 N, or of load factor 1 if there are no forces.
 
+        The primitives of `change` may alter the place and the direction of the force.
+
         Raises
         ------
         ModelError
@@ -336,12 +345,15 @@ class StructureModel(SystemModel):
     def region_losses(
         self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH
     ) -> list[Losses]:
-        """Return the losses of damage regions in each row; patches change the structure."""
+        """Return the losses of damage regions in each row, without losses of other patches.
+
+        Those are part of the structure; see `patched_trial`.
+        """
         in_regions = [primitive for primitive in patch if not self._is_loss_of_patch(primitive)]
         return super().region_losses(trial, health, ModelPatch(tuple(in_regions)))
 
     def _is_loss_of_patch(self, primitive: Primitive) -> bool:
-        """Return whether a primitive is a loss of stiffness of a patch, and of no damage region."""
+        """Return whether a primitive is a stiffness loss of a patch that is no damage region."""
         is_loss = isinstance(primitive, changes.RegionStiffnessLoss)
         return is_loss and getattr(primitive, "region", "") in self.loss_places
 
@@ -381,11 +393,14 @@ class StructureModel(SystemModel):
         return lru_cache(self.cache_size)(structure_in)
 
     def _inputs_of(self, state: SystemState) -> tuple[float, ...]:
-        """Return the parameters of a state that are inputs of the reduced model."""
+        """Return the parameters of a state that are inputs of the reduced model: no mesh errors."""
         return state.parameters[: len(self.model.parameters) + len(self.model.masses)]
 
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, with those of supports that may yield."""
+        """Return the natural scales under a campaign, with those of supports that may yield.
+
+        A support that hardly carries the structure has a compliance of one.
+        """
         scales = super().scales(campaign)
         if not isinstance(self.model, ChangeableModel):
             return scales
@@ -402,7 +417,10 @@ class StructureModel(SystemModel):
 
 
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
-    """Return the priors of parameters and free masses: nominal means, deviations of `DEVIATION`."""
+    """Return the priors of parameters and free masses.
+
+    Their means are nominal, and their deviations `DEVIATION` times their ranges.
+    """
     nominal_values = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
     priors = []
@@ -430,7 +448,11 @@ def _mesh_errors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
 
 
 def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
-    """Return rows (n,) of strains across gauges and shear, and (2, n) of derivatives by place."""
+    """Return the rows of strains near gauges, by output.
+
+    They are the transverse and the shear strain of a gauge (n,), and for each axis along which a
+    gauge may be shifted, such as `g1.along`, the slope and curvature of its strain (2, n).
+    """
     rows = {}
     for ending, strain_rows in zip(ACROSS, model.across_output, strict=True):
         for gauge, row in zip(model.gauges[: len(strain_rows)], strain_rows, strict=True):
@@ -441,7 +463,10 @@ def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
 
 
 class _WithMeshErrors:
-    """A solved structure whose lowest frequencies differ by errors of its mesh."""
+    """A solved structure whose lowest frequencies differ by relative errors of its mesh.
+
+    Shapes and flexibility are those of the structure.
+    """
 
     def __init__(self, structure: StructureWithMatrices, errors: FloatArray) -> None:
         self._structure = structure
@@ -460,14 +485,15 @@ def _is_at_port(name: str) -> bool:
     return name.startswith(PORT_PREFIX)
 
 
-def _acts_along(push: FloatArray, row: FloatArray) -> bool:
-    """Return whether a load (n,) is a multiple of the row (n,) of a displacement."""
-    largest_entry = float(np.abs(push).max())
-    # least-squares factor of the row; the remaining part of a multiple is rounding
-    projection = float(push @ row) / (float(row @ row) or 1.0)
+def _acts_along(load: FloatArray, row: FloatArray) -> bool:
+    """Return whether a load (n,) is a multiple of the row (n,) of a displacement, up to rounding.
+
+    A load of zeros is not.
+    """
+    largest_entry = float(np.abs(load).max())
+    factor = float(load @ row) / (float(row @ row) or 1.0)  # of least squares
     return (
-        largest_entry > 0.0
-        and float(np.abs(push - projection * row).max()) <= ROUNDING * largest_entry
+        largest_entry > 0.0 and float(np.abs(load - factor * row).max()) <= ROUNDING * largest_entry
     )
 
 
@@ -486,9 +512,9 @@ def linear_system(
     rayleigh : iterable of float
         Rayleigh damping: alpha [1/s] and beta [s].
     ports : mapping of str to (n,) array
-        The rows that give the displacement of each port from the n states.
+        The rows that give the displacement of each port from the n coordinates.
     solved : SolvedStructure, optional
-        The structure with other modes; that with these matrices if left out.
+        The structure with corrected modes; by default the modes are those of `structure`.
     """
     alpha, beta = rayleigh
     return LinearSystem(

@@ -77,7 +77,10 @@ class SystemModel(Model):
 
     @abstractmethod
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Assemble and return the linear system in a state; `system` is the same with a cache."""
+        """Assemble and return the linear system in a state.
+
+        `system_in_state` does the same with a cache.
+        """
 
     @abstractmethod
     def force_row(
@@ -96,7 +99,10 @@ class SystemModel(Model):
         """
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
-        """Return the loads (k, N) of a load factor and its powers, under load primitives."""
+        """Return the loads (k, N) of the load factor and of its powers 2 .. k in a flight.
+
+        The load primitives of a patch change them.
+        """
         raise NotImplementedError
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
@@ -145,14 +151,10 @@ class SystemModel(Model):
     def distributed_scales(
         self, ports: Mapping[str, PortScale], shape: FloatArray
     ) -> dict[str, PortScale]:
-        """Return the scales of forces distributed over the structure.
+        """Return the scales of forces that are distributed over the structure, by name.
 
-        Parameters
-        ----------
-        ports : mapping of str to PortScale
-            The scales of single ports.
-        shape : (N,) array
-            The shape of the first mode.
+        Here there are none. `ports` are the scales of single ports, and `shape` (N,) is that of the
+        first mode, empty if springs do not hold the structure.
         """
         return {}
 
@@ -187,7 +189,10 @@ class SystemModel(Model):
         return PatchedTrial(trial, conditions, patch, state)
 
     def excitation(self, case: PatchedTrial) -> Excitation:
-        """Return the excitation of a trial: its loads and prescribed motions, or its release."""
+        """Return the excitation of a trial: its loads and prescribed motions, or its release.
+
+        Raises `ModelError` if a force by a formula in time acts in a ring-down.
+        """
         trial = case.trial
         initial_state = case.conditions.initial
         excitation = Excitation(
@@ -235,11 +240,11 @@ class SystemModel(Model):
     def _respond(
         self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
     ) -> Response:
-        """Return the response of a trial.
+        """Return the response of a trial, without rates for a trial at rest.
 
         The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
-        recorded force is not zero. In a dynamic trial the structure has the temperature of the
-        first sample throughout.
+        recorded force is not zero. In a dynamic trial the structure has the temperature, and the
+        damage, of the first sample throughout.
         """
         laws = self.laws_at_ports(conditions.parameters, patch)
         case = self.patched_trial(trial, conditions, patch)
@@ -331,15 +336,14 @@ class SystemModel(Model):
         Parameters
         ----------
         trial : Trial
-            The dynamic trial: one recorded experiment with its inputs and sample times.
+            The dynamic trial, with its inputs.
         outputs : tuple of (str, Quantity)
             The outputs that channels measure, and the quantity wanted of each.
         parameters : (P,) array
             Values of the calibrated parameters.
         """
-        patch = self.patch.in_trial(trial.name)  # the change of the model that holds in the trial
-        # the health of a structure is its stiffness losses, with one row for each time; a dynamic
-        # trial is simulated with the matrices at its start
+        patch = self.patch.in_trial(trial.name)  # its primitives that act in this trial
+        # a dynamic trial is simulated with the stiffness losses at its start
         losses_at_start = trial.health[:1]
         conditions_at_mean = Conditions(self.prior_mean(), health=losses_at_start)
         case_at_mean = self.patched_trial(trial, conditions_at_mean, patch)
@@ -352,7 +356,10 @@ class SystemModel(Model):
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
+
+        Each interval between samples is divided into `parts`.
+        """
         case = self.patched_trial(trial, conditions, self.patch.in_trial(trial.name))
         system, excitation = self.excited_system(case)
         denser_excitation = replace(
@@ -380,8 +387,8 @@ class SystemModel(Model):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, at the prior mean and without a patch.
 
-        If springs hold the structure and only forces move it, from rest, its stiffness and first
-        mode give the scales. Otherwise the loads and motions of the trials do.
+        If springs hold the structure and all trials are moved by forces alone, from rest, its
+        stiffness and first mode give the scales. Otherwise the loads and motions of the trials do.
         """
         trials = campaign.trials
         parameters = self.prior_mean(campaign)
@@ -395,7 +402,7 @@ class SystemModel(Model):
         estimator = PortScaleEstimator(uncontrolled, port_rows)
         largest_motion = self._add_trials(estimator, campaign, is_held=is_held)
         # scales of the whole structure
-        campaign_sizes = campaign.largest_magnitudes
+        largest_of_campaign = campaign.largest_magnitudes
         if is_held:
             global_scales = self._scales_of_held_structure(system, state, campaign)
             first_shape = system.shapes[:, 0]
@@ -404,7 +411,7 @@ class SystemModel(Model):
             ]
         else:
             global_scales = scales_of_moving_structure(
-                system, largest_motion, campaign_sizes["duration"]
+                system, largest_motion, largest_of_campaign["duration"]
             )
             first_shape = np.zeros(0)
             static_stiffness = [0.0] * len(self.ports)
@@ -417,27 +424,21 @@ class SystemModel(Model):
             tip_stiffness=global_scales.stiffness,
             modal_mass=global_scales.mass,
             angular_frequency=global_scales.angular_frequency,
-            force=campaign_sizes["force"] or largest_motion.load,
-            load_factor=campaign_sizes["load_factor"],
-            duration=campaign_sizes["duration"],
-            campaign_time=campaign_sizes["campaign_time"],
+            force=largest_of_campaign["force"] or largest_motion.load,
+            load_factor=largest_of_campaign["load_factor"],
+            duration=largest_of_campaign["duration"],
+            campaign_time=largest_of_campaign["campaign_time"],
             ports=ports | self.distributed_scales(ports, first_shape),
         )
 
     def _add_trials(
         self, estimator: PortScaleEstimator, campaign: Campaign, *, is_held: bool
     ) -> LargestMotion:
-        """Add the motions of all trials to an estimator, and return their largest magnitudes.
+        """Add the motions of all trials to the estimator, and return their largest magnitudes.
 
-        Parameters
-        ----------
-        estimator : PortScaleEstimator
-            The object that collects the motions of the ports; it is changed in place.
-        campaign : Campaign
-            The campaign: its trials, channels and noise records.
-        is_held : bool
-            Whether springs hold the structure. Only then static trials and ring-downs are added, by
-            their displacements at rest.
+        Trials at rest and ring-downs are added by their displacements at rest, and only if springs
+        hold the structure (`is_held`). The returned magnitudes are those of trials under recorded
+        inputs.
         """
         parameters = self.prior_mean(campaign)
         largest_motion = LargestMotion(0.0, 0.0, 0.0)
@@ -469,8 +470,8 @@ class SystemModel(Model):
     ) -> GlobalScales:
         """Return the scales of a structure that is supported by springs.
 
-        They are seen from the reference load place of the model, or else from the place of the
-        first load in the campaign.
+        Stiffness and mass are those at the reference load place of the model, or else at the load
+        place of the first trial, or else at the first load place of the model.
         """
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
         load_row = self.force_row(self.reference or places[0], state)
@@ -479,7 +480,8 @@ class SystemModel(Model):
         # Mass of the first mode, referred to the load point: its shape is scaled to a modal mass of
         # 1, so a unit displacement of the load point needs the modal coordinate 1 / (row . shape).
         shape_at_load = float(load_row @ system.shapes[:, 0])
-        # the first mode may not move the load point; all mass is then of the right order
+        # If the first mode does not move the load point, the trace of the mass matrix has the right
+        # order of magnitude.
         mass_at_load = 1.0 / shape_at_load**2 if shape_at_load else float(np.trace(system.mass))
         return GlobalScales(
             stiffness=1.0 / static_deflection,
@@ -490,16 +492,15 @@ class SystemModel(Model):
     def _motion_under_inputs(self, campaign: Campaign, trial: Trial) -> Motion:
         """Return the motion of a trial under its recorded inputs, at the prior mean.
 
-        If the inputs cause no motion at all, the structure was released, and the motion begins with
-        the typical magnitudes of an unknown initial state.
+        If it cannot begin as the trial states, it begins from rest. If nothing then moves, the
+        structure was released by hand, and the motion begins with the typical magnitudes of an
+        unknown initial state.
         """
         conditions = Conditions(self.prior_mean(campaign))
         laws = self.laws_at_ports(conditions.parameters)
         try:
             motion = self.simulate_motion(self.patched_trial(trial, conditions), laws)
-        except ModelError:
-            # the trial cannot begin as it states, such as in an equilibrium of a free structure:
-            # its scales are then those of a motion from rest
+        except ModelError:  # such as for the equilibrium of a free structure
             trial_from_rest = replace(trial, begins=Start.STILL)
             motion = self.simulate_motion(self.patched_trial(trial_from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
@@ -509,7 +510,7 @@ class SystemModel(Model):
         return motion
 
     def _static_displacements(self, case: PatchedTrial) -> FloatArray:
-        """Return the displacements of all unknowns in each row of a static trial.
+        """Return the displacements (L, N) of all unknowns in the L rows of a static trial.
 
         For a ring-down there is one row: the displacements from which the structure is released.
         """
@@ -535,23 +536,9 @@ def _output_rows_at_rest(
     """Return the rows (C, N) that give the C outputs of a structure at rest from its N unknowns.
 
     At rest an output depends on displacements, by row 0 of its equation, and on the values of
-    states of first order, which are the rates of their unknowns, by row 1.
-
-    Parameters
-    ----------
-    trial : Trial
-        The static trial, for messages.
-    outputs : sequence of (str, Quantity)
-        The name of each output, and the quantity that a channel measures there.
-    equations : sequence of OutputEquation
-        The equation of each output.
-    displacement_count : int
-        The number of the unknowns that are displacements; the others are states of first order.
-
-    Raises
-    ------
-    ModelError
-        If an output is a velocity, an acceleration or the rate of a state.
+    states of first order, which are the rates of their unknowns, by row 1. The first
+    `displacement_count` unknowns are displacements, the others states. Raises `ModelError` if an
+    output is a velocity, an acceleration or the rate of a state.
     """
     output_rows = []
     for (_, quantity), equation in zip(outputs, equations, strict=True):

@@ -143,10 +143,11 @@ class WingModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return the equations of outputs, with the strain factors of the patch applied."""
-        rows = np.array([self._output_row(output) for output, _ in outputs])
+        """Return the equations of outputs; the patch may scale the strain at gauges."""
+        rows = np.array([self._output_row(output) for output, _ in outputs])  # (C, n)
         factors = self.wing.strain_factors(case.patch)
         if factors is not None:
+            # the index of the gauge of each output; negative for a displacement
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             is_strain = gauges >= 0
             rows = rows * np.where(is_strain, factors[gauges], 1.0)[:, None]
@@ -187,7 +188,10 @@ class WingModel(SystemModel):
         return TURNS if port == ROTATING_PORT else MOVES
 
     def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at ports of `port_rows`."""
+        """Return internal forces as forces at the ports of `port_rows`.
+
+        A force that is spread over the planform acts at the ports of several stations.
+        """
         return self.wing.internal_forces(forces)
 
     def force_row(
@@ -203,7 +207,10 @@ class WingModel(SystemModel):
     def distributed_scales(
         self, ports: Mapping[str, PortScale], shape: FloatArray
     ) -> dict[str, PortScale]:
-        """Return the scales of a force over the planform, given the shape of the first mode."""
+        """Return the scales of a force over the planform, given the shape (n,) of the first mode.
+
+        They are those of the port `span`, with the fraction of the area at each station.
+        """
         weights = self.wing.planform_stations.area_fraction
         motions = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
         relative_motions = motions / float(weights @ motions)

@@ -207,8 +207,8 @@ def test_events_survive_the_files(pump, tmp_path):
 
 
 def test_an_event_has_its_moments_in_its_trial_alone(pump):
-    assert pump.event_moments("pumping", ["pump_on"]) == [{"pump_on": 2.5, "pump_on_until": 8.0}]
-    assert pump.event_moments("quiet", ["pump_on"]) == []
+    assert pump.event_times("pumping", ["pump_on"]) == [{"pump_on": 2.5, "pump_on_until": 8.0}]
+    assert pump.event_times("quiet", ["pump_on"]) == []
 
 
 def test_an_event_without_a_trial_is_of_all_trials(tmp_path):
