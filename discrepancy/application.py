@@ -233,9 +233,9 @@ def _patch_to_apply(
 ) -> files.StoredPatch:
     """Return the patch of the effects that are applied.
 
-    It is read from the `patch.json` beside the verdict, or made from a recorded hypothesis: that of
-    a `member` of a group, or the proved one of an unexplained gap. Raises `DiscrepancyError` if the
-    verdict has no such member, or gives nothing to apply.
+    The patch is read from the `patch.json` beside the verdict, or made from a recorded hypothesis:
+    that of a `member` of a group, or the proved one of an unexplained gap. Raises
+    `DiscrepancyError` if the verdict has no such member, or gives nothing to apply.
     """
     verdict = stored.verdict
     is_group = verdict.kind is VerdictKind.GROUP
@@ -360,9 +360,9 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
 def _relative_deviation_of_force(effect: files.PatchEffect) -> float:
     """Return the standard deviation of the force of an effect's laws over the force.
 
-    It is half the 90 % interval over 1.645 times the value: of the number that scales the force of
-    the first law or, in a patch without intervals, of the first parameter of the effect. Of a table
-    of forces, the largest force is taken. Without a finite interval the result is 0.
+    The result is half the 90 % interval over 1.645 times the value: of the number that scales the
+    force of the first law or, in a patch without intervals, of the first parameter of the effect.
+    Of a table of forces, the largest force is taken. Without a finite interval the result is 0.
     """
     law = effect.patch.primitives[0]
     assert isinstance(law, PortForce)  # only laws at ports are written into a model's file

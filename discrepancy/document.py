@@ -54,7 +54,7 @@ _WINDOWS = {
 }
 
 
-def _number(value: object) -> float:
+def _parse_number(value: object) -> float:
     """Return a number of a document; raise `ValueError` for anything else, such as a boolean."""
     if value is None or isinstance(value, str):
         if value not in _WORDS:
@@ -67,7 +67,7 @@ def _number(value: object) -> float:
     return float(value)
 
 
-def _patch(rows: object) -> ModelPatch:
+def _parse_patch(rows: object) -> ModelPatch:
     """Return the patch of a list of primitives; raise `ValueError` if it is not one."""
     try:
         return ModelPatch.from_list(rows)
@@ -109,14 +109,14 @@ class _SchemaOfPatch:
 
 Number = Annotated[
     float,
-    PlainValidator(_number),
+    PlainValidator(_parse_number),
     WithJsonSchema(
         {
             "anyOf": [{"type": "number"}, {"enum": ["Infinity", "-Infinity"]}, {"type": "null"}],
         }
     ),
 ]
-Patch = Annotated[ModelPatch, PlainValidator(_patch), _SchemaOfPatch()]
+Patch = Annotated[ModelPatch, PlainValidator(_parse_patch), _SchemaOfPatch()]
 
 
 # ---------------------------------------------------------------- documents
@@ -223,7 +223,7 @@ def write_document(path: Path, schema: str, record: object) -> Path:
     """
     content = plain_data(record)
     try:
-        _record_of(type(record), content)
+        _record_from_data(type(record), content)
     except _InvalidDocumentError as cause:
         raise VerdictFileError(f"{Path(path).name} cannot be written: {cause}.") from cause
     document = {"schema": schema, **content.pop("origin"), **content}
@@ -234,7 +234,7 @@ def write_document(path: Path, schema: str, record: object) -> Path:
 def read_document(
     path: Path,
     schema: str,
-    kind: type[_Record],
+    record_class: type[_Record],
     older: Collection[str] = (),
     upgrade: Callable[[JsonObject], None] | None = None,
     **absent: JsonDocument,
@@ -247,7 +247,7 @@ def read_document(
         The file.
     schema : str
         Name of the schema of this version.
-    kind : type
+    record_class : type
         Class of the record.
     older : collection of str
         Names of earlier schemas that are read, too.
@@ -283,7 +283,7 @@ def read_document(
     names_of_origin = [entry.name for entry in fields(Origin) if entry.name in content]
     origin = {name: content.pop(name) for name in names_of_origin}
     try:
-        return _record_of(kind, {**content, "origin": origin})
+        return _record_from_data(record_class, {**content, "origin": origin})
     except _InvalidDocumentError as cause:
         raise VerdictFileError(
             f"{path} does not fit its schema: {cause}; write it again."
@@ -294,7 +294,7 @@ class _InvalidDocumentError(ValueError):
     """Plain data that are not a document; the message is its first fault."""
 
 
-def _record_of(kind: type[_Record], content: JsonObject) -> _Record:
+def _record_from_data(record_class: type[_Record], content: JsonObject) -> _Record:
     """Return plain data as a record of a class.
 
     Raises
@@ -303,7 +303,9 @@ def _record_of(kind: type[_Record], content: JsonObject) -> _Record:
         If the data lack an entry, have an unknown one, or one of another type.
     """
     try:
-        return TypeAdapter(kind).validate_json(json.dumps(content), strict=True, extra="forbid")
+        return TypeAdapter(record_class).validate_json(
+            json.dumps(content), strict=True, extra="forbid"
+        )
     except ValidationError as cause:
         first = cause.errors()[0]
         place = ".".join(str(key) for key in first["loc"])

@@ -165,7 +165,7 @@ def _campaign_of(model: StructureModel, precision: Precision, trials: Sequence[T
 def _load_lines(model: StructureModel) -> list[Trial]:
     """Return a static trial of each force, from zero to the largest force in `LEVELS` steps.
 
-    Its readings are zero, and accelerations are not among its channels.
+    The readings of the trials are zero, and accelerations are not among the channels.
     """
     channels = tuple(
         name for name, quantity in model.quantities.items() if quantity is not Quantity.ACCELERATION
@@ -185,7 +185,8 @@ def _load_lines(model: StructureModel) -> list[Trial]:
 def _releases(model: StructureModel) -> list[Trial]:
     """Return a ring-down after the release of each force, held at `RELEASED_SHARE` of the largest.
 
-    It is released from the static displacement along the force at the prior mean of the parameters.
+    The structure is released from the static displacement along the force at the prior mean of the
+    parameters.
     """
     state = SystemState(tuple(model.prior_mean().tolist()))
     system = model.build_system(state)

@@ -77,7 +77,8 @@ class Simulator:
     def screen(self) -> Screen:
         """Return the screen that measures the distance d^2 of an effect.
 
-        It is linearised about a fit to a campaign whose readings are the predictions of the model.
+        The screen is linearised about a fit to a campaign whose readings are the predictions of the
+        model.
         """
         predicted = campaign_as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
@@ -90,7 +91,7 @@ class Simulator:
     ) -> HiddenEffect | None:
         """Draw an effect's place and parameters from their priors until it is detectable.
 
-        It is detectable if its distance d^2, which the screen measures, is at least
+        An effect is detectable if its distance d^2, which the screen measures, is at least
         `DETECTION_DISTANCE`. A draw that the structure cannot carry counts as not detectable. The
         result is None if none of `MOST_DRAWS` draws is detectable.
         """
@@ -180,8 +181,8 @@ def _draw_unknowns(
 def _draw_noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> FloatArray:
     """Draw noise (N,) [channel's unit] of one channel in the N rows of a trial.
 
-    It has the autocorrelation of the noise record if the trial is sampled at the same interval,
-    else it is white.
+    The noise has the autocorrelation of the noise record if the trial is sampled at the same
+    interval, else it is white.
     """
     count = len(trial.time)
     if not trial.is_dynamic or not model.can_whiten(trial.interval):

@@ -292,8 +292,8 @@ def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) ->
     """Return whether the effects of a verdict explain the whole force that the model lacks.
 
     The answer is no unless one of them is a law at a port, and none acts only in some stretches of
-    time. It is yes for kinds of verdict whose effects leave only noise when they are simulated.
-    Otherwise the estimate of the missing force beside these effects decides.
+    time. The answer is yes for kinds of verdict whose effects leave only noise when they are
+    simulated. Otherwise the estimate of the missing force beside these effects decides.
     """
     terms = fit.candidate.terms
     has_law = any(term.place in search.problem.model.ports for term in terms)
@@ -357,8 +357,8 @@ def check_and_prepare(
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
     """Return the campaign as it is investigated, and the faults of its data.
 
-    Its outputs and load places have the names of the model, outliers are marked, and trials are
-    held out.
+    Outputs and load places have the names of the model, outliers are marked, and trials are held
+    out.
 
     Parameters
     ----------
@@ -392,9 +392,9 @@ def check_and_prepare(
 def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     """Return the problem of a campaign and a model, with wrong readings at record ends left out.
 
-    They are found in the residuals of a fit without effects, which need not describe the data well;
-    `outliers.wrong_end_readings` states the rule. A remark reports them for each channel and trial,
-    unless the campaign accepts outliers there.
+    Wrong readings are found in the residuals of a fit without effects, which need not describe the
+    data well; `outliers.wrong_end_readings` states the rule. A remark reports them for each channel
+    and trial, unless the campaign accepts outliers there.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     first_fit = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
@@ -443,7 +443,7 @@ def patch_draws(
 ) -> list[list[ModelPatch]]:
     """Return the patches of each effect of a fit at draws of its posterior.
 
-    They are drawn from the posterior draws of the fit if it has some, else from the Gaussian
+    The draws are taken from the posterior draws of the fit if it has some, else from the Gaussian
     approximation.
 
     Parameters

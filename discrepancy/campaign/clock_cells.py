@@ -115,8 +115,8 @@ def _offset_seconds(offset: str) -> int:
 def _day_numbers(date: str) -> dict[str, int]:
     """Return the days since the year 1 that a date can mean, by `DAY_FIRST` and `MONTH_FIRST`.
 
-    Both orders have the same day if the date can be read in one way, as `2026-03-31` can, and as
-    any date with points is, whose day comes first. An order in which there is no such day is
+    Both orders have the same day if the date can be read in one way only, such as `2026-03-31`, or
+    any date with points, in which the day comes first. An order in which there is no such day is
     missing; for a text that is no date, both are.
     """
     text = re.sub(r"(?<=\d)(?=[A-Za-z])|(?<=[A-Za-z])(?=\d)|[-/ ,.]+", " ", date)
@@ -140,7 +140,7 @@ def _is_date(cell: str) -> bool:
 def possible_date_orders(columns: Iterable[Sequence[str]]) -> list[str]:
     """Return the orders, `DAY_FIRST` or `MONTH_FIRST`, in which all dates of a table can be read.
 
-    It is `DAY_FIRST` alone if every date is clear, or if none of the orders fits all dates.
+    The result is `DAY_FIRST` alone if every date is clear, or if none of the orders fits all dates.
     """
     days = set()  # the dates as texts
     for cells in columns:

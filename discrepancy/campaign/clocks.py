@@ -1,10 +1,10 @@
 """Tables with several columns of times, put on one clock.
 
 A laboratory's table may have several clocks: columns of times, each for some of the other columns.
-A trial of a campaign has only one. Its times are the times of all clocks together. Each reading
-stays at its own time, and a channel's cell is empty at the times of other clocks. Only a load or a
-temperature must be known at all times. It is interpolated as the campaign states for the course
-between its samples (`hold`).
+A trial of a campaign has only one clock: its times are those of all clocks of the table together.
+Each reading stays at its own time, and a channel's cell is empty at the times of other clocks. Only
+a load or a temperature must be known at all times, and is interpolated as the campaign states for
+the course between its samples (`hold`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -178,7 +178,7 @@ def _must_be_known_throughout(column: LaboratoryColumn, kind: str) -> bool:
 def _hold_of_load(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> Hold:
     """Return the course of a load between its samples: smooth for a motion, else as stated.
 
-    It is linear if it is not stated.
+    A course that is not stated is linear.
     """
     if column.quantity is not None and column.quantity.motion_chain:
         return Hold.SMOOTH

@@ -218,9 +218,10 @@ class ColumnReader:
     def _determine_quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity that a channel or an input measures.
 
-        It is one of the quantities with this unit, or the answer of the user. If the model's output
-        has one of them, it is this. Otherwise a length is a displacement, and a unit of strain is a
-        strain. If several are left, the user is asked, and the result is None.
+        The candidates are the quantities with this unit, or the answer of the user. The quantity of
+        the model's output is taken if it is a candidate. Otherwise a length is a displacement, and
+        a unit of strain is a strain. If several candidates are left, the user is asked, and the
+        result is None.
         """
         answer = self._questionnaire.stated_answer("quantity", head)
         quantities = possible_quantities(unit, answer)

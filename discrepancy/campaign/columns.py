@@ -134,8 +134,8 @@ def role_by_unit(
     heads, units : sequence of str
         The names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        The roles that a unit may determine. It lacks "force" for trials that do not read a column
-        `force`, in which a column in newtons may be a channel.
+        The roles that a unit may determine. "force" is not among them for trials that do not read a
+        column `force`, in which a column in newtons may be a channel.
     """
     if head in time_heads(heads, units):
         return "time"

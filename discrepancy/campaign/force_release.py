@@ -17,9 +17,9 @@ def table_of_release_by_force(
 ) -> TextTable:
     """Return the table of a forced trial for the record of a ring-down.
 
-    Its new column `force` holds the force at negative times, and 0 from time 0 on. If the record
-    has no negative times, a row is put before all others, one interval earlier, in which the force
-    acts and the channels have no readings.
+    The table has a new column `force`, which holds the force at negative times, and 0 from time 0
+    on. If the record has no negative times, a row is put before all others, one interval earlier,
+    in which the force acts and the channels have no readings.
 
     Parameters
     ----------

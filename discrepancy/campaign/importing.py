@@ -285,7 +285,8 @@ class LaboratoryImport:
     def _is_sampled_load(self, column: LaboratoryColumn) -> bool:
         """Return whether a column is a load whose course between its samples is asked for.
 
-        It is the force of a forced trial, or an input other than a motion: motions are smooth.
+        Such a load is the force of a forced trial, or an input other than a motion: motions are
+        smooth.
         """
         if self.kinds[column.sheet.name] == TrialKind.FORCED:
             return column.role == "force"

@@ -56,9 +56,9 @@ def read_matlab(path: Path) -> MatlabTable:
     columns: dict[str, np.ndarray] = {}
     left_out: list[str] = []
     for name, value in _variables(path):
-        columns_of_variable = _columns(name, value)
-        columns |= columns_of_variable
-        if not columns_of_variable:
+        new_columns = _columns_of_variable(name, value)
+        columns |= new_columns
+        if not new_columns:
             left_out.append(name)
     if not columns:
         content = listing(map(repr, left_out)) or "nothing"
@@ -69,7 +69,7 @@ def read_matlab(path: Path) -> MatlabTable:
         )
     table = _columns_of_fitting_lengths(columns)
     left_out += [name for name in columns if name not in table]
-    cells = [_cells(column) for column in table.values()]
+    cells = [_texts_of_cells(column) for column in table.values()]
     row_count = max(map(len, cells))
     # shorter columns end with empty cells
     padded_columns = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
@@ -156,7 +156,7 @@ def _hdf5_array(stored_object: h5py.Dataset | h5py.Group) -> np.ndarray | None:
     return np.transpose(stored_object[()])
 
 
-def _columns(name: str, value: object) -> dict[str, np.ndarray]:
+def _columns_of_variable(name: str, value: object) -> dict[str, np.ndarray]:
     """Return the columns (N,) of a variable by name; none unless it is a vector or narrow matrix.
 
     The longer side of a matrix NAME holds the samples, and its columns are called NAME 1, NAME 2
@@ -197,7 +197,7 @@ def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, 
     return {name: column for name, column in columns.items() if lengths[name] in accepted_lengths}
 
 
-def _cells(column: np.ndarray) -> list[str]:
+def _texts_of_cells(column: np.ndarray) -> list[str]:
     """Return the cells of a column as texts; a value that is not a number is an empty cell."""
     if column.dtype == bool:
         column = column.astype(int)

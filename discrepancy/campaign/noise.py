@@ -159,8 +159,8 @@ def record_at_rest(channel: Channel) -> FloatArray | None:
 def whiteness_is_tested(channel: Channel) -> bool:
     """Return whether the residuals of a channel must be white for a fit to be consistent.
 
-    They must be if the noise record passes the same tests of whiteness itself, or if there is no
-    record long enough to be tested. Residuals of a sensor with coloured noise cannot be white.
+    They must be white if the noise record passes the same tests of whiteness itself, or if there is
+    no record long enough to be tested. Residuals of a sensor with coloured noise cannot be white.
     The location of a discrepancy and the gate of absolute fit use this rule.
     """
     series = record_at_rest(channel)
@@ -359,7 +359,7 @@ def find_line(series: FloatArray) -> LineTest:
 def _autoregressive_spectrum(coefficients: FloatArray, count: int) -> FloatArray:
     """Return the power spectrum (M,) of an autoregression whose innovation has unit variance.
 
-    It is given at the frequencies of `periodogram` for `count` samples.
+    The spectrum is given at the frequencies of `periodogram` for `count` samples.
     """
     filter_response = np.fft.rfft(np.r_[1.0, -coefficients], count)
     return np.asarray(1.0 / np.abs(filter_response[1 : (count - 1) // 2 + 1]) ** 2)

@@ -138,7 +138,7 @@ def ljung_box(series: FloatArray, is_used: BoolArray | None = None) -> SeriesTes
 def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     """Return the sums of lagged products of samples, the unnormalised autocovariance.
 
-    They are computed by the fast Fourier transform (Wiener-Khinchin).
+    The sums are computed by the fast Fourier transform (Wiener-Khinchin).
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
 def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
     """Return mean, standard deviation and skewness of the Ljung-Box Q for white noise.
 
-    They are found by a simulation with a fixed seed.
+    All three are found by a simulation with a fixed seed.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
 def periodogram(series: FloatArray) -> FloatArray:
     """Return the ordinates |FFT|^2 / n of a series (n,) at the frequencies j / n, 0 < j < n / 2.
 
-    Their mean is the variance of the series.
+    The mean of the ordinates is the variance of the series.
     """
     count = series.size
     return np.asarray(np.abs(np.fft.rfft(series)[1 : (count - 1) // 2 + 1]) ** 2 / count)
@@ -309,7 +309,7 @@ def fisher_g(series: FloatArray) -> LineTest:
     """Test a series (n,) for a spectral line by Fisher's g (1929, Proc. R. Soc. A 125, 54-59).
 
     Of the sum for the p-value only the first term t = M (1 - g)^(M - 1) is used, for M ordinates,
-    as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
+    as 1 - exp(-t). The p-value is exact to first order where it is small, and never above one.
     """
     return largest_ordinate_test(periodogram(series))
 

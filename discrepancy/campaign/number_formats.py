@@ -64,7 +64,7 @@ def shown_number(value: float, number_format: str) -> ExactNumber:
 def _unit_of_number_format(number_format: str) -> tuple[str, int]:
     """Return the unit that a number format shows, and the power of ten by which it multiplies.
 
-    They are an empty text and 0 if the text behind the digits is not a unit.
+    If the text behind the digits is not a unit, the result is an empty text and 0.
     """
     match = _NUMBER_FORMAT.fullmatch(number_format.partition(";")[0])
     if match is None:

@@ -108,8 +108,8 @@ def assemble_campaign(
 ) -> Campaign:
     """Return the campaign that `campaign.toml` and its tables describe.
 
-    Its remarks are those of the file, and then those on how it was read, except for sentences that
-    the file has already.
+    The remarks of the campaign are those in the file, then those on how the file was read, except
+    for sentences that the file has already.
 
     Parameters
     ----------

@@ -207,7 +207,7 @@ class Trial(TrialKeys):
     def noise_deviation(self, channel: Channel) -> float:
         """Return the standard deviation of a channel's noise in this trial [channel's unit].
 
-        It is 0 if the channel has no noise record.
+        The result is 0 if the channel has no noise record.
         """
         if channel.noise is None:
             return 0.0
@@ -302,7 +302,7 @@ class Campaign:
     def accepted_faults(self, channel: str = "", trial: str = "") -> frozenset[str]:
         """Return the faults of data that the campaign accepts in a channel of a trial.
 
-        These are the faults that the keys `accept` of the campaign, the channel and the trial name.
+        Faults are accepted by the keys `accept` of the campaign, of the channel and of the trial.
 
         Parameters
         ----------

@@ -88,11 +88,11 @@ def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: 
 def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     """Undo the rounding of printed times: return an even grid if rounding explains the departures.
 
-    Times that were printed with few decimals are not evenly spaced even if the samples were. They
-    are replaced by the evenly spaced grid of least squares if they depart from an even grid by at
-    most one unit of the last printed decimal, plus `EVENNESS_TOLERANCE` intervals. The grid passes
-    through zero if the first time is zero. Times that are even to 1e-9 of the interval, and times
-    that rounding does not explain, are returned as they are.
+    Times that were printed with few decimals are not evenly spaced even if the samples were. Such
+    times are replaced by the evenly spaced grid of least squares if they depart from an even grid
+    by at most one unit of the last printed decimal, plus `EVENNESS_TOLERANCE` intervals. The grid
+    passes through zero if the first time is zero. Times that are even to 1e-9 of the interval, and
+    times that rounding does not explain, are returned as they are.
 
     Parameters
     ----------
@@ -156,9 +156,9 @@ def is_nearly_even(time: FloatArray) -> bool:
 def quantum_of(values: FloatArray) -> float:
     """Return the quantum of a sensor: the smallest step between two of its readings (N,).
 
-    It is the step of the lattice on which the readings repeat (`lattice_step`). If there is no such
-    lattice, it is the least difference between readings that rounding of printed decimals does not
-    explain. It is 0 if all readings are equal.
+    The quantum is the step of the lattice on which the readings repeat (`lattice_step`). If there
+    is no such lattice, the quantum is the least difference between readings that rounding of
+    printed decimals does not explain. The result is 0 if all readings are equal.
     """
     step = lattice_step(values)
     if step is not None:
@@ -205,9 +205,10 @@ def lattice_step(values: FloatArray) -> float | None:
 def least_beyond_rounding(differences: FloatArray) -> float:
     """Return the smallest positive difference that the rounding of printed decimals does not cause.
 
-    Rounding causes many differences that are far smaller than the true ones. They end at the first
-    gap in the sorted differences that exceeds the factor `ROUNDING_GAP`, if at least
-    `LEAST_ROUNDED` differences lie below this gap; otherwise no difference counts as rounding.
+    Rounding causes many differences that are far smaller than the true ones. These small
+    differences end at the first gap in the sorted differences that exceeds the factor
+    `ROUNDING_GAP`, if at least `LEAST_ROUNDED` differences lie below this gap; otherwise no
+    difference counts as rounding.
 
     Parameters
     ----------
@@ -232,8 +233,8 @@ def least_beyond_rounding(differences: FloatArray) -> float:
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
     """Return the remark for the user on trials whose samples are not evenly spaced.
 
-    It states the range of the intervals, and the widest gap if that exceeds 1.5 times the median
-    interval.
+    The remark states the range of the intervals, and the widest gap if that exceeds 1.5 times the
+    median interval.
 
     Parameters
     ----------

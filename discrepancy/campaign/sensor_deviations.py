@@ -59,9 +59,13 @@ class SensorDeviations:
         self.kinds = kinds
         self.decimals = decimals
         self._questionnaire = questionnaire
-        self.zeros = {column.head: self._zero(column) for column in self._columns_with_zero()}
+        self.zeros = {
+            column.head: self._ask_zero_deviation(column) for column in self._columns_with_zero()
+        }
         self.gains = {
-            column.head: self._gain(column.head) for column in columns if column.is_channel
+            column.head: self._ask_gain_deviation(column.head)
+            for column in columns
+            if column.is_channel
         }
 
     def _columns_with_zero(self) -> list[LaboratoryColumn]:
@@ -72,7 +76,7 @@ class SensorDeviations:
                 first_columns.setdefault(column.head, column)
         return [*first_columns.values()]
 
-    def _zero(self, column: LaboratoryColumn) -> float | str:
+    def _ask_zero_deviation(self, column: LaboratoryColumn) -> float | str:
         """Return the standard deviation of a channel's or input's zero [SI], or "free"."""
         default = ASSUMED_ZERO if column.is_channel else EXACT
         expected_answer = (
@@ -97,7 +101,7 @@ class SensorDeviations:
             largest = max(largest, float(np.max(np.abs(readings[is_counted]), initial=0.0)))
         return largest
 
-    def _gain(self, head: str) -> float | str:
+    def _ask_gain_deviation(self, head: str) -> float | str:
         """Return the relative standard deviation of a channel's gain, or "free"."""
         expected_answer = (
             f"how well its gain is known: a standard deviation such as 2%, {EXACT}, or {FREE} for "

@@ -409,8 +409,8 @@ def _columns_with_seconds(
 ) -> _ColumnsWithSeconds:
     """Return the columns of a layout, with seconds in place of its clock times.
 
-    A column of dates is joined to its column of times, or else left out. It stays only if it is the
-    one clock of the table, so that its dates increase.
+    A column of dates is joined to its column of times. Without such a column, the dates are kept if
+    they are the only clock of the table and increase, and left out otherwise.
     """
     cells_of_columns, times_of_dates = join_dates_with_times(
         columns_of_file, layout.head, units, places
@@ -499,11 +499,12 @@ def _matlab_sheet(path: Path) -> Sheet:
 def _text_rows(path: Path) -> tuple[Rows, str]:
     """Return the rows of a text file, and the separator of cells that makes the best table.
 
-    Tabs, semicolons and commas are tried on the first `_LINES_FOR_SEPARATOR` lines; see `merit`.
+    Tabs, semicolons and commas are tried on the first `_LINES_FOR_SEPARATOR` lines; `table_quality`
+    decides.
     """
     lines = read_text(path, CampaignFileError, otherwise="latin-1").splitlines()
 
-    def merit(separator: str) -> tuple[bool, bool, int]:
+    def table_quality(separator: str) -> tuple[bool, bool, int]:
         """Return how good a table a separator gives; a larger tuple is better.
 
         The entries are whether a table is found, whether no head is a number, and the number of
@@ -522,7 +523,7 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
             return False, False, numbers_minus_texts
         return True, not any(map(is_value, layout.head)), numbers_minus_texts
 
-    separator = max(SEPARATORS, key=merit)
+    separator = max(SEPARATORS, key=table_quality)
     return _split_rows(lines, separator, path.name), separator
 
 

@@ -60,8 +60,8 @@ def _rows_of_longer_clocks(
 
     A table may have several columns of times, each with the columns that were sampled at them, and
     these groups may differ in length. The body of the table ends with its first core column (see
-    `find_table`). If that column is one of the shorter ones, rows of the longer ones follow. They
-    end at the first row that has no time, or that has a text that is not a number.
+    `find_table`). If that column is one of the shorter ones, rows of the longer ones follow. These
+    rows end at the first row that has no time, or that has a text that is not a number.
 
     Parameters
     ----------
@@ -220,8 +220,8 @@ def _check_head_is_no_reading(
 ) -> None:
     """Raise an error if readings with a text among them stand just above the table.
 
-    They would pass for the row of names. A row counts as such if it has a number in the first core
-    column and in at least half of the core columns.
+    Such readings would pass for the row of names. A row counts as such if it has a number in the
+    first core column and in at least half of the core columns.
     """
     first_reading = first_row
     for index in range(first_row - 1, -1, -1):

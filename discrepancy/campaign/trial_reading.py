@@ -106,8 +106,8 @@ def _read_force(
 ) -> FloatArray:
     """Return the force [N], or torque [N m], in each row (N,) of a trial's table.
 
-    It is the column `force` of a static or forced trial, else the first force or torque among the
-    inputs, else zero.
+    The force is the column `force` of a static or forced trial, else the first force or torque
+    among the inputs, else zero.
     """
     # a static trial may be loaded by its inputs alone, and then needs no column of force
     reads_column = section.kind is TrialKind.FORCED or (

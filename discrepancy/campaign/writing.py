@@ -54,7 +54,7 @@ class _FileUnits:
     def in_unit(self, values: records.FloatArray, name: str, to_si: float) -> records.FloatArray:
         """Return values (N,) [SI] of a channel or input in its unit.
 
-        They are rounded to the digits of the files if `units` has the unit of this channel or
+        The values are rounded to the digits of the files if `units` has the unit of this channel or
         input.
 
         Parameters
@@ -128,7 +128,9 @@ def write_campaign(
         For the causes of `reporting.files.atomic_file`.
     """
     folder = Path(folder)
-    channel_units = {name: _unit(channel, si) for name, channel in campaign.channels.items()}
+    channel_units = {
+        name: _default_unit(channel, si) for name, channel in campaign.channels.items()
+    }
     file_units = _FileUnits(
         units=channel_units | dict(units or {}),
         digits=_EXACT_DIGITS if units is None else _SHOWN_DIGITS,
@@ -211,7 +213,7 @@ def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
     return columns
 
 
-def _unit(record: records.InTables, in_si: bool) -> str:
+def _default_unit(record: records.InTables, in_si: bool) -> str:
     """Return the unit in which a channel or input is written if the user states none."""
     if usual_name(record.unit) in NEVER_CONVERTED:
         return usual_name(record.unit)
@@ -221,7 +223,7 @@ def _unit(record: records.InTables, in_si: bool) -> str:
 
 def _input_unit(recorded_input: records.RecordedInput, file_units: _FileUnits) -> str:
     """Return the unit in which an input is written."""
-    return file_units.units.get(recorded_input.name) or _unit(recorded_input, in_si=True)
+    return file_units.units.get(recorded_input.name) or _default_unit(recorded_input, in_si=True)
 
 
 def _noise_interval(campaign: records.Campaign) -> float | None:

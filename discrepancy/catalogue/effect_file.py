@@ -367,8 +367,8 @@ def _parse_primitive(
 def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> None:
     """Raise an error if a primitive lacks a value.
 
-    It is built with the number one in the place of each expression, which raises if a value is
-    missing.
+    The primitive is built with the number one in the place of each expression, which raises an
+    error if a value is missing.
     """
     row: dict[str, str | float] = {}
     for key, value in values.items():

@@ -45,9 +45,9 @@ VARIABLES: tuple[Variable, ...] = ("displacement", "velocity")
 def curve_functions(correlation_length: float) -> FloatArray:
     """Return the K functions (P, K) of the expansion of a curve with unit variance at P points.
 
-    They are the eigenvectors of the squared exponential covariance, largest variance first, each
-    multiplied by the prior standard deviation of its amplitude. Those with less than
-    `NEGLECTED_VARIANCE` of the total variance are left out.
+    The functions are the eigenvectors of the squared exponential covariance, largest variance
+    first, each multiplied by the prior standard deviation of its amplitude. Functions with less
+    than `NEGLECTED_VARIANCE` of the total variance are left out.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def curve_functions(correlation_length: float) -> FloatArray:
 def curve_points(variable: Variable, low: float, high: float) -> FloatArray:
     """Return the points (P,) of a curve between two ends.
 
-    They are evenly spaced for displacements, and dense around zero for velocities; see
+    The points are evenly spaced for displacements, and dense around zero for velocities; see
     `DENSE_VELOCITY`.
     """
     if variable == "displacement":

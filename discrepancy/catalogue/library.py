@@ -160,8 +160,8 @@ def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Eff
 def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
     """Return whether an effect can be limited to windows of time with this model.
 
-    It must act in dynamic trials, have no windows of its own, and consist of primitives that allow
-    windows. The model must switch laws in time, unless the effect concerns sensors only.
+    The effect must act in dynamic trials, have no windows of its own, and consist of primitives
+    that allow windows. The model must switch laws in time, unless the effect concerns sensors only.
     """
     places = effect.places(setting)
     if not places or not effect.acts_on & DYNAMIC:
@@ -201,8 +201,8 @@ def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effe
 def with_prior_weights(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return the effects that are compared, with prior weights by their stated frequencies.
 
-    An effect without a frequency keeps its weight. Those with a frequency have, in total, the
-    weight of the same number of effects without one. It is divided among kinds by their
+    An effect without a frequency keeps its weight. The effects with a frequency have, in total, the
+    weight of the same number of effects without one. This total is divided among kinds by their
     frequencies, and within a kind evenly among the effect and its variants in events.
     """
     frequencies: dict[str, float] = {}  # by kind, as the counts

@@ -93,9 +93,9 @@ def _is_held(context: BuildContext) -> float:
 def _holding_force(context: BuildContext) -> float:
     """Return the largest friction force at a port that does not hold the port still.
 
-    It is `LARGEST_SHARE` of the elastic force at the port's natural displacement. There is no limit
-    (infinity) for a force that vanishes at rest (a velocity exponent of one or more), for a port
-    that a drive moves, or if the stiffness at rest is not known.
+    This force is `LARGEST_SHARE` of the elastic force at the port's natural displacement. There is
+    no limit (infinity) for a force that vanishes at rest (a velocity exponent of one or more), for
+    a port that a drive moves, or if the stiffness at rest is not known.
     """
     port = context.port
     vanishes_at_rest = context.values["velocity_exponent"] >= 1.0
@@ -120,7 +120,8 @@ def _port_scale(name: str, fallback: str) -> Callable[[BuildContext], float]:
 def _largest_reading(context: BuildContext) -> float:
     """Return the largest absolute reading that is used at the place [its unit]; 1 if all are zero.
 
-    It is computed once and kept in the setting, because a fit builds patches at every step.
+    The reading is computed once and kept in the setting, because a fit builds patches at every
+    step.
     """
     cached_readings = context.setting.largest
     key = (context.target, context.effect.section.acts_on)
@@ -133,8 +134,8 @@ def _largest_reading(context: BuildContext) -> float:
 def _compute_largest_reading(context: BuildContext) -> float:
     """Return the largest absolute reading of the channels on which an effect acts.
 
-    It has the unit of the channels, and is 0 if they have no reading. Readings that are marked as
-    not used are left out.
+    The result has the unit of the channels, and is 0 if they have no reading. Readings that are
+    marked as not used are left out.
     """
     target = context.target
     target_channels: tuple[str, ...] = (target.name,)
@@ -162,7 +163,8 @@ def _sampling_interval(context: BuildContext) -> float:
 def _largest_release(context: BuildContext) -> float:
     """Return the largest release displacement of the fitted trials that record the channel [m].
 
-    Its unit is V or none if that is the unit of the release. It is 1 if no such trial has one.
+    Its unit is V or none if that is the unit of the release. The result is 1 if no such trial has a
+    release.
     """
     releases = [
         abs(trial.release.displacement)

@@ -64,12 +64,14 @@ def frequency_faults(
                 frequencies.append(nearest)
         if trials:
             frequency = float(np.median(frequencies))
-            sentence = _sentence(trials, frequency, model_name, model_frequency)
+            sentence = _frequency_sentence(trials, frequency, model_name, model_frequency)
             trial_of_fault = trials[0] if len(trials) == 1 else ""
             yield DataFault(FaultKind.FREQUENCY, sentence, trial=trial_of_fault)
 
 
-def _sentence(trials: list[str], frequency: float, model_name: str, model_frequency: float) -> str:
+def _frequency_sentence(
+    trials: list[str], frequency: float, model_name: str, model_frequency: float
+) -> str:
     """Return the message that ring-downs do not have the model's frequency [Hz]."""
     noun = "trial" if len(trials) == 1 else "trials"
     verb = "oscillates" if len(trials) == 1 else "oscillate"
@@ -115,8 +117,8 @@ def _frequency_range(trial: Trial) -> _FrequencyRange | None:
 def dominant_frequency(time: FloatArray, values: FloatArray) -> float | None:
     """Return the frequency [Hz] at which a record oscillates; None if it does not clearly.
 
-    It is the peak of the periodogram with a Hann window. At least half of the power must lie around
-    the peak, and the record must have three periods, with four samples in each.
+    The frequency is the peak of the periodogram with a Hann window. At least half of the power must
+    lie around the peak, and the record must have three periods, with four samples in each.
 
     Parameters
     ----------

@@ -252,8 +252,8 @@ def _other_movement(
     """Return whether other records (N, K) move during a run, compared with windows around the run.
 
     A record moves if its range within the run exceeds `_RANGE_OF_MOVING_RECORD` times its median
-    range within the windows, which are as long as the run and begin at `window_starts`. It rests if
-    its range is less than `_RANGE_OF_RESTING_RECORD` times that.
+    range within the windows, which are as long as the run and begin at `window_starts`. A record
+    rests if its range is less than `_RANGE_OF_RESTING_RECORD` times that.
     """
     length = stop - start
     ranges = [
@@ -288,9 +288,9 @@ def _quantum_in_time(values: FloatArray) -> float:
 def update_length(values: FloatArray) -> float:
     """Return how many samples a logger usually takes of each reading of a slower sensor.
 
-    The result is the median length of the runs of equal readings. It is 1 if the readings are
-    multiples of a resolution, because a reading then repeats for another reason, and also if there
-    are fewer than two changes.
+    The result is the median length of the runs of equal readings. The length is 1 if the readings
+    are multiples of a resolution, because a reading then repeats for another reason, and also if
+    there are fewer than two changes.
 
     Parameters
     ----------

@@ -100,7 +100,7 @@ def even_weights(width: int, degree: int) -> FloatArray:
     """Return the weights (2 width + 1,) of a sample's neighbourhood in the residual of the sample.
 
     The residual is the sample minus a polynomial of least squares through its neighbours, without
-    the sample itself. It equals the residual of the Savitzky-Golay filter, whose polynomial also
+    the sample itself. This residual equals that of the Savitzky-Golay filter, whose polynomial also
     fits the sample, divided by the weight of the sample in that residual (one minus its leverage).
     """
     weights = -savgol_coeffs(2 * width + 1, degree)

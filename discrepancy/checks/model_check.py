@@ -39,12 +39,12 @@ LARGEST_DEVIATION_RATIO = 0.9
 def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, float]:
     """Return the posterior over the prior standard deviation of each calibrated parameter.
 
-    It is 0 if the records determine a parameter exactly, and 1 if they do not depend on it. The
-    posterior is that of the linearised model, from the information matrix of the fitted trials at
-    the prior mean. Gains, zeros, initial states, constants of inputs and all parameters are unknown
-    at the same time, so that a parameter counts as undetermined if others can explain the same
-    readings. Unknown initial states are fitted first, because a model at rest does not depend on
-    any parameter.
+    The ratio is 0 if the records determine a parameter exactly, and 1 if they do not depend on it.
+    The posterior is that of the linearised model, from the information matrix of the fitted trials
+    at the prior mean. Gains, zeros, initial states, constants of inputs and all parameters are
+    unknown at the same time, so that a parameter counts as undetermined if others can explain the
+    same readings. Unknown initial states are fitted first, because a model at rest does not depend
+    on any parameter.
 
     Returns
     -------
@@ -73,7 +73,8 @@ def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, flo
 def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     """Yield one fault that names the calibrated parameters that the records do not determine.
 
-    Those keep more than `LARGEST_DEVIATION_RATIO` of their prior standard deviation.
+    A parameter is named if its posterior standard deviation is more than `LARGEST_DEVIATION_RATIO`
+    of its prior one.
     """
     ratios = posterior_to_prior_ratios(campaign, model)
     undetermined = {
@@ -180,8 +181,9 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     The key `hold` of a campaign states whether an input is smooth, linear or constant between its
     samples. For inputs without this key, the model's response to straight lines is compared with
     its response to smooth curves. The fault is reported if the two differ by more than
-    `LEAST_REPORTED_CHANGE` times the noise (rms) in any channel with a noise record. It limits the
-    conclusions, but does not make the data wrong. Only forced and driven trials have such inputs.
+    `LEAST_REPORTED_CHANGE` times the noise (rms) in any channel with a noise record. The fault
+    limits the conclusions, but does not make the data wrong. Only forced and driven trials have
+    such inputs.
     """
     if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or len(trial.time) < 4:
         return
@@ -291,9 +293,10 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
 def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> Iterator[DataFault]:
     """Yield a fault for each channel that is constant in a trial at rest, but should change.
 
-    Its prediction, (N, C) by the name of the trial, changes by more than `CLEAR_NOISE_DEVIATIONS`
-    times the noise or the sensor's quantum. `check_data` reports, without a model, the channels
-    that are constant in a dynamic trial or in all their trials.
+    Such a channel has a prediction, a column of `predictions` (N, C) of its trial, that changes by
+    more than `CLEAR_NOISE_DEVIATIONS` times the noise or the sensor's quantum. `check_data`
+    reports, without a model, the channels that are constant in a dynamic trial or in all their
+    trials.
     """
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):

@@ -182,8 +182,8 @@ def sample_outliers(
 def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
     """Return the local polynomial that predicts the samples of a record (N,) best.
 
-    It has the least robust scatter of residuals among `_WIDTHS_AND_DEGREES`, of which those are
-    tried that the record is long enough for. Uneven samples have weights for `LOW_DEGREE` alone.
+    The best one has the least robust scatter of residuals. Those of `_WIDTHS_AND_DEGREES` are tried
+    that the record is long enough for. Uneven samples have weights for `LOW_DEGREE` alone.
     """
     polynomials = []
     for width, degree in _WIDTHS_AND_DEGREES:
@@ -293,9 +293,9 @@ def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
 
     A sample is suspect if its residual is more than twice as large as those of its two neighbours
     on either side, and differs from their median by more than `WRONG_END_RATIO` standard
-    deviations: those of the noise, or of such differences near this end, whichever are larger. It
-    is wrong if it is the only suspect sample of its end. Several are a release or an impact, and
-    none of them is wrong.
+    deviations: those of the noise, or of such differences near this end, whichever are larger. The
+    reading is wrong if it is the only suspect sample of its end. Several suspect samples are a
+    release or an impact, and none of them is wrong.
 
     Parameters
     ----------
@@ -349,8 +349,8 @@ def _robust_scatter(residual: FloatArray) -> float:
 def _comparison_deviation(residual: FloatArray, least_deviation: float) -> FloatArray:
     """Return the robust standard deviation (N,) that each residual (N,) is compared with.
 
-    It is that of the whole record or that of the `_HALF_WINDOW` samples on either side, whichever
-    is larger, and at least `least_deviation`. The unjudged edges do not count.
+    The deviation is that of the whole record or that of the `_HALF_WINDOW` samples on either side,
+    whichever is larger, and at least `least_deviation`. The unjudged edges do not count.
     """
     scatter_of_record = max(_robust_scatter(residual), least_deviation, LEAST_DIVISOR)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])

@@ -130,11 +130,11 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 def _contradicting_roughness(campaign: Campaign, record: NoiseRecord, name: str) -> Iterator[float]:
     """Yield the roughness of each dynamic record of a channel that is too smooth for its noise.
 
-    It is too smooth if its roughness (`estimate_roughness`) is less than half of the one expected.
-    At the sampling interval of the noise record, this is the roughness of the noise record. At
-    another interval, or without samples of noise, the noise may be slow, and is taken as smooth as
-    `SLOW_NOISE_ROUGHNESS` says. The test is one-sided: a fast motion may make a record rougher than
-    its noise.
+    A record is too smooth if its roughness (`estimate_roughness`) is less than half of the one
+    expected. At the sampling interval of the noise record, this is the roughness of the noise
+    record. At another interval, or without samples of noise, the noise may be slow, and is taken as
+    smooth as `SLOW_NOISE_ROUGHNESS` says. The test is one-sided: a fast motion may make a record
+    rougher than its noise.
     """
     slow_roughness = SLOW_NOISE_ROUGHNESS * record.standard_deviation
     recorded_roughness = slow_roughness
@@ -255,9 +255,9 @@ def _is_clipped_over_load(
 ) -> bool:
     """Return whether a line through all other readings at rest exceeds a run of equal readings.
 
-    It must do so by 1.5 quanta plus six standard deviations of the scatter about the line, and the
-    run must span three different loads. Readings and loads (N,) are in the order of load, and the
-    run goes from the index `start` to the one before `stop`.
+    The line must exceed the run by 1.5 quanta plus six standard deviations of the scatter about the
+    line, and the run must span three different loads. Readings and loads (N,) are in the order of
+    load, and the run goes from the index `start` to the one before `stop`.
     """
     run = slice(start, stop)
     loads_of_run = load[run]

@@ -86,7 +86,7 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
     """Return the phrase about a vibration at a mode's frequency in a noise record, or None.
 
     A vibration is a spectral line within `RELATIVE_HALF_BAND` of the frequency that has more than
-    `LARGEST_LINE_SHARE` of the variance. It is not looked for if the record has fewer than
+    `LARGEST_LINE_SHARE` of the variance. A vibration is not looked for if the record has fewer than
     `LEAST_PERIODS` periods, or if the frequency is near one of the mains.
 
     Parameters

@@ -29,7 +29,7 @@ def repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArray
     -------
     dict of str to (N,) ndarray of bool
         Which rows are outliers, by the name of the trial. Trials that were done less often are not
-        in it. It is empty if the channel has no noise record.
+        in it. The mapping is empty if the channel has no noise record.
     """
     outliers: dict[str, BoolArray] = {}
     if channel.noise is None:

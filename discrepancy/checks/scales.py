@@ -90,7 +90,8 @@ def _largest_amplitudes(
 def _amplitude(values: FloatArray, trial: Trial) -> float:
     """Return the amplitude of readings (N,) in a trial.
 
-    It is the root mean square about the median for a dynamic trial, else the largest magnitude.
+    The amplitude is the root mean square about the median for a dynamic trial, else the largest
+    magnitude.
     """
     if len(values) == 0:
         return 0.0
@@ -104,11 +105,11 @@ def _static_scale(
 ) -> float:
     """Return the ratio of readings at rest to their prediction; 0 if it is not determined.
 
-    It is the median of the slopes over all pairs of rows. If all rows have nearly the same load, it
-    is the ratio of the median reading to the median prediction. It is not determined if the
-    readings are within the noise or the uncertainty of the zero, if the pairs of rows disagree in
-    the sign of the slope, or if the slope is negative while the readings have the sign of the
-    prediction: another cause, such as temperature, then dominates.
+    The ratio is the median of the slopes over all pairs of rows (Theil-Sen). If all rows have
+    nearly the same load, it is the median reading over the median prediction. The ratio is not
+    determined if the readings are within the noise or the uncertainty of the zero, if the pairs of
+    rows disagree in the sign of the slope, or if the slope is negative while the readings have the
+    sign of the prediction: another cause, such as temperature, then dominates.
 
     Parameters
     ----------
@@ -175,8 +176,8 @@ def _dynamic_scale(
 def sign_of_release(readings: FloatArray, predicted_readings: FloatArray, trial: Trial) -> float:
     """Return -1 if a channel's readings start on the opposite side of their prediction, else 1.
 
-    It is also 1 for a trial that is not a ring-down from rest, whose phase the model need not
-    predict.
+    The result is also 1 for a trial that is not a ring-down from rest, whose phase the model need
+    not predict.
 
     Parameters
     ----------

@@ -207,7 +207,8 @@ def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
 def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> Slip | None:
     """Return the slip of a channel's unit that explains its ratios of data to model, or None.
 
-    It explains their median, and each of them within twice its tolerance (of the logarithm).
+    The slip must explain the median of the ratios, and each single ratio within twice the tolerance
+    of the slip (of the logarithm).
     """
     channel = campaign.channels[name]
     slip = find_slip(median(map(abs, scales)), channel.quantity, channel.unit)
@@ -239,7 +240,7 @@ def _channel_faults(
 ) -> Iterator[DataFault]:
     """Yield the fault of a channel whose readings have a wrong unit in the given trials.
 
-    It may be a doubt or nothing; see `_grade_slip`.
+    Without sufficient evidence the fault is a doubt, or there is none; see `_grade_slip`.
     """
     channel = campaign.channels[name]
     first_trial = trials[0]

@@ -125,7 +125,7 @@ class FmuAtRest(IdentifiedFmu):
     def _static_gain(self, state: OperatingPoint, names: tuple[str, ...]) -> FloatArray | None:
         """Return the change (C, E) of the outputs at rest by unit loads; None if it is not known.
 
-        It is that of the linear system which is identified from the responses of the FMU.
+        The change is that of the linear system which is identified from the responses of the FMU.
         """
         system = self.linear_system(self._excitation_to_rest(state, names))
         return None if system is None else system.gain

@@ -120,9 +120,9 @@ class IdentifiedFmu(FmuRuns):
     def _check_parameters(self) -> None:
         """Raise an error if the FMU does not allow a value that the file may set.
 
-        These are the bounds of calibrated parameters, the switches of effects, and the parameters
-        of trials at rest and in motion. A bound outside the range of an FMU parameter would cut off
-        the posterior.
+        The checked values are the bounds of calibrated parameters, the switches of effects, and the
+        parameters of trials at rest and in motion. A bound outside the range of an FMU parameter
+        would cut off the posterior.
         """
         description = self.description
         settings: list[Mapping[str, float]] = []
@@ -139,7 +139,8 @@ class IdentifiedFmu(FmuRuns):
     def _find_release_variables(self) -> list[str]:
         """Return the variables that the file names in [release], which begin a ring-down.
 
-        They are the parameters of displacement and velocity, and the input of a holding force.
+        These variables are the parameters of displacement and velocity, and the input of a holding
+        force.
         """
         release = self.description.release
         if release is None:
@@ -186,9 +187,10 @@ class IdentifiedFmu(FmuRuns):
         """Return the FMU as a linear system; None if it is not linear.
 
         The system is identified from the responses to single forces and releases. The FMU is linear
-        if such a system exists, and predicts the response to all of them together. This prediction
-        is tested once for a set of inputs and releases, at the first operating point. The result is
-        also None if the file forbids superposition, or if there is nothing to excite the FMU.
+        if such a system exists, and predicts the response to all forces and releases together. This
+        prediction is tested once for a set of inputs and releases, at the first operating point.
+        The result is also None if the file forbids superposition, or if there is nothing to excite
+        the FMU.
         """
         has_excitation = bool(excitation.inputs or excitation.releases)
         if not self.description.superposition or not has_excitation:
@@ -399,7 +401,8 @@ class IdentifiedFmu(FmuRuns):
     ) -> FloatArray:
         """Return the state (n,) at the start of a trial.
 
-        It is the released state, plus equilibrium under the recorded force at the first sample.
+        The state is the released one, plus the equilibrium under the recorded force at the first
+        sample.
         """
         start: FloatArray = system.release_states @ np.array([*release_values.values()])
         first_force = excitation.first_force
@@ -440,8 +443,8 @@ class IdentifiedFmu(FmuRuns):
     def _probing_excitation(self, trial: Trial, state: OperatingPoint) -> FmuExcitation:
         """Return the excitation that shows the modes of the FMU at the sampling of a trial.
 
-        It has a force at each port; without ports, a release; without both, a load on the first
-        input, since any input shows how fast the FMU moves.
+        The excitation has a force at each port; without ports, a release; without both, a load on
+        the first input, since any input shows how fast the FMU moves.
         """
         inputs = tuple(dict.fromkeys(self.port_inputs))
         releases = {}
@@ -459,8 +462,8 @@ class IdentifiedFmu(FmuRuns):
         """Return the system identified at a step that samples all modes without aliasing.
 
         The step is halved until no mode turns by more than `LARGEST_MODE_PHASE` in it, and the
-        system also predicts the FMU at half the step. This ends early if the FMU is not linear, has
-        a fixed step, or if the sampling interval has more than `MOST_PARTS` parts.
+        system also predicts the FMU at half the step. The halving ends early if the FMU is not
+        linear, has a fixed step, or if the sampling interval has more than `MOST_PARTS` parts.
         """
         fixed_step = self.description.motion.step
         parts = 1

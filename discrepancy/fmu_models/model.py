@@ -188,7 +188,7 @@ class FmuModel(DescribedModel):
     def _port_stiffnesses(self, campaign: Campaign, conditions: Conditions) -> list[PortStiffness]:
         """Return the modal and the static stiffness of each port.
 
-        They are those of the linear system in the first dynamic trial, if there is such a trial and
+        Both are those of the linear system in the first dynamic trial, if there is such a trial and
         the FMU is linear in it. Otherwise the static stiffness is returned as the modal one too.
         """
         static_trial = first_trial(campaign, is_dynamic=False)
@@ -221,8 +221,9 @@ class FmuModel(DescribedModel):
     def _first_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
         """Return the angular frequency of the first mode [rad/s].
 
-        It is that of the file, or else that of the FMU in the first dynamic trial. In a campaign
-        of trials at rest it is 1. Without trials it is that of a simulated ring-down.
+        The frequency is that of the file, or else that of the FMU in the first dynamic trial. In a
+        campaign of trials at rest the result is 1 rad/s. Without trials the frequency is that of a
+        simulated ring-down.
         """
         frequency = self.description.scales.angular_frequency
         if frequency:
@@ -296,8 +297,8 @@ class FmuModel(DescribedModel):
     ) -> SampledOutputs:
         """Return outputs of the FMU in a dynamic trial, and their rates.
 
-        They are read at the times of the samples with the clock error of `conditions`; each
-        interval between them is divided into `parts`.
+        The outputs are read at the times of the samples with the clock error of `conditions`; each
+        interval between samples is divided into `parts`.
         """
         laws = self._laws_at_ports(patch)
         times = subdivide(conditions.motion_times(trial.time), parts)
@@ -468,8 +469,8 @@ class FmuModel(DescribedModel):
     def _force_factors(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
         """Return the factor of the recorded force on each input of the FMU, by variable name.
 
-        It is 1 for the force input of the load place. If a patch moves the load, the inputs of
-        bending moment and torque have its distances along the span and the chord [m] as factors.
+        The factor is 1 for the force input of the load place. If a patch moves the load, the inputs
+        of bending moment and torque have its distances along the span and the chord [m] as factors.
         Raises `ModelError` if a load moves along the chord of an FMU without an input of torque.
         """
         inputs = self.description.inputs

@@ -68,7 +68,7 @@ def first_trial(campaign: Campaign, *, is_dynamic: bool) -> Trial | None:
 def trial_without_readings(kind: TrialKind, interval: float) -> Trial:
     """Return a trial without readings, for scales without a campaign.
 
-    It has one row if it is static, else 400 samples at the interval [s].
+    The trial has one row if it is static, else 400 samples at the interval [s].
     """
     count = 1 if kind is TrialKind.STATIC else 400
     return Trial.plain("", kind, (), interval * np.arange(float(count)))

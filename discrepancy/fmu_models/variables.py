@@ -141,7 +141,8 @@ class FmuVariables:
     ) -> dict[str, ParameterBinding]:
         """Return the parameters of the model that the binding lacks, or has in another unit.
 
-        These are rebound in the unit of the model, without a value and a range of the binding.
+        Each of them is bound in the unit of the model; a value and a range that the binding states
+        are dropped.
         """
         description = self._description
         units: dict[str | None, str] = {

@@ -141,8 +141,8 @@ class BackbonePoint(NamedTuple):
     def is_credible(self, start: float) -> bool:
         """Return whether the mode still rings, at a frequency close to its start value [rad/s].
 
-        Its amplitude must exceed `LEAST_AMPLITUDE` standard errors, its frequency must be within
-        30 % of the start value, and its damping ratio below 0.5.
+        The amplitude of the mode must exceed `LEAST_AMPLITUDE` standard errors, its frequency must
+        be within 30 % of the start value, and its damping ratio below 0.5.
         """
         change = abs(2.0 * np.pi * self.frequency / start - 1.0)
         is_above_error = self.amplitude > LEAST_AMPLITUDE * self.amplitude_error
@@ -164,9 +164,10 @@ def _points_of_window(
 ) -> list[BackbonePoint]:
     """Return amplitude, frequency and damping of each mode in a window, with standard errors.
 
-    They belong to the centroid of the mode's energy in time, because a mode that decays quickly is
-    visible mainly at the start of the window. Times (N,) count from the start of the window [s].
-    Standard errors are those for the given noise, or for the residuals of the window if it is None.
+    The values belong to the centroid of the mode's energy in time, because a mode that decays
+    quickly is visible mainly at the start of the window. Times (N,) count from the start of the
+    window [s]. Standard errors are those for the given noise, or for the residuals of the window if
+    it is None.
     """
     residual_deviation = float(solution.deviation[0])
     deviation = residual_deviation if noise_deviation is None else noise_deviation

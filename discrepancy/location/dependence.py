@@ -58,7 +58,7 @@ def modal_motion(
     -------
     (K, N, C) ndarray
         Analytic signal x - i v / w of each mode, with displacement x, rate v and angular frequency
-        w. Its modulus is the amplitude of the mode at each time.
+        w. The modulus of the signal is the amplitude of the mode at each time.
     """
     count = len(values)
     mirrored_motion = np.concatenate([values[:0:-1], values, values[-2::-1]])  # (3 N - 2, C)
@@ -113,10 +113,10 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     """Return the frequencies [Hz] of up to four modes, from the spectra of the predictions.
 
     The modes are the highest peaks, sorted by frequency. A peak is the largest ordinate within a
-    factor of 1.4 in frequency on both sides, and at least a thousandth of the largest of all. It
-    has at least four periods in the record, because a wrong zero or a slow decay looks like a peak
-    at lower frequencies. Spectra are summed over the channels and over those trials that are as
-    long and as finely sampled as the longest one.
+    factor of 1.4 in frequency on both sides, and at least a thousandth of the largest of all. A
+    peak has at least four periods in the record, because a wrong zero or a slow decay looks like a
+    peak at lower frequencies. Spectra are summed over the channels and over those trials that are
+    as long and as finely sampled as the longest one.
     """
     longest_trial = max(trials, key=lambda fitted_trial: len(fitted_trial.trial.time)).trial
     count = len(longest_trial.time)
@@ -179,7 +179,7 @@ class Dependence(NamedTuple):
 def excess_over_noise(trials: Sequence[FittedTrial]) -> float:
     """Return the excess variance of trials, in units of the noise variance.
 
-    It is the sum of squares of their residuals minus its expectation if the model is right.
+    The excess is the sum of squares of the residuals minus its expectation if the model is right.
     """
     total_excess = 0.0
     for fitted_trial in trials:
@@ -191,7 +191,7 @@ def excess_over_noise(trials: Sequence[FittedTrial]) -> float:
 def _hat_functions(values: FloatArray, low: float, high: float) -> FloatArray:
     """Return hat functions, the basis of piecewise linear functions, at values (n,).
 
-    Their knots are evenly spaced from `low` to `high`.
+    The knots are evenly spaced from `low` to `high`.
 
     Returns
     -------
@@ -311,8 +311,8 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
 
     The sum of squares that a decaying sine explains is computed for the frequencies of a Fourier
     transform with four-fold zero padding, from one period in the record upwards, and for decays by
-    0, 1, 3, 10 and 30 e-folds within the record. It is summed over all channels. The result is None
-    for records of fewer than eight samples.
+    0, 1, 3, 10 and 30 e-folds within the record. The explained sum of squares is summed over all
+    channels. The result is None for records of fewer than eight samples.
     """
     length = max(len(fitted_trial.trial.time) for fitted_trial in trials)
     interval = trials[0].trial.interval
@@ -482,9 +482,10 @@ def _dynamic_bases(
 ) -> dict[tuple[str, str], FloatArray]:
     """Return the functions (n, k) of each dependence of dynamic records, by subject and name.
 
-    They are a drift of the zero (Legendre polynomials of time), the predicted displacement x and
-    speed v, and their harmonics. For each mode, its predicted motion is multiplied by hat functions
-    of its amplitude or of time, in phase and a quarter of a period out of phase.
+    The dependences are a drift of the zero (Legendre polynomials of time), the predicted
+    displacement x and speed v, and their harmonics. For each mode, its predicted motion is
+    multiplied by hat functions of its amplitude or of time, in phase and a quarter of a period out
+    of phase.
     """
     bases: dict[tuple[str, str], FloatArray] = {}
     relative_time = samples.stack_used_samples(

@@ -193,8 +193,8 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     """Return the remark on isolated outliers among the residuals, which may be errors of the data.
 
     An outlier exceeds six standard deviations of the noise and of the residuals themselves, because
-    the residuals of a wrong model are large at many samples. It is isolated if both neighbours are
-    less than half as large. Samples next to a gap are not judged.
+    the residuals of a wrong model are large at many samples. An outlier is isolated if both
+    neighbours are less than half as large. Samples next to a gap are not judged.
 
     Returns
     -------

@@ -142,9 +142,9 @@ def _covariance_of_projection(equations: Sequence[NormalEquations]) -> FloatArra
 def motion_envelope(fitted_trial: FittedTrial, column: int) -> FloatArray:
     """Return the amplitude of a channel's predicted motion at each sample of a dynamic trial.
 
-    It is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the rate v,
-    averaged over one period. The angular frequency w is the rms of v over the rms of x, as it is
-    for a harmonic motion. If nothing moves, it is |x|.
+    The amplitude is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the
+    rate v, averaged over one period. The angular frequency w is the rms of v over the rms of x, as
+    it is for a harmonic motion. If nothing moves, the amplitude is |x|.
 
     Parameters
     ----------
@@ -250,8 +250,8 @@ def _add_projected_function(
 ) -> None:
     """Add a function to `functions`, in place, after it was made orthogonal to a basis.
 
-    It is not added if less than 1e-6 of the norm of one of its columns remains. The function has k
-    columns (n, k), and the columns of the basis (n, b) are orthonormal.
+    The function is not added if less than 1e-6 of the norm of one of its columns remains. The
+    function has k columns (n, k), and the columns of the basis (n, b) are orthonormal.
     """
     projected_columns = columns - basis @ (basis.T @ columns)
     norms = np.linalg.norm(columns, axis=0)
@@ -479,10 +479,10 @@ def _test_dependence(
     Returns
     -------
     Cell or None
-        The cell with the p-value of the test. Its value is the correlation coefficient of residuals
-        and function; for a constant function, the mean residual. None if the fit has already
-        removed a component of the function from the residuals, if a component is zero everywhere,
-        or if there are as many components as samples.
+        The cell with the p-value of the test. The value of the cell is the correlation coefficient
+        of residuals and function; for a constant function, the mean residual. None if the fit has
+        already removed a component of the function from the residuals, if a component is zero
+        everywhere, or if there are as many components as samples.
     """
     equations = normal_equations_of(function_values, ((fitted_trial, is_used),), column)
     if equations is None:

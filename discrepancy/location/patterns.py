@@ -111,12 +111,13 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
     """Return the significant patterns of residuals over the channels, largest first.
 
     A pattern is a right singular vector of the matrix of white residuals (samples x channels, in
-    units of the noise). Its p-value is that of the largest singular value of a noise matrix of this
-    size. The square of that value has the law of Tracy and Widom (Johnstone 2001, Ann. Statist. 29,
-    295-327), approximated by a shifted gamma distribution with the same moments (Chiani 2014,
-    J. Multivar. Anal. 129, 69-81). The p-value is averaged over the error of the noise records,
-    because a channel whose noise was underestimated looks like a pattern. At most `MOST_PATTERNS`
-    are returned, up to the first with a p-value above `PATTERN_LEVEL`.
+    units of the noise). The p-value of a pattern is that of its singular value as the largest one
+    of a noise matrix of this size. The squared largest singular value of noise has the law of Tracy
+    and Widom (Johnstone 2001, Ann. Statist. 29, 295-327), approximated by a shifted gamma
+    distribution with the same moments (Chiani 2014, J. Multivar. Anal. 129, 69-81). The p-value is
+    averaged over the error of the noise records, because a channel whose noise was underestimated
+    looks like a pattern. At most `MOST_PATTERNS` are returned, up to the first with a p-value above
+    `PATTERN_LEVEL`.
 
     Parameters
     ----------
@@ -243,9 +244,9 @@ def _known_patterns(
 ) -> Iterator[tuple[_PatternMeaning, FloatArray]]:
     """Yield the patterns over C channels that have a known meaning, with this meaning.
 
-    They are one channel alone, the same physical value in all channels (if all measure the same
-    quantity), and the main pattern of the predicted motion, which is zero if the predictions are
-    zero.
+    Known patterns are one channel alone, the same physical value in all channels (if all measure
+    the same quantity), and the main pattern of the predicted motion, which is zero if the
+    predictions are zero.
 
     Parameters
     ----------

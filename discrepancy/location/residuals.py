@@ -296,8 +296,8 @@ class ResidualSet:
 def without_coloured_records(residuals: ResidualSet) -> ResidualSet:
     """Return the set without the records whose coloured noise cannot be whitened.
 
-    They stay in it with all samples marked as not used. Correlated noise in them would be taken for
-    a discrepancy of the model.
+    These records stay in the set, with all samples marked as not used. Correlated noise in them
+    would be taken for a discrepancy of the model.
     """
     noise = {name: noise_model(channel, 1.0) for name, channel in residuals.channels.items()}
     trials = []

@@ -235,7 +235,7 @@ def _no_steps_message(folder: Path, run: xr.DataTree, steps: slice) -> str:
 def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     """Return the model that the twin of a run used.
 
-    It includes the whole patch of the twin's model, also primitives of sensors, which act in
+    The model includes the whole patch of the twin's model, also primitives of sensors, which act in
     `discrepancy.system.sensing.observe`.
 
     Parameters
@@ -394,7 +394,8 @@ def _temperature_rises(run: xr.DataTree, steps: slice) -> records.FloatArray | N
 def _strain_noise(scenario: JsonObject) -> tuple[float, str]:
     """Return the standard deviation of a strain reading [1], and its source as a phrase.
 
-    It is that of the simulated gauges if the scenario states it, else the one that the twin uses.
+    The deviation is that of the simulated gauges if the scenario states it, else the one that the
+    twin uses.
     """
     truth = scenario.get("truth") or {}
     deviation = (truth.get("noise") or {}).get("standard_deviation")
@@ -406,7 +407,7 @@ def _strain_noise(scenario: JsonObject) -> tuple[float, str]:
 def _calibrated_parameter(run: xr.DataTree) -> dict[str, tuple[float, float]]:
     """Return the mean and standard deviation of the calibrated parameter, by its name.
 
-    They are computed from the draws of the calibration in the run. The result is empty if the run
+    Both are computed from the draws of the calibration in the run. The result is empty if the run
     has no calibrated parameter, or if all draws are equal.
     """
     name = str(run.attrs.get("parameter", ""))

@@ -85,8 +85,8 @@ def real_wing(
         Columns of the plot that are averaged into one sample.
     detrended : bool
         True to subtract the slow zero that the trials share: a moving average over three periods
-        (Hann weights), averaged over the trials. It moves by a third of a millivolt and is not a
-        motion of the wing. Slow changes of a single trial are noise and stay.
+        (Hann weights), averaged over the trials. This zero moves by a third of a millivolt and is
+        not a motion of the wing. Slow changes of a single trial are noise and stay.
 
     Raises
     ------
@@ -226,8 +226,8 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
 def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
     """Return the slow drift of the zero (N,) [V] that all records share.
 
-    It is the moving average of the mean record, with Hann weights over `TREND_COLUMNS` samples; nan
-    at the ends, where the average is incomplete.
+    The drift is the moving average of the mean record, with Hann weights over `TREND_COLUMNS`
+    samples; nan at the ends, where the average is incomplete.
     """
     weights = np.hanning(TREND_COLUMNS + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)

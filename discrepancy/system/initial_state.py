@@ -153,7 +153,8 @@ def _held_state(
     """Return the state of a structure that is held at rest by a force at its release point.
 
     The force moves the release point by the release displacement, counted from its position under
-    the other loads. It compensates the forces of the laws, which would move the point back.
+    the other loads. The holding force also compensates the forces of the laws, which would move the
+    point back.
 
     Parameters
     ----------

@@ -337,7 +337,7 @@ class Model(ABC):
     def prior_moments(self, campaign: Campaign) -> list[tuple[float, float]]:
         """Return mean and standard deviation of the prior of each parameter.
 
-        They are those that the campaign states, or else those of the model.
+        Both are those that the campaign states, or else those of the model.
         """
         campaign_parameters = campaign.parameters
         return [

@@ -159,7 +159,7 @@ class LinearSystem:
     def drive_shapes(self) -> FloatArray:
         """Displacements and states (N, P) under a unit motion, or a unit state, of each drive.
 
-        They have the least norm of those that follow the drives (pseudo-inverse).
+        Of all shapes that follow the drives, these have the least norm (pseudo-inverse).
         """
         shapes = np.zeros((self.unknown_count, len(self.drives)))
         if len(self.drives):
@@ -389,8 +389,8 @@ class LinearSystem:
     def residual_displacements(self, loads: FloatArray) -> FloatArray:
         """Return the displacements of the modes without inertia under loads (N,) or (N, k).
 
-        They are the residual flexibility times the loads: K^-1 loads minus the static displacements
-        of the M modes with inertia, shapes / omega^2 (shapes^T loads).
+        The displacements are the residual flexibility times the loads: K^-1 loads minus the static
+        displacements of the M modes with inertia, shapes / omega^2 (shapes^T loads).
         """
         in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
         return self.apply_flexibility(loads) - in_modes

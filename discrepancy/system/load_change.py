@@ -36,7 +36,7 @@ class LoadChange(NamedTuple):
     def from_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
         """Return the change of loads by the primitives `LoadGain` and `LoadPlace` of a patch.
 
-        They are applied in their order: a later gain also acts on earlier tares.
+        The primitives are applied in their order: a later gain also acts on earlier tares.
         """
         change = cls()
         for primitive in patch:

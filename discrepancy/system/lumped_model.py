@@ -120,7 +120,7 @@ class LumpedModel(DescribedModel, SystemModel):
     def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws that the model itself has at ports, multiplied by their factors.
 
-        They are none if the model is a copy without laws (`linear`).
+        There are no laws if the model is a copy without laws (`linear`).
         """
         if self.linear:
             return NO_PATCH
@@ -311,8 +311,8 @@ class LumpedModel(DescribedModel, SystemModel):
     ) -> OutputEquation:
         """Return the equation of an output: vector . unknowns, or the time derivative of it.
 
-        It is differentiated as often as the quantity requires, such as once if the output is a
-        displacement and a channel measures its speed. The derivative has no constant.
+        The output is differentiated as often as the quantity requires, such as once if the output
+        is a displacement and a channel measures its speed. The derivative has no constant.
         """
         derivatives = 0
         if quantity is not section.quantity:

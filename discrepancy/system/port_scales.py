@@ -244,10 +244,10 @@ class PortScaleEstimator:
     ) -> FloatArray:
         """Return factors (P,) for ports whose motion was measured to be far from the computed one.
 
-        A factor is the largest measured displacement of a port over the largest computed one. It is
-        1 for ports that are not measured, for ports of states, and if the two displacements differ
-        by less than the factor `FAR_FROM_MEASURED`. A port is measured if its row is a combination
-        of those of channels and drives.
+        A factor is the largest measured displacement of a port over the largest computed one. The
+        factor is 1 for ports that are not measured, for ports of states, and if the two
+        displacements differ by less than the factor `FAR_FROM_MEASURED`. A port is measured if its
+        row is a combination of those of channels and drives.
 
         Parameters
         ----------

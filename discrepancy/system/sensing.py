@@ -324,7 +324,8 @@ def observe_response(
 def _release_displacement(trial: Trial, conditions: Conditions) -> float:
     """Return the displacement from which the structure is released, which scales a free gain.
 
-    It includes the deviation of a release from rest. For trials without a release it is 1.
+    The displacement includes the deviation of a release from rest. For trials without a release it
+    is 1.
     """
     if trial.kind is not TrialKind.RINGDOWN or trial.release is None:
         return 1.0

@@ -220,7 +220,7 @@ class StructureModel(SystemModel):
     def _rows_of_changes(self) -> Callable[[tuple[int, ...]], dict[str, FloatArray]]:
         """The function that returns the rows (k,) of outputs and ports under some changes.
 
-        They are in the coordinates in which a structure with these changes is solved.
+        The rows are in the coordinates in which a structure with these changes is solved.
         """
         rows = self._rows | {PORT_PREFIX + name: row for name, row in self.port_rows.items()}
 
@@ -419,7 +419,7 @@ class StructureModel(SystemModel):
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     """Return the priors of parameters and free masses.
 
-    Their means are nominal, and their deviations `DEVIATION` times their ranges.
+    The means are the nominal values, and the standard deviations `DEVIATION` times the ranges.
     """
     nominal_values = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")

@@ -209,7 +209,7 @@ class WingModel(SystemModel):
     ) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, given the shape (n,) of the first mode.
 
-        They are those of the port `span`, with the fraction of the area at each station.
+        The scales are those of the port `span`, with the fraction of the area at each station.
         """
         weights = self.wing.planform_stations.area_fraction
         motions = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
