@@ -88,7 +88,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     name : str or Path, optional
         A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU
         (.toml); any of these with a patch (.json); the name of a shipped lumped model or structure;
-        the folder of a mission whose twin's model is meant. The shipped wing if left out.
+        the folder of a mission whose twin's model is meant. None for the shipped wing.
     progress : Progress, optional
         Where the modelling of a wing or a structure reports.
 

@@ -1,4 +1,4 @@
-"""The picture of an investigation that is wanted in a notebook: the missing force over time."""
+"""The picture of an investigation for a notebook: the missing force over time."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol

@@ -144,6 +144,8 @@ class Simulator:
             response, _ = problem.response(
                 trial_index, shared, local, patch if effect_acts else no_patch, REFINEMENT
             )
+            # the prediction of a trial reads only its own local unknowns; those of earlier trials
+            # keep the place
             earlier_trials = self.nuisances.local[:trial_index]
             point = Point(shared, (*earlier_trials, local), np.empty(0))
             values = problem.prediction(trial_index, point, response).copy()

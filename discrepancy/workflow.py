@@ -291,9 +291,9 @@ def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
 def _laws_leave_no_force(verdict: Verdict, search: Search, fit: CandidateFit) -> bool:
     """Return whether the effects of a verdict explain the whole force that the model lacks.
 
-    The answer is no unless one of them is a law at a port, and none acts only in some stretches of
-    time. The answer is yes for kinds of verdict whose effects leave only noise when they are
-    simulated. Otherwise the estimate of the missing force beside these effects decides.
+    The answer is no if none of the effects is a law at a port, or if one acts only in some
+    stretches of time. The answer is yes for kinds of verdict whose effects leave only noise when
+    they are simulated. Otherwise the estimate of the missing force beside these effects decides.
     """
     terms = fit.candidate.terms
     has_law = any(term.place in search.problem.model.ports for term in terms)

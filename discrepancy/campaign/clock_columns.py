@@ -1,4 +1,4 @@
-"""Tables with several columns of times: which columns each of them stamps."""
+"""Tables with several columns of times: which other columns were read at which of these times."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

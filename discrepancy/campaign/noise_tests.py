@@ -224,12 +224,12 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
     rows : (M, N) ndarray
         Series; samples that are left out are zero.
     count : int
-        The number of samples that are used.
+        The number n of used samples of each series.
     pairs : (lags,) ndarray
-        The number of pairs of them at each lag.
+        The number of pairs of used samples at each lag.
     """
-    products = lag_products(rows, len(pairs))
-    rho = products[:, 1:] / products[:, :1]
+    products = lag_products(rows, len(pairs))  # (M, 1 + lags)
+    rho = products[:, 1:] / products[:, :1]  # autocorrelations
     return np.asarray(count * (count + 2) * np.sum(rho**2 / np.maximum(pairs, 1.0), axis=1))
 
 

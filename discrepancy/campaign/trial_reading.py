@@ -364,7 +364,7 @@ def _stiffness_losses(
     columns = [name.removeprefix(prefix) for name in table.columns if name.startswith(prefix)]
     regions_of_columns = [name.removesuffix("_deviation") for name in columns]
     regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated_losses, *regions_of_columns)))
-    means = np.zeros((len(table), len(regions)))
+    means = np.zeros((len(table), len(regions)))  # (rows, regions), as the deviations
     deviations = np.zeros((len(table), len(regions)))
     for index, region in enumerate(regions):
         column = region if region in USUAL_REGIONS else f"{prefix}{region}"

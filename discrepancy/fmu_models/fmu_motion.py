@@ -196,19 +196,21 @@ class FmuSimulator(FmuAtRest):
     ) -> "StartState":
         """Return the state of the linear system at the start of a trial, and the laws' memory.
 
-        Under a recorded force it is the equilibrium with the laws under the first force. Without
-        laws or without a recorded force it is the released state, and the laws have no memory.
+        Under a recorded force the start is the equilibrium with the J laws under the first force.
+        Without laws or without a recorded force it is the released state, and the laws have no
+        memory.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, release_values), None)
         first_forces = excitation.first_force * excitation.force_factor_values  # (E,)
         gain = system.gain  # (C, E)
         outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
-        positions_without_laws = outputs[ports.columns]
-        compliance = gain[np.ix_(ports.columns, ports.force_indices)]
+        positions_without_laws = outputs[ports.columns]  # (J,), of the port of each law
+        compliance = gain[np.ix_(ports.columns, ports.force_indices)]  # (J, J)
         solution = static_solution(
             laws, positions_without_laws[None], compliance, kernel=compiled_kernel()
         )
+        # the sum of the forces of laws on each of the E inputs
         law_forces = np.bincount(ports.force_indices, solution.forces[0], len(first_forces))
         return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 
@@ -281,7 +283,7 @@ class FmuSimulator(FmuAtRest):
             return SettledRun(run, None)
 
         def run_under(forces: FloatArray) -> FmuRun:
-            """Return the run whose first inputs are the loads minus the forces of the laws."""
+            """Return the run whose first inputs are the loads minus forces of the laws (1, J)."""
             loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
             begin = self.subtract_law_forces(loads, laws, forces)
             return run._replace(

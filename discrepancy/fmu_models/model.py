@@ -225,9 +225,9 @@ class FmuModel(DescribedModel):
         campaign of trials at rest the result is 1 rad/s. Without trials the frequency is that of a
         simulated ring-down.
         """
-        frequency = self.description.scales.angular_frequency
-        if frequency:
-            return frequency
+        angular_frequency = self.description.scales.angular_frequency
+        if angular_frequency:
+            return angular_frequency
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
             operating_point = self._operating_point(dynamic_trial, conditions)
@@ -238,9 +238,10 @@ class FmuModel(DescribedModel):
         interval = 0.01
         for _ in range(3):
             trial = trial_without_readings(TrialKind.RINGDOWN, interval)
-            frequency = self.fmu.choose_step(trial, self.fmu.nominal_point).angular_frequency
-            interval = PHASE_IN_INTERVAL / frequency
-        return frequency or 1.0
+            step_choice = self.fmu.choose_step(trial, self.fmu.nominal_point)
+            angular_frequency = step_choice.angular_frequency
+            interval = PHASE_IN_INTERVAL / angular_frequency
+        return angular_frequency or 1.0
 
     def _load_point_stiffness(self, stiffnesses: list[PortStiffness]) -> PortStiffness:
         """Return the stiffness of the first port whose force input is one of the trials' loads.

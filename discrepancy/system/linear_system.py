@@ -81,7 +81,7 @@ class StaticPath(NamedTuple):
     values : (L, N) or (L, C) ndarray
         Displacements and states at each level, or rows times these.
     memory : ndarray, optional
-        The memory of the laws at the last level; None without laws.
+        The memory of the laws at the last level, a row for each law; None without laws.
     """
 
     values: FloatArray

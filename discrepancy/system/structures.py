@@ -376,6 +376,7 @@ class StructureModel(SystemModel):
         structure = self._structure_in_state(state._replace(parameters=self._inputs_of(state)))
         rows = self._rows_of_changes(self._changes_of(state))
         ports = {name: rows[PORT_PREFIX + name] for name in self.port_rows}
+        # the parameters after the inputs of the reduced model are the errors of the mesh
         errors = np.array(state.parameters[len(self._inputs_of(state)) :])
         solved = _WithMeshErrors(structure, errors) if errors.any() else None
         return linear_system(structure, self.model.damping, ports, solved)

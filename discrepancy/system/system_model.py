@@ -161,7 +161,10 @@ class SystemModel(Model):
     # ------------------------------------------------------------ trials
 
     def laws_at_ports(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
-        """Return all laws that act at the ports: the model's own laws and the laws of a patch."""
+        """Return all laws that act at the ports: the model's own laws and the laws of a patch.
+
+        `parameters` (P,) are values of the model's parameters, which may scale its own laws.
+        """
         forces = self.forces_at_ports(self.built_in_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 

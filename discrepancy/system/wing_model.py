@@ -115,7 +115,7 @@ class WingModel(SystemModel):
 
     @classmethod
     def of_calibration(cls, path: Path | str, progress: Progress | None = None) -> "WingModel":
-        """Return the wing of a calibration, its posterior as prior.
+        """Return the wing of a calibration; the posterior of its parameters becomes their prior.
 
         Raises
         ------
