@@ -239,9 +239,8 @@ class FmuModel(DescribedModel):
         for _ in range(3):
             trial = trial_without_readings(TrialKind.RINGDOWN, interval)
             step_choice = self.fmu.choose_step(trial, self.fmu.nominal_point)
-            angular_frequency = step_choice.angular_frequency
-            interval = PHASE_IN_INTERVAL / angular_frequency
-        return angular_frequency or 1.0
+            interval = PHASE_IN_INTERVAL / step_choice.angular_frequency
+        return step_choice.angular_frequency or 1.0
 
     def _load_point_stiffness(self, stiffnesses: list[PortStiffness]) -> PortStiffness:
         """Return the stiffness of the first port whose force input is one of the trials' loads.
