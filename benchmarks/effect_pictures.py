@@ -15,7 +15,7 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
-from reporting.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
+from reporting.pages.figures import PREDICTION, REFERENCE, new_figure, publication_style, to_png
 
 FloatArray = NDArray[np.float64]
 RESOLUTION = 88.0

@@ -13,10 +13,10 @@ from inspect import isfunction
 from operator import or_
 from pathlib import Path
 
-from reporting import known_keys
 from reporting.files import atomic_write_text
-from reporting.format_schema import JsonSchema, format_schema
-from reporting.format_tables import PrintedTable, format_page, printed_tables
+from reporting.formats import known_keys
+from reporting.formats.schema import JsonSchema, format_schema
+from reporting.formats.tables import PrintedTable, format_page, printed_tables
 from uav_twin.formats import FORMATS, SCHEMA_FOLDER, FileFormat
 
 ROOT = Path(__file__).parents[1]

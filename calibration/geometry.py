@@ -15,7 +15,7 @@ from fe.runtime.state import Geometry
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
 from reporting.files import hash_record
-from reporting.table_file import TextTable
+from reporting.formats.table_file import TextTable
 from reporting.words import comma_list
 
 from .lab_folder import lab_table

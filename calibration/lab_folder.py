@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from reporting.table_file import TableErrors, TextTable, read_table
+from reporting.formats.table_file import TableErrors, TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
 

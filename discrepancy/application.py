@@ -31,8 +31,8 @@ from fmu_asset.packing.structure_fmu import pack_wing
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing
 from reporting.folders import restore_folder
+from reporting.formats.toml_file import read_toml, toml_text
 from reporting.progress import Progress
-from reporting.toml_file import read_toml, toml_text
 from reporting.words import capital
 
 ENDINGS = (".toml", ".json", ".fmu")

@@ -27,7 +27,7 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import INSTALLED_LAWS
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
-from reporting.format_schema import JsonSchema, format_schema
+from reporting.formats.schema import JsonSchema, format_schema
 from reporting.json_file import JsonDocument, JsonObject, read_json
 from reporting.json_file import plain as json_of
 from reporting.provenance import Provenance

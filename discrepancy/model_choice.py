@@ -22,8 +22,8 @@ from fe.wing.design import SHIPPED_DESIGN, WingDesign
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.choices import did_you_mean
 from reporting.files import hash_file, hash_record
+from reporting.formats.toml_file import read_toml
 from reporting.progress import Progress
-from reporting.toml_file import read_toml
 from reporting.words import comma_list
 from scenarios import structure_files
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from discrepancy.missing_force.port_force import MissingForce
-from reporting.notebook import new_panels
+from reporting.pages.notebook import new_panels
 
 if TYPE_CHECKING:  # it takes long to import
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ def plot_missing_force(
     ValueError
         If no force is missing, or none can be determined; or if another number of panels was given.
     """
-    from reporting import figures as style
+    from reporting.pages import figures as style
 
     missing = result.missing
     if missing is None:

@@ -11,7 +11,7 @@ from discrepancy.self_calibration import (
     SelfCalibration,
     ordered_outcomes,
 )
-from reporting.format_schema import JsonSchema
+from reporting.formats.schema import JsonSchema
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"

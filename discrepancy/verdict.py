@@ -6,7 +6,7 @@ from enum import StrEnum
 from math import nan
 
 from discrepancy.document import Number, Patch
-from reporting.notebook import html_table
+from reporting.pages.notebook import html_table
 from reporting.words import between, brief, listing, rounded
 
 RATE_OF = "the rate of "

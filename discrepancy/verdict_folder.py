@@ -17,10 +17,10 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_so_far import SO_FAR_NAME
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
-from reporting.figures import save_figure
 from reporting.files import atomic_write_text
 from reporting.folders import restore_folder, whole_folder
-from reporting.page import render_page
+from reporting.pages.figures import save_figure
+from reporting.pages.page import render_page
 
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"

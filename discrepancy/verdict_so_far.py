@@ -9,7 +9,7 @@ from discrepancy.judgement.decide import comparison_of
 from discrepancy.judgement.hypotheses import hypothesis_record
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import Hypothesis
-from reporting.format_schema import JsonSchema
+from reporting.formats.schema import JsonSchema
 
 SO_FAR_SCHEMA = "uav-twin verdict so far 1"
 """Value of the key `schema`."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable
-from reporting.toml_file import toml_value
+from reporting.formats.toml_file import toml_value
 from reporting.units import BASE_UNITS, meaning_of
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")

@@ -12,7 +12,7 @@ from fe.structure.tables import StructureDesign
 from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.description import rendered
 from fmu_asset.errors import BindingError, FmuBuildError
-from reporting.toml_file import parse_toml
+from reporting.formats.toml_file import parse_toml
 
 
 def structure_binding_text(design: StructureDesign, frequencies: int = 0) -> str:

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-from .errors import InvalidChoiceError
-from .words import listing
+from reporting.errors import InvalidChoiceError
+from reporting.words import listing
 
 
 def require_one_of(value: object, allowed: Iterable[object], name: str) -> None:

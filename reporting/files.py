@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from reporting.errors import DiskFullError, FileNotWrittenError
-from reporting.operating_system import can_flush, flag_for_flushing, open_descriptor
+from reporting.system.operating_system import can_flush, flag_for_flushing, open_descriptor
 
 TEMPORARY_SUFFIX = ".partial"
 """Ending of temporary names, which marks the leftovers of a killed process."""

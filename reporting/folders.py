@@ -15,7 +15,7 @@ from pathlib import Path
 
 from reporting.errors import FileNotWrittenError
 from reporting.files import explained_write_errors, refuse_address
-from reporting.operating_system import lock_folder
+from reporting.system.operating_system import lock_folder
 
 _NEW = "new"
 _OLD = "old"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
-from reporting.log import module_logger
+from reporting.system.log import module_logger
 
 if TYPE_CHECKING:  # rich takes long to import, and most code needs only the names of types
     from rich.console import Console

@@ -21,15 +21,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import reporting.progress
-from reporting.log import shown_log
+from reporting.system.log import shown_log
 from reporting.words import with_short_hashes
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from reporting.pages.table import Table as TextTable
     from reporting.progress import Progress
-    from reporting.table import Table as TextTable
 
 _Command = Any  # Typer does not export the classes of its commands and options.
 _Option = Any
@@ -39,6 +39,18 @@ INTERRUPTED = 130
 
 WIDTH_OF_A_PIPE = 1000
 """Width of a console that is not a terminal, in columns."""
+
+
+LARGEST_SEED = 2**63 - 1
+"""The largest seed, that of a signed integer of 64 bits."""
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
+]
+"""Whether a command prints JSON instead of text."""
+
+NoReportOption = Annotated[bool, typer.Option("--no-report", help="Draw no report and no figures.")]
+"""Whether a command leaves out its report."""
 
 
 @dataclass

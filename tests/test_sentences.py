@@ -6,7 +6,7 @@ from string import Formatter
 
 import pytest
 
-from reporting.sentences import Sentences
+from discrepancy.errors import Sentences
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import InvalidChoiceError, ReportingError
 from reporting.files import NO_SPACE
-from reporting.former_options import former_names_as_lines
+from reporting.formats.former_options import former_names_as_lines
+from reporting.terminal import JsonOption, NoReportOption
 from reporting.words import number
 from twin_master.command_options import (
     CalibrationOption,

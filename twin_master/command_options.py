@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reporting.operating_system import usable_processors
+from reporting.system.operating_system import usable_processors
 from scenarios import scenario_files
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
+from reporting.terminal import JsonOption
 
 if TYPE_CHECKING:
     from twin_master.fleet.comparison import Statistics
@@ -37,7 +37,7 @@ def compare(
 
     Example: `uav-twin compare runs/fleet runs/other_fleet`
     """
-    from reporting.figures import write_picture
+    from reporting.pages.figures import write_picture
     from twin_master.fleet.comparison import compare_fleets, groups_of_fleets, returns_of_group
     from twin_master.fleet.page.page_figures import returns_figure
 

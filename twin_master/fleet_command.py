@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
-from reporting.former_options import accepts_former_options
-from reporting.operating_system import lower_priority
+from reporting.formats.former_options import accepts_former_options
+from reporting.system.operating_system import lower_priority
+from reporting.terminal import JsonOption, NoReportOption
 from reporting.words import counted
 from twin_master.command_options import (
     CertificateOption,
@@ -97,7 +97,7 @@ def watch(
 
     Example: `uav-twin fleet watch fleet.toml --follow`
     """
-    from reporting.operating_system import call_on_end_signal
+    from reporting.system.operating_system import call_on_end_signal
     from twin_master.fleet.page.view import is_fleet, serve_fleet
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.watched.watching import FleetWatch

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from reporting.notebook import new_panels
+from reporting.pages.notebook import new_panels
 from twin_master.scenario.section import printed_state
 
 if TYPE_CHECKING:  # both take long to import
@@ -52,7 +52,7 @@ def plot_belief(
     ValueError
         If another number of panels was given.
     """
-    from reporting import figures as style
+    from reporting.pages import figures as style
 
     tree = _tree_of(run)
     filtered_group = tree["filtered"].to_dataset()
@@ -97,7 +97,7 @@ def plot_residuals(run: "xr.DataTree | HasTree", axes: "Axes | None" = None) -> 
     Axes
         The panel.
     """
-    from reporting import figures as style
+    from reporting.pages import figures as style
 
     residual = _tree_of(run)["filtered"].to_dataset()["residual"]
     (panel,) = new_panels(1, axes)
@@ -138,7 +138,7 @@ def plot_courses(fleet: "xr.DataTree", axes: "Axes | Sequence[Axes] | None" = No
     list of Axes
         The panels.
     """
-    from reporting import figures as style
+    from reporting.pages import figures as style
 
     rows = []
     for group_name, group in fleet.children.items():

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
 from reporting.files import atomic_write_bytes
+from reporting.terminal import JsonOption
 from reporting.words import comma_list
 from twin_master.command_options import CalibrationOption, ScenarioArgument, SeedOption
 from twin_master.errors import MissionInputError
@@ -65,7 +65,7 @@ def plan(
 
     Example: `uav-twin plan inspected_wing --out policy.npz`
     """
-    from reporting.figures import write_picture
+    from reporting.pages.figures import write_picture
     from twin_master.mission.planning import (
         compare_simple_rules,
         encode_policy,
@@ -414,7 +414,7 @@ def _write_design_picture(
     """Draw the information of the chosen sensors, and their positions."""
     import numpy as np
 
-    from reporting.figures import write_picture
+    from reporting.pages.figures import write_picture
     from twin_master.report.planning import design_figure
 
     positions = places.positions

@@ -15,9 +15,9 @@ from typing import NamedTuple
 from reporting.files import atomic_write_text, remove_leftovers, write_members
 from reporting.folders import closing_lock, restore_folder, whole_folder
 from reporting.json_file import JsonObject, read_json
-from reporting.operating_system import is_lock_of, lock_folder
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance, plug_in_versions
+from reporting.system.operating_system import is_lock_of, lock_folder
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
+from reporting.terminal import JsonOption
 from scenarios import scenario_files
 from twin_master.command_options import CalibrationOption, complete_scenario
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from reporting.command_options import NoReportOption
-from reporting.former_options import accepts_former_options
+from reporting.formats.former_options import accepts_former_options
+from reporting.terminal import NoReportOption
 from reporting.words import counted
 from twin_master.command_options import (
     CalibrationOption,

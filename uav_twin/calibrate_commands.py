@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from reporting import terminal
-from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
 from reporting.files import atomic_write_text, refuse_filled
+from reporting.terminal import LARGEST_SEED, JsonOption, NoReportOption
 from uav_twin.completion import complete_model
 from uav_twin.discrepancy_commands import use_one_thread
 from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
@@ -292,9 +292,9 @@ def calibrate_ringdown(
         average,
         fit_trials,
     )
-    from reporting.figures import save_figure
-    from reporting.page import ReportFigure
-    from reporting.table_file import table_text
+    from reporting.formats.table_file import table_text
+    from reporting.pages.figures import save_figure
+    from reporting.pages.page import ReportFigure
 
     start = FIRST_PEAK if start is None else start
     trials = fit_trials(read_records(data), frequencies_fitted=fitted, start=start)

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
-from reporting.operating_system import lower_priority
+from reporting.system.operating_system import lower_priority
 from twin_master.watch.cause_search import RunningSearch, SearchRequest
 
 COMMAND = (sys.executable, "-m", "uav_twin", "discrepancy", "run")

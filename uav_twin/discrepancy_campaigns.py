@@ -9,8 +9,8 @@ import typer
 
 from discrepancy.errors import CatalogueError
 from reporting import terminal
-from reporting.command_options import LARGEST_SEED
 from reporting.files import refuse_filled
+from reporting.terminal import LARGEST_SEED
 from reporting.words import comma_list, counted, in_one_line
 from uav_twin.completion import complete_effect
 from uav_twin.options import EffectFilesOption, ModelOption

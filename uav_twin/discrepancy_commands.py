@@ -16,9 +16,9 @@ import typer
 
 from discrepancy.errors import CampaignFileError, DiscrepancyError
 from reporting import terminal
-from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
-from reporting.former_options import accepts_former_options
+from reporting.formats.former_options import accepts_former_options
 from reporting.progress import reporter, stage
+from reporting.terminal import LARGEST_SEED, JsonOption, NoReportOption
 from uav_twin.completion import complete_model
 from uav_twin.options import CampaignArgument, EffectFilesOption, ModelOption, ReplaceOption
 

@@ -11,9 +11,9 @@ import typer
 
 from fmu_asset.errors import SspError, visible
 from reporting import terminal
-from reporting.command_options import JsonOption
 from reporting.errors import ReportingError
 from reporting.files import atomic_write_text, refuse_existing
+from reporting.terminal import JsonOption
 from reporting.words import counted, in_one_line
 from scenarios import asset_scripts
 from twin_master.command_options import complete_scenario
@@ -448,7 +448,7 @@ def _refuse_what_is_no_system(what: str) -> None:
 
 def _table_of_file(path: str) -> Mapping[str, object]:
     """Return the content of a TOML file; empty if there is none, or it is not TOML."""
-    from reporting.toml_file import read_toml
+    from reporting.formats.toml_file import read_toml
 
     try:
         return read_toml(path, ReportingError)

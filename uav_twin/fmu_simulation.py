@@ -377,7 +377,7 @@ def _draw_history(
     At most `_MOST_PANELS` panels with `_MOST_LINES` lines each are drawn; a legend counts the
     omitted lines.
     """
-    from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
+    from reporting.pages.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
 
     columns_of_unit: dict[str, list[HistoryColumn]] = {}
     for column in columns:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from reporting.choices import did_you_mean
 from reporting.errors import InvalidChoiceError
-from reporting.format_tables import Notation
+from reporting.formats.tables import Notation
 from reporting.json_file import JsonObject
 
 SCHEMA_FOLDER = Path(__file__).with_name("schemas")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from reporting.command_options import LARGEST_SEED
+from reporting.terminal import LARGEST_SEED
 from uav_twin.completion import complete_model, complete_structure
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reporting.command_options import JsonOption
+from reporting.terminal import JsonOption
 
 
 def _complete_format(incomplete: str) -> list[str]:

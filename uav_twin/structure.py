@@ -13,10 +13,10 @@ import typer
 from fe.runtime.errors import DesignFileError
 from reporting import terminal
 from reporting.choices import did_you_mean
-from reporting.command_options import JsonOption
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing, refuse_filled
 from reporting.progress import stage
+from reporting.terminal import JsonOption
 from reporting.words import comma_list
 from scenarios import structure_files
 from uav_twin.options import (
@@ -67,7 +67,7 @@ def find_structure(file: Path) -> Path:
 def is_structure_file(design: Path) -> bool:
     """Return whether a design file describes a structure, and not a wing."""
     from fe.structure.design import is_structure
-    from reporting.toml_file import read_toml
+    from reporting.formats.toml_file import read_toml
 
     return is_structure(read_toml(find_structure(design), DesignFileError, what="wing design"))
 

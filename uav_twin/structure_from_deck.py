@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
 from reporting.files import explained_write_errors, refuse_filled
 from reporting.progress import stage
+from reporting.terminal import JsonOption
 
 if TYPE_CHECKING:
     from fe.solver_deck.comparison import DeckReport

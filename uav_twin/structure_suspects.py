@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
 from reporting.progress import stage
+from reporting.terminal import JsonOption
 from reporting.words import listing, number
 from uav_twin.options import StructureArgument
 from uav_twin.structure import find_structure

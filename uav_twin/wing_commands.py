@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reporting import terminal
-from reporting.command_options import JsonOption
 from reporting.files import atomic_write_text, refuse_filled
+from reporting.terminal import JsonOption
 from uav_twin.options import DesignOption
 
 if TYPE_CHECKING:

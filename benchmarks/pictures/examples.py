@@ -7,7 +7,7 @@ import uav_twin
 from benchmarks.pictures.notebooks import folder_until_exit
 from benchmarks.pictures.picture import Drawing
 from discrepancy.report.figures import missing_force_figure
-from reporting.figures import publication_style, to_png
+from reporting.pages.figures import publication_style, to_png
 
 CHAIN = "three_mass_chain"
 HIDDEN_FRICTION = "coulomb_friction@joint=0.004"

@@ -9,7 +9,14 @@ from matplotlib.figure import Figure
 from benchmarks.pictures.notebooks import notebook
 from benchmarks.pictures.picture import Drawing
 from discrepancy.report.figures import missing_force_figure
-from reporting.figures import PAST, PREDICTION, REFERENCE, new_figure, publication_style, to_png
+from reporting.pages.figures import (
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    new_figure,
+    publication_style,
+    to_png,
+)
 
 RESOLUTION = 150.0
 

@@ -16,7 +16,7 @@ from discrepancy.sources.measured_rigs import write_rig_campaign
 from discrepancy.workflow import Investigation
 from evidence.sandwich_plate.plate_comparison import DAMAGE, PlateAgreement, compare_with_plate
 from fe.wing.design import load_design
-from reporting.figures import (
+from reporting.pages.figures import (
     OBSERVED,
     PAST,
     PREDICTION,

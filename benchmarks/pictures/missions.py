@@ -19,7 +19,7 @@ import uav_twin
 from benchmarks.browser import open_browser
 from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
-from reporting.figures import to_png
+from reporting.pages.figures import to_png
 from twin_master.fleet.configuration import KIND, fleet_config
 from twin_master.fleet.page.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps

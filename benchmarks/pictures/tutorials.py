@@ -4,7 +4,14 @@ import numpy as np
 
 from benchmarks.pictures.notebooks import notebook
 from benchmarks.pictures.picture import Drawing
-from reporting.figures import PAST, PREDICTION, REFERENCE, new_figure, publication_style, to_png
+from reporting.pages.figures import (
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    new_figure,
+    publication_style,
+    to_png,
+)
 
 RESOLUTION = 150.0
 WIDTH = 7.2

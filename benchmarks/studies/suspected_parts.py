@@ -14,7 +14,7 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.toml_file import toml_text
+from reporting.formats.toml_file import toml_text
 
 Point = tuple[float, float, float]
 

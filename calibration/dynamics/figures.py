@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reporting import figures as style
+from reporting.pages import figures as style
 
 from .damped_cosine import RingDownMode
 from .trials import Fits, ModalQuantity, RingDownFit, amplitude_dependence, average, spectrum

@@ -11,7 +11,7 @@ import numpy as np
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.lab_folder import LAB_ERRORS, possible_locations
 from reporting.arrays import Float, nan_where_masked
-from reporting.table_file import TextTable, parse_table
+from reporting.formats.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import comma_list, counted
 

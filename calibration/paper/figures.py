@@ -13,11 +13,11 @@ from calibration.paper.load_test import ParticlePosterior, StaticCalibration
 from calibration.result.record import Calibration
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
-from reporting import figures as style
 from reporting.files import atomic_write_text
-from reporting.page_words import Words
-from reporting.table import RecordColumn, Table, number_cells, table_of_records, text_cells
-from reporting.table_file import table_text
+from reporting.formats.table_file import table_text
+from reporting.pages import figures as style
+from reporting.pages.page_words import Words
+from reporting.pages.table import RecordColumn, Table, number_cells, table_of_records, text_cells
 
 WORDS = Words("calibration.paper", "table_1.toml")
 

@@ -14,8 +14,8 @@ from scipy.stats import gaussian_kde
 from calibration.result.record import Calibration, QuantityReading
 from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
-from reporting import figures as style
 from reporting.arrays import Float
+from reporting.pages import figures as style
 
 _COLOURS = (style.PAST, style.PRESENT, style.REFERENCE)
 _COLUMNS = 3

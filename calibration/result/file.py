@@ -23,7 +23,7 @@ from fe.runtime.state import DigitalState
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_bytes
-from reporting.netcdf import read_groups
+from reporting.formats.netcdf import read_groups
 from reporting.words import one_line
 
 FILE_NAME = "calibration.nc"

@@ -21,9 +21,9 @@ from calibration.result.tables import (
     sensors_table,
 )
 from calibration.result.text import NOTICEABLE_CORRELATION, correlation_lines, outcome_sentences
-from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors
-from reporting.page import (
+from reporting.pages.figures import save_figure
+from reporting.pages.page import (
     Fold,
     Highlights,
     Notice,

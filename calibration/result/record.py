@@ -19,7 +19,7 @@ from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
-from reporting.notebook import html_table, new_panels
+from reporting.pages.notebook import html_table, new_panels
 from reporting.words import brief, comma_list, plus_minus
 
 if TYPE_CHECKING:  # it takes long to import
@@ -233,7 +233,7 @@ class Calibration:
         list of Axes
             The panels.
         """
-        from reporting import figures as style
+        from reporting.pages import figures as style
 
         panels = new_panels(len(self.priors), axes)
         for panel, prior in zip(panels, self.priors, strict=True):

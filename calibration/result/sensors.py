@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import inf, isfinite, nan
 from typing import Literal
 
-from reporting.table import RecordColumn, number_cells, text_cells
+from reporting.pages.table import RecordColumn, number_cells, text_cells
 from reporting.words import plus_minus
 
 MOST_PRINTED_SENSORS = 12

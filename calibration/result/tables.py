@@ -9,8 +9,7 @@ from calibration.result.sensors import (
     gains_and_farthest_zeros,
     printed_rows,
 )
-from reporting.provenance import provenance_items
-from reporting.table import (
+from reporting.pages.table import (
     RecordColumn,
     Table,
     item_table,
@@ -18,6 +17,7 @@ from reporting.table import (
     table_of_records,
     text_cells,
 )
+from reporting.provenance import provenance_items
 from reporting.words import between, plus_minus
 
 PROCEDURES = {

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.result import tables
 from calibration.result.record import Calibration
-from reporting.table import Table
+from reporting.pages.table import Table
 from reporting.words import counted
 
 NOTICEABLE_CORRELATION = 0.3

@@ -32,7 +32,7 @@ from calibration.static.experiments import (
 )
 from reporting.choices import require_one_of
 from reporting.files import atomic_write_text, hash_file, hash_record
-from reporting.table_file import table_text
+from reporting.formats.table_file import table_text
 
 WEIGHED_MASS_FILE = STEP_FOLDER / "weighed_mass.csv"
 """The file of the weighed total of servos and pitot tube [g]; the authors have none."""

@@ -26,11 +26,11 @@ from calibration.wing.calibrate import WingCalibration
 from calibration.wing.lab_data import StepOrigin
 from fe.reduction.model_cache import WingFields, wing_fields, write_modes_vtu, write_wing_vtu
 from fe.runtime.reduced_results import ReducedModes
-from reporting import figures as style
 from reporting.arrays import Float
-from reporting.figures import save_figure
-from reporting.page import Block, Notice, Section
-from reporting.page_words import Words
+from reporting.pages import figures as style
+from reporting.pages.figures import save_figure
+from reporting.pages.page import Block, Notice, Section
+from reporting.pages.page_words import Words
 from reporting.progress import stage
 from reporting.words import plus_minus
 

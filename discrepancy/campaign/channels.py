@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Accepted, Deviation, InFiles
 from discrepancy.campaign.quantity import Quantity
-from reporting.toml_file import Name, NotNegative, Number, Positive
+from reporting.formats.toml_file import Name, NotNegative, Number, Positive
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from discrepancy.campaign import schema
 from discrepancy.campaign.records import InTables, TrialKind
-from reporting.table_file import TextTable
+from reporting.formats.table_file import TextTable
 from reporting.words import comma_list
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from discrepancy.campaign.trial_reading import LATEST_FIRST_SAMPLE
 from discrepancy.errors import CampaignDataError
-from reporting.table_file import TextTable
+from reporting.formats.table_file import TextTable
 
 
 def table_of_release_by_force(

@@ -32,7 +32,7 @@ from discrepancy.campaign.sensor_deviations import SensorDeviations
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.errors import CampaignFileError
 from reporting.files import hash_record
-from reporting.table_file import TextTable
+from reporting.formats.table_file import TextTable
 from reporting.words import listing
 
 KINDS = (*TrialKind, NOISE)

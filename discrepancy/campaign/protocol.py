@@ -21,9 +21,9 @@ from pydantic_core import PydanticKnownError
 
 from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
-from reporting.format_schema import MUST_BE_STATED, NeverInFile
-from reporting.known_keys import TEXTS_ARE_READ
-from reporting.toml_file import Name, NotNegative, Number, Positive
+from reporting.formats.known_keys import TEXTS_ARE_READ
+from reporting.formats.schema import MUST_BE_STATED, NeverInFile
+from reporting.formats.toml_file import Name, NotNegative, Number, Positive
 
 MOST_MODES = 100
 IN_FILES = ConfigDict(extra="forbid", strict=False, use_attribute_docstrings=TEXTS_ARE_READ)

@@ -28,8 +28,8 @@ from discrepancy.campaign.trial_reading import numbers_in_si, read_trial
 from discrepancy.campaign.wild_readings import without_fill_values
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.files import hash_file, hash_record
-from reporting.table_file import TableErrors, TextTable, is_number, read_table
-from reporting.toml_file import read_toml
+from reporting.formats.table_file import TableErrors, TextTable, is_number, read_table
+from reporting.formats.toml_file import read_toml
 from reporting.words import comma_list, counted, is_or_are
 
 CAMPAIGN_FILE = "campaign.toml"

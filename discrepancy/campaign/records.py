@@ -25,7 +25,7 @@ from discrepancy.campaign.channels import RecordedInput as RecordedInput
 from discrepancy.campaign.protocol import Accepted, Event, InFiles, Release
 from discrepancy.campaign.quantity import Quantity as Quantity
 from discrepancy.campaign.sampling import is_nearly_even
-from reporting.toml_file import Name, Number, Positive
+from reporting.formats.toml_file import Name, Number, Positive
 from reporting.words import brief
 
 

@@ -21,8 +21,16 @@ from discrepancy.campaign.units import (
 )
 from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
+from reporting.formats.toml_file import (
+    Check,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    validate,
+)
 from reporting.json_file import JsonRecord
-from reporting.toml_file import Check, Name, NotNegative, Number, Positive, Section, validate
 from reporting.words import comma_list
 
 FORMAT = 1

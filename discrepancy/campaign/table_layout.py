@@ -10,7 +10,7 @@ from discrepancy.campaign.head_rows import Rows, find_head_rows
 from discrepancy.campaign.heads import split_head, time_heads
 from discrepancy.campaign.lost_readings import places_of_readings
 from discrepancy.errors import CampaignFileError
-from reporting.toml_file import short_repr
+from reporting.formats.toml_file import short_repr
 from reporting.words import counted, listing
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}

@@ -25,7 +25,7 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.sampling import check_sampling
 from discrepancy.campaign.units import conversion_factor, factor_to_si
 from discrepancy.errors import CampaignDataError, CampaignFileError
-from reporting.table_file import TextTable
+from reporting.formats.table_file import TextTable
 from reporting.words import counted, is_or_are, rows_of_table
 
 LATEST_FIRST_SAMPLE = 1.5

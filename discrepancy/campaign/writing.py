@@ -20,8 +20,8 @@ from discrepancy.campaign.units import (
 )
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
-from reporting.table_file import table_text
-from reporting.toml_file import toml_text
+from reporting.formats.table_file import table_text
+from reporting.formats.toml_file import toml_text
 
 NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""

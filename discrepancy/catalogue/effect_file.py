@@ -71,7 +71,7 @@ from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
-from reporting.toml_file import read_toml, validate
+from reporting.formats.toml_file import read_toml, validate
 
 
 def effects_of_file(path: Path) -> tuple[Effect, ...]:

@@ -12,7 +12,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, TrialKind
 from discrepancy.system.interface import Model
 from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
-from reporting.known_keys import TEXTS_ARE_READ
+from reporting.formats.known_keys import TEXTS_ARE_READ
 
 NINETY_PERCENT_QUANTILE = 1.6448536269514722
 """Standard normal quantile of 0.95."""

@@ -30,8 +30,8 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.system.load_change import DEFAULT_PLACE
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
+from reporting.formats.netcdf import read_groups
 from reporting.json_file import JsonRecord
-from reporting.netcdf import read_groups
 from reporting.words import one_line
 
 RESIDUALS_NAME = "residuals.nc"

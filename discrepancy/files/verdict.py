@@ -27,7 +27,7 @@ from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
-from reporting.format_schema import JsonSchema
+from reporting.formats.schema import JsonSchema
 from reporting.json_file import JsonObject
 from reporting.words import brief
 

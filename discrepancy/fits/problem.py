@@ -24,7 +24,7 @@ from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.system.interface import Model
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
-from reporting.memory import ResultCache
+from reporting.system.memory import ResultCache
 
 from .candidate import (
     LEAST_EFFECT_STEP,

@@ -22,7 +22,7 @@ from fe.runtime.patch import (
     StiffnessDrift,
     SupportCompliance,
 )
-from reporting.toml_file import Check, Name, Number, Positive
+from reporting.formats.toml_file import Check, Name, Number, Positive
 from scenarios import binding_files
 
 CARRIED = tuple(primitive.kind for primitive in (*STRUCTURE, *LOADS, StiffnessDrift))

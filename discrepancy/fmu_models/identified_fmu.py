@@ -21,7 +21,7 @@ from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
 from fmu_asset.client.runs import FmuRun, FmuRuns, OperatingPoint
 from fmu_asset.client.state_space import FmuStateSpace, realise_state_space
 from fmu_asset.errors import FmuError
-from reporting.memory import ResultCache
+from reporting.system.memory import ResultCache
 
 LINEARITY_TOLERANCE = 1e-6
 """Largest deviation from superposition of a linear FMU, as a share of the motion."""

@@ -40,8 +40,8 @@ from discrepancy.report.verdict_sentences import (
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
-from reporting import figures as style
-from reporting.page import ReportFigure
+from reporting.pages import figures as style
+from reporting.pages.page import ReportFigure
 from reporting.words import listing
 
 _LARGEST_DISTANCE = 1e4

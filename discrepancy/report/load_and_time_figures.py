@@ -21,7 +21,7 @@ from discrepancy.report.residual_figures import (
     size_colour_scale,
 )
 from discrepancy.verdict import GapWindow
-from reporting import figures as style
+from reporting.pages import figures as style
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""

@@ -22,7 +22,7 @@ from discrepancy.report.residual_figures import (
     new_panels,
     rms_over_noise,
 )
-from reporting import figures as style
+from reporting.pages import figures as style
 
 _ARRAYS = [entry.name for entry in fields(Backbone) if entry.name != "mode"]
 """Names of the arrays of a backbone."""

@@ -37,7 +37,7 @@ from discrepancy.report.verdict_sentences import (
 )
 from discrepancy.verdict import Gate, NamedEffect, ParameterEstimate, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page import Block, Fold, Highlights, Notice, Page, PageFigure, Section
+from reporting.pages.page import Block, Fold, Highlights, Notice, Page, PageFigure, Section
 from reporting.words import capital, counted, listing, with_short_hashes
 
 LONGEST_CARD = 60

@@ -27,7 +27,7 @@ from discrepancy.self_calibration import SelfCalibration
 from discrepancy.system.interface import Model
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.table import Table
+from reporting.pages.table import Table
 from reporting.words import counted, listing
 
 MOST_PRINTED_EXPERIMENTS = 3

@@ -17,7 +17,7 @@ from discrepancy.judgement.closed_share import residuals_with_noise_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
-from reporting import figures as style
+from reporting.pages import figures as style
 
 AFTER = "with the effect"
 EMPTY_CELL_COLOUR = "#f0f1f2"

@@ -6,7 +6,7 @@ from calibration.result.sensors import SENSOR_COLUMNS, gains_and_farthest_zeros,
 from discrepancy.campaign.records import Channel
 from discrepancy.judgement.sensor_estimates import sensor_fits
 from discrepancy.verdict import SensorEstimate
-from reporting.table import Table, table_of_records
+from reporting.pages.table import Table, table_of_records
 
 
 def sensor_table(estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]) -> Table:

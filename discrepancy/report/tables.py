@@ -22,8 +22,7 @@ from discrepancy.report.text import (
 )
 from discrepancy.self_calibration import Proportion, SelfCalibration, ordered_outcomes
 from discrepancy.workflow import Investigation
-from reporting.provenance import provenance_items
-from reporting.table import (
+from reporting.pages.table import (
     PageColumn,
     RecordColumn,
     Table,
@@ -33,6 +32,7 @@ from reporting.table import (
     table_of_records,
     text_cells,
 )
+from reporting.provenance import provenance_items
 from reporting.words import number as cell_text
 from reporting.words import plus_minus
 

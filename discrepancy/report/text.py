@@ -6,7 +6,7 @@ from math import isfinite, isnan
 
 from discrepancy.verdict import Hypothesis, ParameterEstimate, VerdictKind
 from discrepancy.workflow import Investigation
-from reporting.page_words import Words
+from reporting.pages.page_words import Words
 from reporting.words import between, rounded
 
 WORDS = Words("discrepancy.report")

@@ -27,7 +27,7 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
-from reporting.table import (
+from reporting.pages.table import (
     PageColumn,
     RecordColumn,
     Table,

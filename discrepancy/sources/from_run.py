@@ -23,8 +23,8 @@ from fmu_asset.packing.patch_file import load_patch
 from reporting.errors import DamagedFileError
 from reporting.files import hash_file
 from reporting.folders import restore_folder
+from reporting.formats.netcdf import read_groups
 from reporting.json_file import JsonObject, read_json
-from reporting.netcdf import read_groups
 from reporting.words import counted
 
 RUN_FILE = "run.nc"

@@ -16,8 +16,8 @@ from discrepancy.errors import CampaignFileError
 from discrepancy.sources.real_wing import real_wing
 from discrepancy.sources.rig_files import RigFiles
 from reporting.files import atomic_write_text
-from reporting.table_file import table_text
-from reporting.toml_file import toml_text
+from reporting.formats.table_file import table_text
+from reporting.formats.toml_file import toml_text
 
 LARGEST_FALLING_READING = 3.0
 """Absolute reading of the phone's axis z below which it falls [m/s^2]."""

@@ -13,7 +13,7 @@ from calibration.static.experiments import LoadDisplacementData, read_measuremen
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.sources.rig_files import RigFiles
-from reporting.table_file import table_text
+from reporting.formats.table_file import table_text
 from reporting.words import counted, is_or_are
 
 

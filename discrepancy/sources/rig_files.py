@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from reporting.toml_file import TomlTable
+from reporting.formats.toml_file import TomlTable
 
 
 class RigFiles(NamedTuple):

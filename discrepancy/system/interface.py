@@ -25,7 +25,7 @@ from fe.runtime.patch import (
     RegionStiffnessLoss,
 )
 from fe.runtime.state import Losses
-from reporting.memory import ResultCache
+from reporting.system.memory import ResultCache
 from reporting.words import brief, capital, comma_list, counted
 
 RESPONSE_CACHE_BYTES = 24_000_000

@@ -32,7 +32,7 @@ from discrepancy.system.lumped_sections import (
 )
 from discrepancy.system.model_file import ModelDescription
 from reporting.choices import did_you_mean
-from reporting.toml_file import Check, Positive
+from reporting.formats.toml_file import Check, Positive
 from reporting.words import counted, listing
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"

@@ -11,7 +11,7 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.toml_file import Check, Name, NotNegative, Number
+from reporting.formats.toml_file import Check, Name, NotNegative, Number
 
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; a parameter scales one under the name CONTROLLER.proportional etc."""

@@ -10,8 +10,8 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.system.interface import Model
-from reporting import toml_file
-from reporting.toml_file import Check, Name, NotNegative, Number, read_toml, validate
+from reporting.formats import toml_file
+from reporting.formats.toml_file import Check, Name, NotNegative, Number, read_toml, validate
 
 
 class Section(toml_file.Section):

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from reporting.figures import (
+from reporting.pages.figures import (
     OBSERVED,
     PAST,
     PREDICTION,

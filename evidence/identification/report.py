@@ -3,9 +3,9 @@
 import itertools
 from collections.abc import Sequence
 
-from reporting.figures import to_svg
-from reporting.page import Block, Highlights, Notice, Page, PageFigure, Section, render_page
-from reporting.table import PageColumn, Table, number_column
+from reporting.pages.figures import to_svg
+from reporting.pages.page import Block, Highlights, Notice, Page, PageFigure, Section, render_page
+from reporting.pages.table import PageColumn, Table, number_column
 
 from .comparison import PERCENT, Comparison
 from .figures import gauge_figure, identifiability_figure, profile_figure

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from fe.runtime.errors import ReducedModelFileError
 from reporting.errors import FileNotWrittenError
-from reporting.log import module_logger
-from reporting.operating_system import lock_descriptor, open_descriptor, read_at
+from reporting.system.log import module_logger
+from reporting.system.operating_system import lock_descriptor, open_descriptor, read_at
 
 _logger = module_logger(__name__)
 

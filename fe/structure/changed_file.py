@@ -17,7 +17,7 @@ from fe.runtime.patch import (
     Primitive,
     SupportCompliance,
 )
-from reporting.toml_file import read_toml
+from reporting.formats.toml_file import read_toml
 
 from .candidates import AXES, places_of_mesh
 from .design import Gauge, MeshDesign, load_structure, parse_structure

@@ -11,7 +11,7 @@ import numpy as np
 
 from fe.elements.kinds import DECK_KINDS, ElementKind
 from fe.runtime.arrays import IntArray
-from reporting.toml_file import short_repr
+from reporting.formats.toml_file import short_repr
 
 from .deck_text import FLAT, DeckWords, fail, whole
 from .mesh import StructureMesh

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from fe.runtime.errors import MeshError
+from reporting.formats.toml_file import parse_toml, short_repr
 from reporting.text_file import read_text
-from reporting.toml_file import parse_toml, short_repr
 
 _WORDS_FILE = parse_toml(
     resources.files("fe.structure").joinpath("deck_words.toml").read_bytes(), "decks", MeshError

@@ -23,7 +23,7 @@ from fe.elements.elasticity import (
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Check, read_toml, validate
+from reporting.formats.toml_file import Check, read_toml, validate
 
 from . import tables
 from .matrix_design import MatrixDesign

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Check
+from reporting.formats.toml_file import Check
 
 from . import tables
 

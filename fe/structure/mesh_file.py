@@ -10,7 +10,7 @@ from scipy.sparse import csgraph
 from fe.elements.cells import BATCH, jacobians
 from fe.full.fronts import analyse
 from fe.runtime.errors import MeshError
-from reporting.memory import available_memory
+from reporting.system.memory import available_memory
 
 from .abaqus import read_abaqus
 from .deck import Deck

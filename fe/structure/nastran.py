@@ -13,7 +13,7 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.toml_file import short_repr
+from reporting.formats.toml_file import short_repr
 
 from .coordinates import GLOBAL, CoordinateSystem, axes_by_points
 from .deck import Deck

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
-from reporting.toml_file import Check, Section
+from reporting.formats.toml_file import Check, Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]

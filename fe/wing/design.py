@@ -17,7 +17,7 @@ from pydantic import Field
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, default_region_names, wing_input_names
 from fe.structure.tables import DesignSection, StructureDesign
-from reporting.toml_file import Check, read_toml, validate
+from reporting.formats.toml_file import Check, read_toml, validate
 from reporting.words import brief
 
 from . import parts

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from fe.runtime.arrays import FloatArray
 from fe.structure.tables import DesignSection, Modulus
-from reporting.toml_file import Check
+from reporting.formats.toml_file import Check
 
 _FOUR_DIGIT_COEFFICIENTS = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 

@@ -32,7 +32,7 @@ from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.worker.client import WorkerLimits
 from reporting.choices import require_one_of
-from reporting.toml_file import Check, Number, Positive, Section, read_toml, validate
+from reporting.formats.toml_file import Check, Number, Positive, Section, read_toml, validate
 from reporting.words import comma_list
 
 from .bound_variables import (

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field
 
-from reporting.toml_file import Check, Number, Section
+from reporting.formats.toml_file import Check, Number, Section
 
 from .units import same_dimension
 

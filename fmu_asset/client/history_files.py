@@ -10,7 +10,7 @@ import numpy as np
 from fmu_asset.errors import FmuInputError
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.table_file import TableErrors, read_table, table_text
+from reporting.formats.table_file import TableErrors, read_table, table_text
 from reporting.words import comma_list
 
 from .binding import INPUT_ROLES, Binding

@@ -21,9 +21,9 @@ from fmu_asset.instances.statuses import status_name
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 from reporting.arrays import Float
-from reporting.log import module_logger
-from reporting.operating_system import can_supervise
-from reporting.toml_file import validate
+from reporting.formats.toml_file import validate
+from reporting.system.log import module_logger
+from reporting.system.operating_system import can_supervise
 
 from .binding import Binding
 from .reset_trial import FirstStep, InstanceStart, ResetTrial, RestartMethod

@@ -14,7 +14,7 @@ import numpy as np
 
 from fmu_asset.instances.plan import InitialValues, Instance
 from reporting.arrays import Float
-from reporting.log import module_logger
+from reporting.system.log import module_logger
 
 _logger = module_logger(__name__)
 _logged: set[tuple[str, "RestartMethod"]] = set()

@@ -16,7 +16,7 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fmu_asset.errors import FmuOutputError
-from reporting.memory import ResultCache
+from reporting.system.memory import ResultCache
 
 from .binding import Binding
 from .session import FmiAsset

@@ -12,7 +12,7 @@ from importlib.resources import files
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.packing.contents import python_members, sealed
 from fmu_asset.slaves.variables import VariableTable
-from reporting.toml_file import TomlTable
+from reporting.formats.toml_file import TomlTable
 
 _IMPORTS = """import json
 

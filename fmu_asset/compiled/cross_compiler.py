@@ -13,8 +13,8 @@ from typing import get_args
 from fe.reduction.built_once import cache_folder
 from fmu_asset.errors import FmuBuildError
 from reporting.choices import require_one_of
-from reporting.log import module_logger
 from reporting.progress import stage
+from reporting.system.log import module_logger
 
 from .compiler import COMMON_FLAGS, Compiler
 from .platforms import Target, suffix_of

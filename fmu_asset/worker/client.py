@@ -16,7 +16,7 @@ from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorke
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import REPORT_PERIOD, InitialValues, Instance, Plan
 from reporting.arrays import Float
-from reporting.toml_file import Positive, Section
+from reporting.formats.toml_file import Positive, Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
 from .protocol import (

@@ -19,7 +19,7 @@ from benchmarks.pictures.picture import (
     share_of_changed_pixels,
     with_numbers,
 )
-from reporting.figures import new_figure, to_png
+from reporting.pages.figures import new_figure, to_png
 from tests.conftest import REFERENCE
 
 LARGEST = 300_000

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
-from reporting import figures
-from reporting.page import Page, PageFigure, render_page
+from reporting.pages import figures
+from reporting.pages.page import Page, PageFigure, render_page
 
 X = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
 Y = np.array([12.0, 13.5, 11.25, 14.0, 15.0])

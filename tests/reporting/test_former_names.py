@@ -4,9 +4,9 @@ import warnings
 
 import pytest
 
-from reporting import former_names
 from reporting.errors import DamagedFileError
-from reporting.former_names import FormerNameWarning, with_present_names
+from reporting.formats import former_names
+from reporting.formats.former_names import FormerNameWarning, with_present_names
 
 PRESENT_NAMES = {
     "turn": "step",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from reporting import progress
-from reporting.log import PACKAGE_LOGGER, module_logger, shown_log
+from reporting.system.log import PACKAGE_LOGGER, module_logger, shown_log
 from tests.test_architecture import MAY_IMPORT, source_files
 
 
@@ -43,7 +43,7 @@ PRINTING = {"twin_master.__main__", "reporting.terminal"}
 def test_library_code_has_no_print_and_no_logger_of_its_own(package):
     wrong = []
     for name, path in source_files().items():
-        if name.split(".")[0] != package or name in {*PRINTING, "reporting.log"}:
+        if name.split(".")[0] != package or name in {*PRINTING, "reporting.system.log"}:
             continue
         for node in ast.walk(ast.parse(Path(path).read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call):

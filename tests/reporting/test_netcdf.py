@@ -13,9 +13,9 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reporting import netcdf
 from reporting.errors import DamagedFileError
-from reporting.netcdf import NetcdfGroup, Variable, read_groups, write_groups
+from reporting.formats import netcdf
+from reporting.formats.netcdf import NetcdfGroup, Variable, read_groups, write_groups
 from tests.refusals import refused
 
 # ---------------------------------------------------------------- written and read

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from reporting import operating_system
-from reporting.operating_system import (
+from reporting.system import operating_system
+from reporting.system.operating_system import (
     can_fork,
     is_lock_of,
     lock_descriptor,
@@ -30,7 +30,7 @@ from pathlib import Path
 if sys.argv[1] == "bytes":
     from tests.reporting.test_operating_system import stand_in_for_windows
     stand_in_for_windows()
-from reporting.operating_system import lock_folder
+from reporting.system.operating_system import lock_folder
 print(lock_folder(Path(sys.argv[2])) is not None)
 """
 

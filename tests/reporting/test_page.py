@@ -7,10 +7,10 @@ from html.parser import HTMLParser
 
 import pytest
 
-from reporting import figures
 from reporting.errors import InvalidFigureError
-from reporting.inline_svg import inline_svg
-from reporting.page import (
+from reporting.pages import figures
+from reporting.pages.inline_svg import inline_svg
+from reporting.pages.page import (
     Fold,
     Highlights,
     Notice,
@@ -20,8 +20,8 @@ from reporting.page import (
     render_page,
     script_source,
 )
-from reporting.page_words import Words
-from reporting.table import (
+from reporting.pages.page_words import Words
+from reporting.pages.table import (
     PageColumn,
     Table,
     item_table,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from reporting import provenance
 from reporting.json_file import plain
-from reporting.memory import ResultCache
+from reporting.system.memory import ResultCache
 
 # ---------------------------------------------------------------- provenance
 

@@ -4,10 +4,16 @@ import re
 
 import pytest
 
+from reporting.formats.table_file import (
+    TableErrors,
+    parse_table,
+    plain_number,
+    read_table,
+    table_text,
+)
+from reporting.formats.toml_file import parse_toml, read_toml
 from reporting.json_file import parse_json, read_json
-from reporting.table_file import TableErrors, parse_table, plain_number, read_table, table_text
 from reporting.text_file import DEEPEST_NESTING
-from reporting.toml_file import parse_toml, read_toml
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)

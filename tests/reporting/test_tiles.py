@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.browser import CHROMIUM, Tab, open_browser
-from reporting import figures
-from reporting.inline_svg import inline_svg
-from reporting.page import Fold, Page, ReportFigure, Section, render_page
-from reporting.tiles import Tile, tiles_of_figure
+from reporting.pages import figures
+from reporting.pages.inline_svg import inline_svg
+from reporting.pages.page import Fold, Page, ReportFigure, Section, render_page
+from reporting.pages.tiles import Tile, tiles_of_figure
 from tests.costs import once
 from tests.reporting.test_page import parse
 

@@ -14,7 +14,7 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from reporting.former_names import FormerNameWarning
+from reporting.formats.former_names import FormerNameWarning
 from tests.own_process import ended_by
 from tests.twin_master.runs import check_same, cut_off_after, noted, with_former_names, written
 from twin_master import workflow

@@ -19,7 +19,7 @@ from fe.structure.design import parse_structure
 from fe.wing.design import parse_design
 from fmu_asset.client.binding import parse_binding
 from fmu_asset.errors import BindingError
-from reporting.format_tables import format_page, undocumented_keys
+from reporting.formats.tables import format_page, undocumented_keys
 from scenarios import binding_files, scenario_files, structure_files
 from tests import command_line
 from tests.refusals import refused

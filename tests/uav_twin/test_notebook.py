@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from reporting.notebook import MOST_ROWS, html_table, new_panels
+from reporting.pages.notebook import MOST_ROWS, html_table, new_panels
 from tests.conftest import synthetic_calibration
 from tests.reporting.test_page import parse
 from tests.twin_master.runs import changed_scenario

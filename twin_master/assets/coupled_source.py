@@ -19,8 +19,8 @@ from fmu_asset.coupling.structure import (
     expand_connection,
 )
 from reporting.files import atomic_write_bytes, hash_file
+from reporting.formats.toml_file import Check, Number, Positive
 from reporting.progress import Progress
-from reporting.toml_file import Check, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError

@@ -16,9 +16,9 @@ from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
 from reporting.files import hash_file
-from reporting.log import module_logger
+from reporting.formats.toml_file import Check, Number, Positive
 from reporting.progress import Progress
-from reporting.toml_file import Check, Number, Positive
+from reporting.system.log import module_logger
 from reporting.units import meaning_of
 from twin_master.assets.asset_source import (
     BINDING_COPY,

@@ -289,7 +289,7 @@ def load_observation_library(path: Path) -> ObservationLibrary:
         raise MissionInputError(
             f"there is no observation library {path}: make it with `uav-twin library sample`."
         )
-    from reporting.netcdf import read_groups  # it loads xarray
+    from reporting.formats.netcdf import read_groups  # it loads xarray
 
     try:
         dataset = read_groups(path).to_dataset()

@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias
 
 from pydantic import ConfigDict, Field
 
+from reporting.formats.toml_file import read_toml, validate
 from reporting.json_file import JsonRecord
-from reporting.toml_file import read_toml, validate
 from reporting.words import comma_list
 from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
 from twin_master.assets.parameter import is_of_parameters

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from reporting.former_names import warn_of_former_names
+from reporting.formats.former_names import warn_of_former_names
 from twin_master.errors import MissionInputError
 from twin_master.feeds.feed import RecordedFeed
 from twin_master.feeds.lines import Position, first_line, rotated_files

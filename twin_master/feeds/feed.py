@@ -13,8 +13,8 @@ import xarray as xr
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
+from reporting.formats.netcdf import read_groups
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.feeds.lines import GrowingFile, Position, contains, find_file
 from twin_master.feeds.message import (

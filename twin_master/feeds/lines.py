@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import IO, BinaryIO, TypedDict, cast
 
-from reporting.operating_system import ReadableStream, is_same_beginning, polled_pieces
+from reporting.system.operating_system import ReadableStream, is_same_beginning, polled_pieces
 from twin_master.feeds.message import LARGEST_MESSAGE, Refused
 
 

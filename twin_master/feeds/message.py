@@ -19,7 +19,7 @@ from unicodedata import normalize
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.former_names import with_present_names
+from reporting.formats.former_names import with_present_names
 from reporting.json_file import parse_json
 from reporting.words import listing
 from twin_master.mission.steps import Reading

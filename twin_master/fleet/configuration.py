@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from reporting.folders import closing_lock
-from reporting.former_names import with_present_names
+from reporting.formats.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord
 from reporting.provenance import collect_provenance
 from twin_master import run_folder

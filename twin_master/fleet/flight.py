@@ -20,7 +20,7 @@ from reporting.files import (
     write_members,
 )
 from reporting.json_file import read_json
-from reporting.notebook import html_table
+from reporting.pages.notebook import html_table
 from reporting.progress import Progress, SilentProgress, note
 from reporting.words import listing
 from twin_master import run_folder

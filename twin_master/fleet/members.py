@@ -10,8 +10,8 @@ from typing import overload
 import numpy as np
 
 from reporting.arrays import Index
+from reporting.formats.toml_file import NotNegative, Number
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.toml_file import NotNegative, Number
 from twin_master.feeds.message import FeedItem
 from twin_master.scenario.section import Section
 from twin_master.seeds import generator

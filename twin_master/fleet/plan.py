@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from reporting.files import hash_file, hash_record
-from reporting.former_names import with_present_names
+from reporting.formats.former_names import with_present_names
+from reporting.formats.toml_file import Check, read_toml, validate
 from reporting.json_file import JsonObject
-from reporting.toml_file import Check, read_toml, validate
 from twin_master.assets.resolution import Overrides, OverridesOrMapping, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.feeds.broker_address import is_broker

@@ -25,8 +25,8 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
 from reporting.folders import closing_lock
 from reporting.json_file import JsonObject, JsonRecord, parse_json
-from reporting.operating_system import lock_folder, usable_processors
 from reporting.progress import Stage, stage
+from reporting.system.operating_system import lock_folder, usable_processors
 from twin_master.assets.library_source import (
     FORMAT,
     KIND,

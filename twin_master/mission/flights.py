@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
-from reporting.log import module_logger
 from reporting.progress import Progress, SilentProgress
+from reporting.system.log import module_logger
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch
 from twin_master.gauges.monitor import gauge_watch_of

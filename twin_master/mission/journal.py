@@ -27,7 +27,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_at, write_error
-from reporting.former_names import with_present_names
+from reporting.formats.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord, plain
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal_packing import (

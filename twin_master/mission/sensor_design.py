@@ -27,7 +27,7 @@ from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from reporting.arrays import Float, Index
 from reporting.files import write_members
-from reporting.toml_file import read_toml, validate
+from reporting.formats.toml_file import read_toml, validate
 from twin_master.assets.asset_source import read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
 from twin_master.errors import MissionInputError

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Float
-from reporting.log import module_logger
+from reporting.system.log import module_logger
 from twin_master.errors import ImpossibleObservation, InvalidObservationError, TwinMasterError
 from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.twin import Twin, TwinStep

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index, nan_where_masked
-from reporting.memory import available_memory
+from reporting.system.memory import available_memory
 from reporting.words import comma_list
 from twin_master.errors import InvalidModelError, TwinMasterError
 from twin_master.network.kernels import PredecessorLists

@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from reporting import figures as style
 from reporting.arrays import Float
+from reporting.pages import figures as style
 from reporting.words import capital
 from twin_master.report.reading import Run, short_number
 

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import truncnorm
 
-from reporting import figures as style
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
+from reporting.pages import figures as style
 from reporting.words import parameter_title
 from twin_master.report.reading import Run
 

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from reporting.arrays import Float
-from reporting.page import PageFigure, ReportFigure
-from reporting.page_words import Words
+from reporting.pages.page import PageFigure, ReportFigure
+from reporting.pages.page_words import Words
 from reporting.words import capital, number, parameter_title, small
 from twin_master.report.calibration import load_test, parameter_unit, true_value
 from twin_master.report.check import PredictiveCheck

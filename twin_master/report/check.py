@@ -9,8 +9,8 @@ from matplotlib.ticker import MaxNLocator
 from scipy.special import ndtr
 from scipy.stats import binom
 
-from reporting import figures as style
 from reporting.arrays import Float, Index
+from reporting.pages import figures as style
 from twin_master.report.belief import draw_step_map
 from twin_master.report.reading import NORMAL_95, Run
 

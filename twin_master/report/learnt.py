@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from reporting import figures as style
 from reporting.arrays import Float
+from reporting.pages import figures as style
 from reporting.words import between, rounded
 from twin_master.report.reading import Moments, Run, moments_of
 from twin_master.store.mission_result import LearntQuantity

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from reporting import figures as style
 from reporting.arrays import Float, Index
+from reporting.pages import figures as style
 from reporting.words import capital
 from twin_master.report.reading import NORMAL_95, Run, short_number
 from twin_master.scenario.schema import REWARD_NAMES

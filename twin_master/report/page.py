@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text
-from reporting.page import (
+from reporting.pages.figures import save_figure
+from reporting.pages.page import (
     Block,
     Fold,
     Notice,

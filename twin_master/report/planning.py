@@ -8,8 +8,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from reporting import figures as style
 from reporting.arrays import Float
+from reporting.pages import figures as style
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy
 

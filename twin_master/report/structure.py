@@ -12,8 +12,8 @@ from fe.elements.cells import CellMesh
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.structure.design import MeshDesign, load_structure
 from fe.wing.design import WingDesign, load_design
-from reporting import figures as style
 from reporting.arrays import Float, Index
+from reporting.pages import figures as style
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY

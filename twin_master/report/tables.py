@@ -7,8 +7,8 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import JsonRecord
+from reporting.pages.table import PageColumn, Table, item_table, number_column
 from reporting.provenance import provenance_items
-from reporting.table import PageColumn, Table, item_table, number_column
 from reporting.words import between, listing, number
 from twin_master.report.captions import WORDS
 from twin_master.report.learnt import (

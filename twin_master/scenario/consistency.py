@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, SerializeAsAny, model_validator
 
-from reporting.toml_file import Check
+from reporting.formats.toml_file import Check
 from reporting.words import comma_list
 from twin_master.scenario.kinds import WATCHED_KIND, AssetSection, BeliefSection
 from twin_master.scenario.mission import Calibration, Control, Mission, Reference, StateFactor

@@ -20,7 +20,7 @@ from pydantic_core import CoreSchema
 
 from fe.runtime.errors import PlugInError
 from fe.runtime.plug_ins import load_plug_ins
-from reporting.toml_file import missing_keys, short_repr
+from reporting.formats.toml_file import missing_keys, short_repr
 from scenarios import asset_scripts, binding_files, recording_files, structure_files
 from twin_master.scenario.section import Section, Table
 

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from reporting.toml_file import Check, NotNegative, Number
+from reporting.formats.toml_file import Check, NotNegative, Number
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.section import Count, Name, Probability, Section, Seed
 from twin_master.scenario.tables import ROW_SUM_TOLERANCE

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from reporting.arrays import Float, Index
-from reporting.toml_file import Check, NotNegative, Positive
+from reporting.formats.toml_file import Check, NotNegative, Positive
 from twin_master.scenario.section import Count, Name, PerSensor, Section, Table, value_count_check
 
 MODES_ROLE = "modes"

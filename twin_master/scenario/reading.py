@@ -7,8 +7,8 @@ from math import prod
 from pathlib import Path
 
 from reporting.choices import did_you_mean
-from reporting.former_names import with_present_names
-from reporting.toml_file import read_toml, validate
+from reporting.formats.former_names import with_present_names
+from reporting.formats.toml_file import read_toml, validate
 from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.toml_file import Check
+from reporting.formats.toml_file import Check
 from twin_master.scenario.consistency import ScenarioTables
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.section import Section, Table, unknown_name_check

@@ -9,10 +9,10 @@ from typing import Annotated, ClassVar, TypeAlias
 from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
 
-from reporting import toml_file
 from reporting.choices import nearest_word
+from reporting.formats import toml_file
+from reporting.formats.toml_file import Check, Positive, missing_keys, short_repr
 from reporting.json_file import JsonDocument
-from reporting.toml_file import Check, Positive, missing_keys, short_repr
 
 Table: TypeAlias = toml_file.TomlTable
 """A table of a TOML or JSON file before it is checked: values of any type by key."""

@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field
 
+from reporting.formats.toml_file import Check, NotNegative, Number, Positive, validate
 from reporting.json_file import JsonRecord
-from reporting.toml_file import Check, NotNegative, Number, Positive, validate
 from twin_master.errors import ScenarioError
 from twin_master.scenario.kinds import FileSection
 from twin_master.scenario.observation import RecordSection

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Float
-from reporting.netcdf import NetcdfGroup, Variable
-from reporting.table_file import table_text
+from reporting.formats.netcdf import NetcdfGroup, Variable
+from reporting.formats.table_file import table_text
 from twin_master.learning.expectation import Expectation, concatenate_expectations
 from twin_master.mission.plant import SensorStatus, Truth
 from twin_master.mission.residuals import expected_ahead, expected_in_steps

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import AnyArray, Index
-from reporting.netcdf import NetcdfGroup, Variable
+from reporting.formats.netcdf import NetcdfGroup, Variable
 from twin_master.scenario.schema import Scenario
 
 SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(

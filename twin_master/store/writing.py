@@ -11,9 +11,9 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text, hash_record
 from reporting.folders import restore_folder
+from reporting.formats.netcdf import NetcdfGroup, read_groups, write_groups
 from reporting.json_file import JsonObject, read_json
-from reporting.netcdf import NetcdfGroup, read_groups, write_groups
-from reporting.notebook import html_table
+from reporting.pages.notebook import html_table
 from reporting.words import brief, number, rounded
 from twin_master.assets.asset_source import AssetAndModel
 from twin_master.errors import NotResumableError, RunFolderError

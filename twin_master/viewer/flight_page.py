@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from reporting.arrays import Float
 from reporting.errors import ReportingError
 from reporting.json_file import plain
-from reporting.page import Page, Section, render_page
+from reporting.pages.page import Page, Section, render_page
 from twin_master.errors import TwinMasterError
 from twin_master.report.reading import (
     NORMAL_95,

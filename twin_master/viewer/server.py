@@ -16,7 +16,7 @@ from tornado.routing import Rule, URLSpec
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from reporting.page import script_source
+from reporting.pages.page import script_source
 from twin_master.errors import ViewError
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.flight_page import FlightPage, Request

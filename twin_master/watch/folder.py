@@ -12,8 +12,8 @@ from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.json_file import JsonObject
-from reporting.operating_system import call_on_end_signal
 from reporting.progress import Progress
+from reporting.system.operating_system import call_on_end_signal
 from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError

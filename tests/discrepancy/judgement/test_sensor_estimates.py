@@ -22,8 +22,8 @@ from discrepancy.report.printed import verdict_lines
 from discrepancy.report.sensor_table import printed_sensor_table
 from discrepancy.verdict import MovedUnknown, SensorEstimate, SensorValue, VerdictKind
 from discrepancy.workflow import investigate
-from reporting.page import render_page
-from reporting.table import Table
+from reporting.pages.page import render_page
+from reporting.pages.table import Table
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import ORIGIN, chosen, simulated
 

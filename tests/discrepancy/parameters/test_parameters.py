@@ -21,7 +21,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.response import Response
 from discrepancy.system.scales import Scales
 from discrepancy.verdict import VerdictKind
-from reporting.table import Table
+from reporting.pages.table import Table
 from tests.discrepancy.core import kit
 from tests.discrepancy.rigs import ORIGIN
 

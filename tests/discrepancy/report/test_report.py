@@ -51,9 +51,9 @@ from fe.runtime import patch as patches
 from fe.runtime.patch import PowerDamping, SensorDrift
 from fe.wing.design import load_design
 from reporting.errors import FileNotWrittenError
-from reporting.figures import page_figure
-from reporting.operating_system import lock_folder
-from reporting.page import render_page
+from reporting.pages.figures import page_figure
+from reporting.pages.page import render_page
+from reporting.system.operating_system import lock_folder
 from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import FEW, INPUTS, ORIGIN, drag_found, model_of

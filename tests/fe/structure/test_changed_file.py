@@ -22,7 +22,7 @@ from fe.runtime.patch import (
 )
 from fe.structure.changed_file import changed_tables
 from fe.structure.operators import assemble_structure
-from reporting.toml_file import toml_text
+from reporting.formats.toml_file import toml_text
 
 WriteBeam = Callable[..., Path]
 

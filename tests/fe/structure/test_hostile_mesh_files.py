@@ -9,9 +9,9 @@ import pytest
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.structure.mesh_file import read_mesh
+from reporting.formats.table_file import TableErrors, parse_table
+from reporting.formats.toml_file import parse_toml
 from reporting.json_file import parse_json
-from reporting.table_file import TableErrors, parse_table
-from reporting.toml_file import parse_toml
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)

@@ -15,7 +15,7 @@ import xarray as xr
 
 from calibration.errors import PosteriorError
 from fmu_asset.errors import FmuEndedError
-from reporting.former_names import FormerNameWarning
+from reporting.formats.former_names import FormerNameWarning
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, of_library, text_of, written

@@ -12,7 +12,7 @@ import pytest
 from scipy.special import expit, logit
 from scipy.stats import beta, betabinom, norm, t
 
-from reporting.page import render_page
+from reporting.pages.page import render_page
 from reporting.progress import Progress
 from tests.refusals import refused
 from tests.twin_master.network.decision_oracles import precise_forward_backward

@@ -11,8 +11,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reporting import figures
-from reporting.page import PageFigure, ReportFigure, render_page
+from reporting.pages import figures
+from reporting.pages.page import PageFigure, ReportFigure, render_page
 from tests.twin_master.runs import changed_scenario
 from twin_master.report import page as report
 from twin_master.report.reading import Run, read_run

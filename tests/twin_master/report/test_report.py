@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.file import run_record
-from reporting.page import ReportFigure
+from reporting.pages.page import ReportFigure
 from reporting.words import number
 from tests.refusals import Inputs, refused
 from tests.twin_master.report.conftest import (

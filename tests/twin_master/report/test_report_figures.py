@@ -10,7 +10,7 @@ from matplotlib.transforms import Bbox
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from reporting.page import ReportFigure
+from reporting.pages.page import ReportFigure
 from tests.twin_master.report.conftest import altered, figures_of_unwritten, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report

@@ -18,7 +18,7 @@ from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from fe.runtime.patch import LocalStiffnessLoss
 from fe.wing.design import SHIPPED_DESIGN
-from reporting.former_names import FormerNameWarning
+from reporting.formats.former_names import FormerNameWarning
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import merged, patch_record, table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset

@@ -18,7 +18,7 @@ import pytest
 
 from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN
-from reporting.figures import new_figure, to_svg
+from reporting.pages.figures import new_figure, to_svg
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same
 from tests.twin_master.watch.conftest import HANGS, served, viewed

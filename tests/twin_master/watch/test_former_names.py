@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from reporting import former_names
-from reporting.former_names import FormerNameWarning
+from reporting.formats import former_names
+from reporting.formats.former_names import FormerNameWarning
 from tests.twin_master.runs import journal, with_former_names
 from tests.twin_master.watch.conftest import begun, ran, viewed, watchful, write_csv
 from tests.twin_master.watch.test_teaching import tutor

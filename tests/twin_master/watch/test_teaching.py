@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.patch import ModelPatch, SensorGain, SensorSaturation
-from reporting.figures import new_figure, to_svg
+from reporting.pages.figures import new_figure, to_svg
 from tests.twin_master.runs import belief_in_journal, check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
 from twin_master.errors import MissionInputError

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from reporting.files import atomic_write_text
+from reporting.formats.toml_file import toml_text
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.toml_file import toml_text
 from reporting.words import counted
 from twin_master.fleet.configuration import fleet_config
 

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from reporting import figures as style
 from reporting.arrays import Float
+from reporting.pages import figures as style
 from twin_master.fleet.reading import severity
 from twin_master.report.reading import NORMAL_95, printed_factors
 from twin_master.scenario.schema import Scenario

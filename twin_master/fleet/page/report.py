@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.figures import page_figure
 from reporting.files import atomic_write_text
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.page import (
+from reporting.pages.figures import page_figure
+from reporting.pages.page import (
     Block,
     Highlights,
     Notice,
@@ -26,8 +26,8 @@ from reporting.page import (
     Section,
     render_page,
 )
-from reporting.page_words import Words
-from reporting.table import PageColumn, Table, number_column
+from reporting.pages.page_words import Words
+from reporting.pages.table import PageColumn, Table, number_column
 from reporting.words import counted
 from twin_master.errors import FleetError
 from twin_master.fleet.comparison import group_statistics, returns_of_group, statistic_rows

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from reporting.errors import ReportingError
-from reporting.page import render_page
+from reporting.pages.page import render_page
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.configuration import KIND, WATCHED_KIND
 from twin_master.fleet.learning.lessons import LESSONS_NAME

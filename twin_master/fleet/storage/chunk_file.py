@@ -7,7 +7,7 @@ import numpy as np
 
 from reporting.arrays import Unsigned
 from reporting.files import atomic_file, atomic_write_bytes, remove_leftovers
-from reporting.operating_system import open_descriptor
+from reporting.system.operating_system import open_descriptor
 from twin_master.errors import FleetError
 
 CHUNKS_PER_FILE = 128

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import AnyArray, Float, Index
-from reporting.former_names import warn_of_former_names
+from reporting.formats.former_names import warn_of_former_names
 from reporting.json_file import JsonObject
 from twin_master.errors import FleetError
 from twin_master.fleet.configuration import fleet_config

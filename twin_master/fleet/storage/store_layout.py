@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from reporting.arrays import AnyArray, Float, Index
+from reporting.formats.netcdf import Variable
 from reporting.json_file import JsonObject
-from reporting.netcdf import Variable
 from twin_master.scenario.schema import Scenario
 from twin_master.store.schema import (
     SCHEMA,

@@ -13,7 +13,7 @@ import numpy as np
 
 from reporting.arrays import AnyArray
 from reporting.files import explained_write_errors
-from reporting.netcdf import Variable
+from reporting.formats.netcdf import Variable
 from twin_master.fleet.plan import Fleet, Group
 from twin_master.fleet.storage.chunk_file import CHUNKS_PER_FILE, ChunkFile
 from twin_master.fleet.storage.store_address import STORE_NAME, StoreAddress

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reporting.former_names import with_present_names
+from reporting.formats.former_names import with_present_names
 from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import FleetError
 from twin_master.feeds.feed import Feed

@@ -12,8 +12,8 @@ from pathlib import Path
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.json_file import JsonObject, JsonRecord
-from reporting.operating_system import allow_many_files
 from reporting.progress import SilentProgress
+from reporting.system.operating_system import allow_many_files
 from twin_master.errors import FleetError
 from twin_master.feeds.broker_address import is_broker
 from twin_master.feeds.feed import Feed

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.transforms import Bbox
 
-from reporting.inline_svg import NARROW
+from reporting.pages.inline_svg import NARROW
 
 _ALLOWED_OVERLAP = 4.0
 """Overlap of two boxes that is ignored, since it is the margin around their letters [pt]."""

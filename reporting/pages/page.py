@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from markupsafe import Markup
 
-from reporting.inline_svg import InlineDrawing, inline_svg
-from reporting.table import Table
-from reporting.templates import html_environment
+from reporting.pages.inline_svg import InlineDrawing, inline_svg
+from reporting.pages.table import Table
+from reporting.pages.templates import html_environment
 
 if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes long to import
     from matplotlib.figure import Figure
@@ -50,7 +50,7 @@ class PageFigure(NamedTuple):
     name : str
         The name of its file, without ending.
     svg : bytes
-        The drawing, from `reporting.figures.to_svg`.
+        The drawing, from `reporting.pages.figures.to_svg`.
     title : str
         A few words in bold before the caption, which also describe the drawing to readers who
         cannot see it.
@@ -232,4 +232,4 @@ def script_source() -> str:
 
 @cache
 def _read_resource(name: str) -> str:
-    return resources.files("reporting").joinpath(name).read_text(encoding="utf-8")
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

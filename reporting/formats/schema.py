@@ -3,7 +3,7 @@
 The description of a key is the text below the field in its class. The unit of a value stands in
 brackets at the end of a clause of this text, as in "Length of the record [s].", or in
 `json_schema_extra` of the field's type. The texts of models are there only if
-`reporting.known_keys.TEXTS_ARE_READ` was set before they were defined.
+`reporting.formats.known_keys.TEXTS_ARE_READ` was set before they were defined.
 """
 
 import re

@@ -32,9 +32,9 @@ from numpy.typing import ArrayLike
 
 from reporting.errors import InvalidFigureError
 from reporting.files import atomic_write_bytes
-from reporting.hover import annotated
-from reporting.page import PageFigure, ReportFigure
-from reporting.tiles import tiles_of_figure
+from reporting.pages.hover import annotated
+from reporting.pages.page import PageFigure, ReportFigure
+from reporting.pages.tiles import tiles_of_figure
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType

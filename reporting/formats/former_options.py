@@ -14,7 +14,7 @@ from typing import Annotated, ParamSpec, TextIO, TypeVar, get_args
 import typer
 from typer.models import OptionInfo
 
-from reporting.former_names import FormerNameWarning, warn_of_former_names
+from reporting.formats.former_names import FormerNameWarning, warn_of_former_names
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")

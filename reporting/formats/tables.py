@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from reporting.format_schema import JsonSchema
+from reporting.formats.schema import JsonSchema
 from reporting.words import listing
 
 Notation = Literal["toml", "json"]

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING
 
-from reporting.page import ReportFigure
-from reporting.table import PageColumn, Table, number_column
-from reporting.templates import fill_template
+from reporting.pages.page import ReportFigure
+from reporting.pages.table import PageColumn, Table, number_column
+from reporting.pages.templates import fill_template
 
 if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes long to import
     from matplotlib.figure import Figure

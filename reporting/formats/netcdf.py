@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 from reporting.arrays import AnyArray
 from reporting.errors import DamagedFileError
-from reporting.operating_system import can_fork
+from reporting.system.operating_system import can_fork
 
 if TYPE_CHECKING:
     import h5py

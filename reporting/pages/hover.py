@@ -23,7 +23,7 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
 from reporting.arrays import Float
-from reporting.table_file import is_number
+from reporting.formats.table_file import is_number
 
 _POINTS_PER_INCH = 72.0
 _MOST_CELLS = 5000

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from reporting.log import module_logger
+from reporting.system.log import module_logger
 
 _logger = module_logger(__name__)
 _reported_weaknesses: set[str] = set()

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Self, TypeAlias, TypeVar, cast
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from reporting import known_keys
 from reporting.choices import nearest_word
+from reporting.formats import known_keys
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 from reporting.words import counted, is_or_are, listing, small
 

@@ -1,0 +1,1 @@
+"""Files of users and results: keys, schemas, tables, NetCDF."""
