@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable
 from reporting.formats.toml_file import toml_value
-from reporting.units import BASE_UNITS, meaning_of
+from reporting.units import BASE_UNITS, conversion_of
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")
 """Name of an element of an array: `strain[1]` or `health.z1`."""
@@ -92,7 +92,7 @@ class Declaration:
 
 def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> None:
     """Complete the declaration of a unit from its name and a display unit."""
-    meaning = meaning_of(name)
+    meaning = conversion_of(name)
     if meaning is None:
         return
     for symbol, exponent in zip(BASE_UNITS, meaning.exponents, strict=True):
@@ -102,7 +102,7 @@ def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> No
         unit.base["factor"] = meaning.factor
         unit.base["offset"] = meaning.offset
     if display_unit:
-        display_meaning = meaning_of(display_unit)
+        display_meaning = conversion_of(display_unit)
         if display_meaning is not None:
             unit.displays[display_unit] = meaning.factor / display_meaning.factor
 

@@ -95,7 +95,7 @@ def _destination(path: Path) -> Path:
 def refuse_address(path: Path) -> None:
     """Refuse a path that is the address of a service, such as s3://BUCKET/NAME.
 
-    `Path` has made one slash of two; the first part is left, such as "s3:".
+    An address is recognised by its first part, such as "s3:", since `Path` joins its two slashes.
 
     Raises
     ------
@@ -129,9 +129,9 @@ def synchronise(path: Path) -> None:
 
 
 def write_at(path: Path, data: bytes, position: int) -> None:
-    """Write bytes into an existing file, which is open for this time alone.
+    """Write bytes at a position of an existing file; the file is opened and closed for them.
 
-    Once this returns, the bytes survive if the process is killed, but not a loss of power.
+    The bytes are not flushed to the disk: they survive a kill of the process, but no power failure.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def write_at(path: Path, data: bytes, position: int) -> None:
     data : bytes
         The bytes.
     position : int
-        The position of the first one [bytes].
+        The position of the first byte in the file [bytes].
 
     Raises
     ------
@@ -263,7 +263,9 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> Path:
 
 
 def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, bytes]:
-    """Return the contents of the files below a folder by their relative paths, in order.
+    """Read the files below a folder into memory, and return their contents by relative path.
+
+    The entries are sorted by path.
 
     Parameters
     ----------
@@ -283,7 +285,7 @@ def read_members(folder: Path, suffixes: Collection[str] = ()) -> dict[str, byte
 
 
 def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
-    """Write files below a folder unless they exist; raises as `atomic_file`.
+    """Write files below a folder; raises as `atomic_file`. A file that exists is left unchanged.
 
     Parameters
     ----------
@@ -314,7 +316,7 @@ def remove_leftovers(folder: str | os.PathLike[str]) -> int:
 
 
 def hash_tree(root: Path, *, suffixes: Iterable[str]) -> str:
-    """Return the SHA-256 of the files below a folder that have one of the suffixes.
+    """Return the SHA-256 over names and contents of the files below a folder with these suffixes.
 
     Line ends of Windows and of Unix give the same hash.
     """
@@ -324,7 +326,7 @@ def hash_tree(root: Path, *, suffixes: Iterable[str]) -> str:
 
 
 def hash_members(members: Mapping[str, bytes]) -> str:
-    """Return the SHA-256 over the names and contents of files, which are sorted by name."""
+    """Return the SHA-256 over the names and contents of files; their order does not matter."""
     digest = hashlib.sha256()
     for name, content in sorted(members.items()):
         digest.update(f"{name}\0{len(content)}\0".encode())

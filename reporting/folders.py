@@ -32,7 +32,10 @@ def closing_lock(lock: int) -> Iterator[None]:
 
 
 def fresh_folder(folder: Path) -> Path:
-    """Return a new empty folder next to `folder`, with the permissions of the user's umask.
+    """Make an empty temporary folder next to `folder`, and return it.
+
+    Missing parents of `folder` are made. The new folder has the permissions of the user's umask,
+    and the caller removes it or moves it into place.
 
     Raises
     ------
@@ -100,7 +103,7 @@ def whole_folder(
 
 
 def replace_folder(fresh: Path, folder: Path) -> None:
-    """Replace a folder by a new one, and remove the old one. This process has locked both.
+    """Replace a folder by a new one, and remove the old one; the caller has locked both.
 
     If the process is killed meanwhile, either the new or the old folder is in place, or
     `restore_folder` can put the old one back.

@@ -125,15 +125,16 @@ def _null(_: float) -> None:
 
 
 def plain(value: object, not_finite: Callable[[float], object] = _null) -> JsonDocument:
-    """Return a value as plain data of JSON: records by their fields, arrays as lists.
+    """Return a value as plain data of JSON.
+
+    A dataclass becomes an object with the fields that its constructor takes, an enum its value, an
+    array or a tuple a list, and an object with a method `to_list` what that returns. Keys become
+    texts. Any other value is returned as it is.
 
     Parameters
     ----------
-    value : object
-        Numbers, words, arrays, records, and collections of these. An object with a method
-        `to_list` is written as that returns it.
     not_finite : callable
-        Returns what replaces a NaN or an infinity; null by default.
+        Returns what replaces a NaN or an infinity, which JSON lacks; null by default.
     """
     if hasattr(value, "to_list"):
         return value.to_list()

@@ -49,12 +49,12 @@ class Progress:
 
     @contextmanager
     def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
-        """Return a context for a part of the work.
+        """Return a context for a part of the work; it yields the `Stage` that takes its reports.
 
         Parameters
         ----------
         description : str
-            Whether variables are set or read.
+            What is being done, such as "Flying".
         total : int, optional
             The number of units of work; None if it is not known.
         unit : str
@@ -108,8 +108,8 @@ class _BarStage(Stage):
 class _LineStage(Stage):
     """A stage that is shown as lines, on a pipe or in a log.
 
-    If the work reports nothing for `LONGEST_SILENCE`, a thread repeats the last detail, so that the
-    reader sees that the work goes on.
+    A thread shows the last detail again before the work has been silent for `LONGEST_SILENCE`, so
+    that the reader sees that it goes on. `stop` or `end` ends the thread.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class _LineStage(Stage):
         threading.Thread(target=self._break_silence, daemon=True).start()
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
-        """Show how much is done, unless the last line is recent."""
+        """Note how much is done; show it if the last line is `SECONDS_BETWEEN_LINES` old."""
         self._done += amount
         self._detail = detail
         now = time.perf_counter()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pint import UnitRegistry
 
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-"""Units of SI, in the order of `Meaning.exponents`."""
+"""Base units of SI and the radian, in the order of `SiConversion.exponents`."""
 _PINT_BASE_UNITS = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
 """The same units in pint, whose unit of mass is the gram."""
 _PINT_NAMES = {
@@ -62,8 +62,8 @@ _ERRORS_OF_THE_PARSER = (AssertionError, AttributeError, TypeError, ArithmeticEr
 """What pint raises of texts that are not units, beside errors of its own."""
 
 
-class Meaning(NamedTuple):
-    """The conversion of a unit: SI value = `factor` * value + `offset`.
+class SiConversion(NamedTuple):
+    """The conversion of a unit to SI: SI value = `factor` * value + `offset`.
 
     Attributes
     ----------
@@ -78,31 +78,31 @@ class Meaning(NamedTuple):
     offset: float = 0.0
 
 
-class ExactMeaning(NamedTuple):
-    """The conversion of a unit in fractions, see `Meaning`."""
+class ExactSiConversion(NamedTuple):
+    """The conversion of a unit in fractions, see `SiConversion`."""
 
     exponents: tuple[int, ...]
     factor: Fraction
     offset: Fraction
 
 
-def _meaning(factor: float, **exponents: int) -> Meaning:
-    """Return the meaning of a unit from its factor and the exponents of its base units."""
-    return Meaning(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor)
+def _conversion(factor: float, **exponents: int) -> SiConversion:
+    """Return the conversion of a unit from its factor and the exponents of its base units."""
+    return SiConversion(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor)
 
 
 _COMMON_UNITS = {
-    "1": _meaning(1.0),
-    "%": _meaning(0.01),
-    "microstrain": _meaning(1e-6),
-    "m": _meaning(1.0, m=1),
-    "mm": _meaning(1e-3, m=1),
-    "kg": _meaning(1.0, kg=1),
-    "g": _meaning(1e-3, kg=1),
-    "s": _meaning(1.0, s=1),
-    "Hz": _meaning(1.0, s=-1),
-    "1/s": _meaning(1.0, s=-1),
-    "N": _meaning(1.0, kg=1, m=1, s=-2),
+    "1": _conversion(1.0),
+    "%": _conversion(0.01),
+    "microstrain": _conversion(1e-6),
+    "m": _conversion(1.0, m=1),
+    "mm": _conversion(1e-3, m=1),
+    "kg": _conversion(1.0, kg=1),
+    "g": _conversion(1e-3, kg=1),
+    "s": _conversion(1.0, s=1),
+    "Hz": _conversion(1.0, s=-1),
+    "1/s": _conversion(1.0, s=-1),
+    "N": _conversion(1.0, kg=1, m=1, s=-2),
 }
 """Units of nearly every FMU; pint takes long to import."""
 
@@ -206,7 +206,7 @@ def _pint_factor(factor: re.Match[str], *, gravity: bool) -> str:
 
 
 @cache
-def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
+def exact_conversion(unit: str, *, gravity: bool = False) -> ExactSiConversion:
     """Return the conversion of a unit to SI, in fractions.
 
     Names with SI prefixes are joined by `.`, `*`, `/` or a blank. A power follows its name (`m2`,
@@ -248,16 +248,18 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
     factor = Fraction(str(factor_to_root_units)) / Fraction(1000) ** exponent_of_mass
     if not _SMALLEST_FACTOR < abs(factor) < _LARGEST_FACTOR:
         raise ValueError(f"{unit!r} is beyond the numbers of a computer")
-    return ExactMeaning(tuple(int(exponent) for exponent in exponents), factor, Fraction(offset))
+    return ExactSiConversion(
+        tuple(int(exponent) for exponent in exponents), factor, Fraction(offset)
+    )
 
 
 @lru_cache(maxsize=1024)
-def meaning_of(unit: str) -> Meaning | None:
-    """Return the conversion of a unit to SI, or None if `exact_meaning` refuses it."""
+def conversion_of(unit: str) -> SiConversion | None:
+    """Return the conversion of a unit to SI, or None if `exact_conversion` refuses it."""
     if unit in _COMMON_UNITS:
         return _COMMON_UNITS[unit]
     try:
-        exponents, factor, offset = exact_meaning(unit)
-        return Meaning(exponents, float(factor), float(offset))
+        exponents, factor, offset = exact_conversion(unit)
+        return SiConversion(exponents, float(factor), float(offset))
     except (ValueError, OverflowError):
         return None

@@ -11,7 +11,10 @@ from tests.own_process import ended_by
 ROOT = Path(__file__).parents[1]
 FORKS = ("os." + "fork(", 'get_context("' + 'fork")')
 ALLOWED = {
-    ROOT / "reporting" / "netcdf.py": "reads a file with h5py, which holds its own lock while it forks",
+    ROOT
+    / "reporting"
+    / "formats"
+    / "netcdf.py": "reads a file with h5py, which holds its own lock while it forks",
     ROOT / "fmu_asset" / "worker" / "supervisor.py": "forks before it loads any library",
 }
 """Files of the product that fork, and why the fork meets no thread."""

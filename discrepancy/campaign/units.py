@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Quantity
-from reporting.units import exact_meaning
+from reporting.units import exact_conversion
 from reporting.words import listing
 
 _TABLES = Path(__file__).with_suffix(".toml")
@@ -109,8 +109,8 @@ def conversion_factor(unit: str, si: str) -> float:
         return 1.0  # without pint, which takes a third of a second to load
     # acceleration is the only quantity for which `g` is the standard gravity, and not a gram
     gravity = si == UNITS[Quantity.ACCELERATION].si
-    dimension, factor, _ = exact_meaning(unit, gravity=gravity)
-    si_dimension, si_factor, _ = exact_meaning(si, gravity=gravity)
+    dimension, factor, _ = exact_conversion(unit, gravity=gravity)
+    si_dimension, si_factor, _ = exact_conversion(si, gravity=gravity)
     if dimension != si_dimension:
         raise ValueError(f"{unit!r} cannot become {si}")
     return float(factor / si_factor)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription
 from fmu_asset.client.units import contradictions
 from fmu_asset.packing.structure_fmu import recorded_content_hash
-from reporting.units import meaning_of
+from reporting.units import conversion_of
 
 from .finding import CheckResult, Finding
 
@@ -100,7 +100,7 @@ def _check_units(description: FmuDescription) -> list[CheckResult]:
         sentences.append(f"{count} real variables have no unit: {_listed(without_unit)}.")
     defined = {unit.name for unit in description.units if unit.exponents is not None}
     used_units = {variable.unit for variable in reals if variable.unit}
-    unknown_units = [unit for unit in sorted(used_units - defined) if meaning_of(unit) is None]
+    unknown_units = [unit for unit in sorted(used_units - defined) if conversion_of(unit) is None]
     if unknown_units:
         sentences.append(
             f"Nothing can be converted to {_listed(unknown_units)}: the FMU does not define it in "

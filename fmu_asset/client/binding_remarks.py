@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping
 
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
-from reporting.units import meaning_of
+from reporting.units import conversion_of
 from reporting.words import counted, listing
 
 from .binding import INPUT_ROLES, Binding
@@ -113,5 +113,5 @@ def _bound_units(binding: Binding) -> Iterator[tuple[str, str]]:
 
 def _is_unit_of_si(unit: str) -> bool:
     """Return whether a unit is an SI unit without prefix, or unknown."""
-    meaning = meaning_of(unit)
+    meaning = conversion_of(unit)
     return meaning is None or (meaning.factor, meaning.offset) == (1.0, 0.0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo, VariableInfo
 from fmu_asset.errors import BindingError
-from reporting.units import Meaning, meaning_of
+from reporting.units import SiConversion, conversion_of
 
 
 def same_dimension(first: str, second: str) -> bool | None:
@@ -14,8 +14,8 @@ def same_dimension(first: str, second: str) -> bool | None:
     # without loading pint, which takes a third of a second
     if first == second:
         return True
-    first_meaning = meaning_of(first)
-    second_meaning = meaning_of(second)
+    first_meaning = conversion_of(first)
+    second_meaning = conversion_of(second)
     if first_meaning is None or second_meaning is None:
         return None
     return first_meaning.exponents == second_meaning.exponents
@@ -98,7 +98,7 @@ def contradictions(definitions: Sequence[UnitInfo]) -> list[str]:
     """Return a sentence for every unit that an FMU defines otherwise than usual."""
     sentences = []
     for definition in definitions:
-        common_meaning = meaning_of(definition.name)
+        common_meaning = conversion_of(definition.name)
         if common_meaning is None or definition.exponents is None:
             continue
         # Radians are a dimension in FMI, but not in SI; "1/s" and "rad/s" are mixed up everywhere.
@@ -145,12 +145,12 @@ def between(
     return Conversion(source_meaning.factor / target_meaning.factor, offset)
 
 
-def meaning(unit: str, definitions: Sequence[UnitInfo]) -> Meaning | None:
+def meaning(unit: str, definitions: Sequence[UnitInfo]) -> SiConversion | None:
     """Return the meaning of a unit in SI, as the FMU or else common use defines it.
 
     None if the unit is unknown.
     """
     for definition in definitions:
         if definition.name == unit and definition.exponents is not None and definition.factor:
-            return Meaning(definition.exponents, definition.factor, definition.offset)
-    return meaning_of(unit)
+            return SiConversion(definition.exponents, definition.factor, definition.offset)
+    return conversion_of(unit)

@@ -26,15 +26,17 @@ def with_present_names(
     source: str,
     error: type[Exception],
 ) -> dict[str, object]:
-    """Return the content of a file, with keys that were renamed under their present names.
+    """Return the content of a file in which each key has its present name.
+
+    The record itself is not changed.
 
     Parameters
     ----------
     record : dict of str to object
         The content, as it was read.
     present_names : dict of str to str
-        The present name of a key, by the location that it had before: "planner.inspections". The
-        location of a key in a table of a list has no number, and `*` stands for every key.
+        The present name of a key, by its former location, such as "planner.inspections". A
+        location does not number the tables of a list, and `*` stands for every key.
     source : str
         The name of the file, or what else was read; begins the message.
     error : type of Exception

@@ -28,8 +28,8 @@ def accepts_former_options(
 ) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
     """Return a decorator for a command whose options had other names in earlier versions.
 
-    The default of such an option must be None. A value under the former name is passed on with a
-    warning; both names together are refused.
+    The default of such an option must be None, since None means that it was not given. A value
+    under the former name is passed on with a warning; both names together are refused.
 
     Parameters
     ----------
@@ -57,16 +57,9 @@ def accepts_former_options(
 
 
 def _hidden_parameter(parameter: inspect.Parameter, former_flag: str) -> inspect.Parameter:
-    """Return the parameter of a command that takes an option under its former name.
+    """Return a parameter that takes an option under its former flag, such as "--turns".
 
     It has the type and the limits of the option, and does not appear in the help.
-
-    Parameters
-    ----------
-    parameter : inspect.Parameter
-        The parameter of the option, annotated for Typer.
-    former_flag : str
-        The former name, such as "--turns".
     """
     value_type, *metadata = get_args(parameter.annotation)
     (present_option,) = [entry for entry in metadata if isinstance(entry, OptionInfo)]

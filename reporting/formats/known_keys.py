@@ -16,15 +16,18 @@ It reads them when a model is defined, from its source: 0.2 s for those of a sce
 
 
 def keys_of_table(model: object, location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that the table at a location of a file may have; empty if it is not known.
+    """Return the keys that the table at a location of a file may have.
+
+    If several classes may describe the table, the keys are those of all of them. The list is empty
+    if no class describes it.
 
     Parameters
     ----------
     model : type
-        The class that describes the file.
+        The class that describes the file: a model of pydantic, a dataclass, or a union of them.
     location : tuple of int and str
-        The keys and indices that lead to the table. Entries that are neither, such as the names of
-        types that pydantic adds, are passed over.
+        The keys and indices that lead to the table. An entry that leads nowhere is passed over,
+        since pydantic adds names of types to its locations.
     """
     types = [*_alternatives(model)]
     for step in location:

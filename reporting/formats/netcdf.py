@@ -77,7 +77,7 @@ class NetcdfGroup:
 def write_groups(
     path: Path, groups: Mapping[str, NetcdfGroup], attrs: Mapping[str, object]
 ) -> None:
-    """Write a NetCDF-4 file; equal arguments give equal bytes.
+    """Write a NetCDF-4 file, replacing one that exists; equal arguments give equal bytes.
 
     Parameters
     ----------
@@ -205,20 +205,10 @@ def read_groups(path: Path) -> xr.DataTree:
 
 
 def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
-    """Return the groups of a file, which a forked process reads.
+    """Return the groups of a file by path, or one line on why the file cannot be read.
 
-    A damaged file can make the HDF5 library crash, hang or fill the memory. The fork takes the
-    damage.
-
-    Parameters
-    ----------
-    path : Path
-        The path of the file.
-
-    Returns
-    -------
-    dict of str to Dataset, or str
-        The groups, or the reason why the file cannot be read.
+    A forked process reads the file, because a damaged file can make the HDF5 library crash, hang or
+    fill the memory.
     """
     reading_end, writing_end = os.pipe()
     with warnings.catch_warnings():
@@ -243,12 +233,8 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
 def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
     """In the forked process, send the groups of a file, or why it cannot be read, and end.
 
-    Parameters
-    ----------
-    path : Path
-        The path of the file.
-    writing_end : int
-        The file descriptor of the pipe to the parent process.
+    `writing_end` is the descriptor of the pipe to the parent process. All other descriptors but
+    those of standard streams are closed.
     """
     try:
         # Among the inherited descriptors may be the lock of a run folder, which must end with the
@@ -280,14 +266,10 @@ def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
 
 
 def _limit_resources(file_size: int) -> None:
-    """Limit time and memory of this process to what a file of this size may need.
+    """Limit time and memory of this process to what a file of this size [bytes] may need.
 
-    The kernel ends the process when it exceeds a limit.
-
-    Parameters
-    ----------
-    file_size : int
-        The size of the file [bytes].
+    The kernel ends the process when it exceeds a limit of time; beyond the limit of memory,
+    allocations fail. Signals that the parent process handles end this one.
     """
     import resource
 

@@ -102,16 +102,10 @@ class _DescribedSchema(GenerateJsonSchema):
 
 
 def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
-    """Return the schema of a class with the units of its keys, and without keys that no file has.
+    """Return the schema that pydantic made of a class, with units, and without keys no file has.
 
-    A key without a text below its field has the text of the base class.
-
-    Parameters
-    ----------
-    schema : dict
-        The schema of the class as pydantic makes it.
-    cls : type
-        The class.
+    A key without a text below its field has the text of the base class. A key with
+    `MUST_BE_STATED` loses its default and is required.
     """
     if "properties" not in schema:
         return schema

@@ -31,9 +31,7 @@ class TableErrors(NamedTuple):
 
 
 def plain_number(text: str) -> float:
-    """Return the number in a text that is written with the digits 0 to 9.
-
-    NaN and infinities are accepted.
+    """Return the number in a text that is written with the digits 0 to 9, or is NaN or infinite.
 
     Raises
     ------

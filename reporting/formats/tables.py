@@ -11,7 +11,7 @@ from reporting.formats.schema import JsonSchema
 from reporting.words import listing
 
 Notation = Literal["toml", "json"]
-"""The language of the files of a format, in which places are written."""
+"""The language of the files of a format, in which locations are written."""
 
 _TYPE_NAMES = {
     "string": "text",
@@ -53,12 +53,12 @@ class KeyTable:
     ----------
     schema : dict
         The JSON Schema of the table.
-    places : list of str
+    locations : list of str
         Where the table can stand in a file; empty for the file as a whole.
     """
 
     schema: JsonSchema
-    places: list[str] = field(default_factory=list)
+    locations: list[str] = field(default_factory=list)
 
     @property
     def kind(self) -> str | None:
@@ -107,7 +107,7 @@ def _with_addresses(tables: Sequence[KeyTable], page: str) -> list[PrintedTable]
     counts: Counter[str] = Counter()
     printed = []
     for group in _groups(tables):
-        anchor = _anchor(_heading(group[0]) if len(group) == 1 else _heading_of_places(group[0]))
+        anchor = _anchor(_heading(group[0]) if len(group) == 1 else _heading_of_locations(group[0]))
         number = f"-{counts[anchor]}" if counts[anchor] else ""
         counts[anchor] += 1
         printed += [PrintedTable(table.schema, f"{page}#{anchor}{number}") for table in group]
@@ -152,12 +152,19 @@ def format_page(
 
 
 def _groups(tables: Sequence[KeyTable]) -> list[list[KeyTable]]:
-    """Return the tables, those together that differ in their `kind` and can stand in one place."""
+    """Return the tables in groups; tables that differ only in their `kind` are one group.
+
+    They follow one another and have the same locations in a file.
+    """
     groups: list[list[KeyTable]] = []
     for table in tables:
+        previous = groups[-1][0] if groups else None
         is_further_kind = (
-            groups and table.kind is not None and groups[-1][0].kind is not None
-        ) and groups[-1][0].places == table.places
+            previous is not None
+            and previous.kind is not None
+            and table.kind is not None
+            and previous.locations == table.locations
+        )
         if is_further_kind:
             groups[-1].append(table)
         else:
@@ -191,7 +198,7 @@ def _section_of_kinds(
         )
     return "\n\n".join(
         [
-            f"## {_heading_of_places(group[0])}",
+            f"## {_heading_of_locations(group[0])}",
             "The key `kind` decides the other keys.",
             _lines_of_table([["kind", "meaning", "keys [unit]"], *kinds]),
             _markdown_table(sorted(rows_of_keys, key=lambda row: row.key)),
@@ -200,7 +207,7 @@ def _section_of_kinds(
 
 
 def _markdown_table(rows: Sequence[KeyRow]) -> str:
-    """Return rows as a table of Markdown, without the optional columns in which all are empty."""
+    """Return rows as a table of Markdown, without optional columns that have no entry."""
     columns = [
         name
         for name in KeyRow._fields
@@ -221,11 +228,11 @@ def undocumented_keys(schema: JsonSchema) -> list[str]:
     keys = []
     for table in _TableFinder(schema, "json").tables:
         for key, key_schema in table.schema["properties"].items():
-            place = f"{' '.join(table.places)} {key}".strip()
+            location = f"{' '.join(table.locations)} {key}".strip()
             if not _description(key_schema, schema):
-                keys.append(f"{place}: no description")
+                keys.append(f"{location}: no description")
             elif "unit" not in key_schema and "number" in _basic_types(key_schema, schema):
-                keys.append(f"{place}: no unit")
+                keys.append(f"{location}: no unit")
     return keys
 
 
@@ -241,45 +248,45 @@ class _TableFinder:
         self._notation = notation
         self._waiting: list[tuple[JsonSchema, str]] = [(schema, "")]
         while self._waiting:
-            node, place = self._waiting.pop(0)
-            self._visit(node, place)
+            node, location = self._waiting.pop(0)
+            self._visit(node, location)
 
-    def _visit(self, node: JsonSchema, place: str) -> None:
-        """Add the tables that a part of the schema describes, and note the tables inside them."""
+    def _visit(self, node: JsonSchema, location: str) -> None:
+        """Add the tables that a part of the schema describes, and queue the tables inside them."""
         node = _resolved(node, self._root)
         for key in _ALTERNATIVES:
             for alternative in node.get(key, ()):
-                self._visit(alternative, place)
+                self._visit(alternative, location)
         if "items" in node:
-            self._visit(node["items"], self._place_of_row(place))
+            self._visit(node["items"], self._location_of_row(location))
         for entry in node.get("prefixItems", ()):
-            self._visit(entry, place)
+            self._visit(entry, location)
         if isinstance(node.get("additionalProperties"), dict):
-            self._visit(node["additionalProperties"], self._place_in(place, "NAME"))
+            self._visit(node["additionalProperties"], self._location_in(location, "NAME"))
         if "properties" in node:
-            self._add_table(node, place)
+            self._add_table(node, location)
 
-    def _add_table(self, node: JsonSchema, place: str) -> None:
-        """Add a table, or a further place of a table that was found before."""
+    def _add_table(self, node: JsonSchema, location: str) -> None:
+        """Add a table, or a further location of a table that was found before."""
         for table in self.tables:
             if table.schema == node:
-                if place not in table.places:
-                    table.places.append(place)
+                if location not in table.locations:
+                    table.locations.append(location)
                 return
-        self.tables.append(KeyTable(node, [place]))
+        self.tables.append(KeyTable(node, [location]))
         for key, key_schema in node["properties"].items():
-            self._waiting.append((key_schema, self._place_in(place, key)))
+            self._waiting.append((key_schema, self._location_in(location, key)))
 
-    def _place_in(self, place: str, key: str) -> str:
-        """Return the place of a table inside another table."""
+    def _location_in(self, location: str, key: str) -> str:
+        """Return the location of a table inside another table."""
         if self._notation == "json":
-            return f"{place}.{key}".lstrip(".")
-        inner_place = place.strip("[]")
-        return f"[{inner_place}.{key}]".replace("[.", "[")
+            return f"{location}.{key}".lstrip(".")
+        inner_location = location.strip("[]")
+        return f"[{inner_location}.{key}]".replace("[.", "[")
 
-    def _place_of_row(self, place: str) -> str:
-        """Return the place of a table in a list of tables."""
-        return f"{place}[]" if self._notation == "json" else f"[{place}]"
+    def _location_of_row(self, location: str) -> str:
+        """Return the location of a table in a list of tables."""
+        return f"{location}[]" if self._notation == "json" else f"[{location}]"
 
 
 def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:
@@ -292,18 +299,18 @@ def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:
 
 
 def _heading(table: KeyTable) -> str:
-    """Return the heading of a table: its places, and its kind if it has one."""
-    heading = _heading_of_places(table)
+    """Return the heading of a table: its locations, and its kind if it has one."""
+    heading = _heading_of_locations(table)
     if table.kind is not None:
         return f'{heading}, kind "{table.kind}"'
     variant = table.schema.get("variant")
     return f"{heading}, {variant}" if variant else heading
 
 
-def _heading_of_places(table: KeyTable) -> str:
-    """Return the places of a table as a heading."""
-    places = [f"`{place}`" for place in table.places if place]
-    return listing(places) if places else "The file"
+def _heading_of_locations(table: KeyTable) -> str:
+    """Return the locations of a table as a heading."""
+    locations = [f"`{location}`" for location in table.locations if location]
+    return listing(locations) if locations else "The file"
 
 
 def _anchor(heading: str) -> str:
@@ -315,17 +322,7 @@ def _anchor(heading: str) -> str:
 def _rows(
     table: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]
 ) -> Iterator[KeyRow]:
-    """Yield the rows of a table of keys.
-
-    Parameters
-    ----------
-    table : dict
-        The JSON Schema of the table.
-    root : dict
-        The JSON Schema of the format.
-    link : callable
-        Returns the link to a table, given its schema.
-    """
+    """Yield a row for each key of a table, whose schema is a part of `root`."""
     required = table.get("required", ())
     for key, key_schema in table["properties"].items():
         unit = key_schema.get("unit", "")
@@ -374,14 +371,8 @@ def _default_text(schema: JsonSchema) -> str:
 def _type_text(node: JsonSchema, root: JsonSchema, link: Callable[[JsonSchema], str]) -> str:
     """Return the type of a value in words, such as "list of: number".
 
-    Parameters
-    ----------
-    node : JsonSchema
-        The schema of the value.
-    root : JsonSchema
-        The schema of the whole format, with the definitions to which `node` may refer.
-    link : callable
-        Returns a link to the section of the page about a table.
+    References of `node` are looked up in `root`, the schema of the whole format. `link` returns the
+    link to a table.
     """
     node = _resolved(node, root)
     if "const" in node:

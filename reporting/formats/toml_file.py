@@ -110,20 +110,9 @@ def _has_too_long_key(text: str) -> bool:
 def _check_integers(
     node: dict[str, object] | list[object], location: str, source: str, error: type[Exception]
 ) -> None:
-    """Refuse integers beyond 64 bits.
+    """Refuse integers beyond 64 bits in a part of a document, which has the given location.
 
     TOML refuses them (its specification, "Integer"), but `tomllib` does not.
-
-    Parameters
-    ----------
-    node : dict or list
-        A table or an array of the document.
-    location : str
-        The location of the node in the document, such as "tables[1].key".
-    source : str
-        Where the document is from; begins the message.
-    error : type of Exception
-        The exception to raise.
     """
     entries = list(node.items()) if isinstance(node, dict) else list(enumerate(node, start=1))
     for key, value in entries:
@@ -145,8 +134,8 @@ def _check_integers(
 def toml_text(content: Mapping[str, object]) -> str:
     """Return plain data as TOML, from which `parse_toml` returns the same data.
 
-    Values None are left out. A table inside a table is written in one line, a long array in
-    several.
+    Values that are None are left out, and do not come back. A table inside a table is written in
+    one line, a long array in several.
     """
     values: dict[str, object] = {}
     tables: dict[str, dict[str, object]] = {}
@@ -240,7 +229,7 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 Check = tuple[object, str]
-"""Whether a check of a table failed (a true value), and the message that is told then."""
+"""Whether a check of a table has failed (any true value), and the message that is then raised."""
 
 
 class Section(BaseModel):
@@ -256,8 +245,8 @@ class Section(BaseModel):
     def checks(self) -> Iterator[Check]:
         """Yield (has failed, message) of each check of the table.
 
-        The first one that failed is raised, and those after it are not evaluated. A check may
-        therefore rely on those before it.
+        The message of the first check that has failed is raised, and later checks are not
+        evaluated. So a check may rely on those before it.
         """
         yield from ()
 
@@ -362,16 +351,8 @@ _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 def _validation_message(error: ValidationError, model: object, what: str, first_index: int) -> str:
     """Return the message about the fault, among those of pydantic, that helps the user most.
 
-    Parameters
-    ----------
-    error : ValidationError
-        The error of pydantic, with all faults.
-    model : type
-        The class that describes the file.
-    what : str
-        What the file describes, with its article.
-    first_index : int
-        The number of the first entry of a list in messages.
+    Unknown keys come first, then all missing keys, then the first value that does not fit. The
+    parameters are those of `validate`.
     """
     faults = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
@@ -395,7 +376,7 @@ def _message_of_all_faults(
     """Return the message about all faults that pydantic found, one for each place in the file.
 
     A misspelt key is reported twice, as unknown and as missing. So keys that are missing in a table
-    with unknown keys are left out. The parameters are those of `_validation_message`.
+    with unknown keys are left out. The parameters are those of `validate`.
     """
     faults = error.errors(include_url=False)
     unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
@@ -470,16 +451,10 @@ def _missing_locations(fault: ErrorDetails, first_index: int) -> list[str]:
 
 
 def _location_in_file(location: tuple[int | str, ...], first_index: int) -> str:
-    """Return a location such as "tables[1].key".
+    """Return a location of pydantic as messages write it, such as "tables[1].key".
 
-    Names of types, which pydantic adds to its locations, are left out.
-
-    Parameters
-    ----------
-    location : tuple of int and str
-        The location as pydantic gives it.
-    first_index : int
-        The number of the first entry of a list in messages.
+    Names of types, which pydantic adds to its locations, are left out. The entries of a list are
+    numbered from `first_index`.
     """
     text = ""
     for step in location:

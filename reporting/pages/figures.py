@@ -236,7 +236,7 @@ def panels(
 
 
 def keep_first_panels(grid_of_axes: list[list[Axes]], count: int) -> list[Axes]:
-    """Return the first panels, row by row, and remove the others from the figure."""
+    """Return the first `count` panels, row by row, and remove the others from their figure."""
     panels_in_order = list(chain.from_iterable(grid_of_axes))
     for axes in panels_in_order[count:]:
         axes.remove()
@@ -350,7 +350,7 @@ def color_bar(
     location: Literal["left", "right", "top", "bottom"] | None = None,
     **shape: Unpack[ColorBarShape],
 ) -> Axes:
-    """Draw the scale of the colours of an artist, and return its panel.
+    """Draw the colour bar of an artist, and return the panel of the bar.
 
     Parameters
     ----------
@@ -361,13 +361,13 @@ def color_bar(
     label : str
         The quantity and its unit.
     ax : Axes or sequence of Axes, optional
-        The panels next to which the scale is drawn, if it has no panel of its own.
+        The panels from which the bar takes its room, if it has no panel of its own.
     cax : Axes, optional
-        The panel in which the scale is drawn.
+        The panel in which the bar is drawn.
     location : str, optional
-        The side of the panels on which the scale is drawn; the right by default.
+        The side of the panels on which the bar is drawn; the right by default.
     **shape : ColorBarShape
-        Gap, size and ends of the scale.
+        Gap, size and ends of the bar.
     """
     bar = figure.colorbar(artist, ax=ax, cax=cax, location=location, **shape)
     bar.set_label(label)

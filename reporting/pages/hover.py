@@ -60,10 +60,11 @@ class _Annotation(NamedTuple):
 
 @contextmanager
 def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
-    """Mark the artists of a figure while it is drawn as SVG, so that a page can show their values.
+    """Return a context in which a figure is drawn as SVG, so that a page can show its values.
 
-    Draw the figure inside the context. Then call the function that the context yields with the text
-    of the SVG: it returns the text with the attributes that the script of the page reads.
+    The context yields a function: given the text of the SVG, it returns the text with the
+    attributes that the script of the page reads. Call it inside the context, which marks the
+    artists by their group ids and removes these at its end.
 
     Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and tick texts of both
     axes), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
@@ -98,7 +99,8 @@ def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
 def _annotations(figure: Figure) -> list[_Annotation]:
     """Return the annotations of all panels that show lines, points or heat maps.
 
-    An artist that already has a group id keeps it and gets no annotation.
+    Panels with other than linear or logarithmic axes have none, nor have artists that already have
+    a group id.
     """
     line_names = _line_names(figure)
     annotations: list[_Annotation] = []
@@ -203,7 +205,7 @@ def _look_of(artist: Line2D | PathCollection) -> _LineLook:
 
 
 def _panel_record(axes: Axes) -> JsonObject:
-    """Return a drawn panel's position in the SVG, its heat maps and the meaning of its axes."""
+    """Return title, box in the SVG, heat maps and axes of a panel that has been drawn."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())

@@ -42,7 +42,9 @@ class _LineHandler(logging.Handler):
 
 @contextmanager
 def shown_log(show: Callable[[str], None], level: int) -> Iterator[None]:
-    """Return a context in which the log is shown line by line.
+    """Return a context in which each message of the log is passed to a function as a line.
+
+    The level of the package's logger is `level` meanwhile, and is restored at the end.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ _CONTROL_GROUP = Path("/sys/fs/cgroup")
 def available_memory() -> float:
     """Return the memory that the machine or the container has left [bytes].
 
-    It is infinite where the system does not state it.
+    The result is infinite if the system does not state it.
     """
     available = math.inf
     with contextlib.suppress(OSError, ValueError, IndexError):
@@ -59,11 +59,12 @@ class ResultCache:
     Parameters
     ----------
     size : int
-        The largest total weight of the results in the cache.
+        The largest total weight of the results. The newest result stays even if it alone weighs
+        more.
     weight : callable
         Returns the weight of a result; 1 by default.
     end : callable
-        Called with each result that the cache drops.
+        Called with each result that the cache drops, also by `clear`.
     """
 
     def __init__(

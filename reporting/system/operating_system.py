@@ -59,7 +59,7 @@ def open_descriptor(path: Path, flags: int, mode: int = 0o666) -> int:
 
 
 def read_at(descriptor: int, count: int, position: int) -> bytes:
-    """Return bytes at a position of a file, whose own position stays."""
+    """Return at most `count` bytes at a position of an open file, without moving its position."""
     if hasattr(os, "pread"):
         return os.pread(descriptor, count, position)
     former_position = os.lseek(descriptor, 0, os.SEEK_CUR)
@@ -73,21 +73,23 @@ def read_at(descriptor: int, count: int, position: int) -> bytes:
 def lock_descriptor(descriptor: int, *, wait: bool, shared: bool = False) -> None:
     """Lock an open file for this process until its descriptor is closed.
 
-    Windows locks a byte far behind the content, so that others can still read it.
+    On Windows a byte far beyond the end of the content is locked, so that other processes can still
+    read the content. A system without locks on files locks nothing, and says so once in the log.
 
     Parameters
     ----------
     descriptor : int
-        The descriptor of the file.
+        The descriptor of the open file.
     wait : bool
         Whether to wait while another process holds the lock.
     shared : bool
-        Whether others may hold a shared lock at the same time; Windows has none.
+        Whether other processes may hold shared locks at the same time. Windows has no shared locks,
+        so that the lock is exclusive there.
 
     Raises
     ------
     BlockingIOError
-        If another process holds the lock, and it is not waited for.
+        If another process holds the lock and `wait` is False.
     """
     try:
         import fcntl
@@ -187,21 +189,21 @@ def _lock_file_of(folder: Path) -> Path:
 
 
 def can_flush(path: Path) -> bool:
-    """Return whether the system can flush a file or a folder to the disk; not a folder on Windows.
+    """Return whether the system can flush a file or a folder to the disk.
 
-    There a file that was moved into place may be lost by a power failure, with its former content
-    in its place.
+    Windows cannot flush a folder. A file that was moved into it may be lost in a power failure; the
+    former file is then still there.
     """
     return os.name == "posix" or not path.is_dir()
 
 
 def flag_for_flushing() -> int:
-    """Return the flag with which a file is opened to flush it; Windows wants to write."""
+    """Return the flag with which a file is opened to flush it; Windows needs write access."""
     return os.O_RDONLY if os.name == "posix" else os.O_RDWR | _BINARY
 
 
 def can_fork() -> bool:
-    """Return whether a process can be forked; where it cannot, this is said once."""
+    """Return whether a process can be forked; if not, the log says once what follows from it."""
     if hasattr(os, "fork"):
         return True
     _report_weakness(
@@ -214,7 +216,7 @@ def can_fork() -> bool:
 def can_supervise() -> bool:
     """Return whether a process can be isolated and supervised as the worker of an FMU is.
 
-    That needs Linux 5.3 or later. Where it cannot, this is said once.
+    That needs Linux 5.3 or later. If it is not possible, the log says once what follows from it.
     """
     if hasattr(os, "pidfd_open") and hasattr(os, "fork"):
         return True
@@ -227,7 +229,7 @@ def can_supervise() -> bool:
 
 
 def usable_processors() -> int:
-    """Return the number of processors that this process may use; all where no limit is stated."""
+    """Return how many processors this process may use: all, unless the system limits it to some."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -236,7 +238,7 @@ def usable_processors() -> int:
 def allow_many_files() -> float:
     """Raise this process's limit of open files to the largest allowed, and return it.
 
-    It is infinite where there is none.
+    The limit is infinite if the system has none.
     """
     try:
         import resource
@@ -248,12 +250,12 @@ def allow_many_files() -> float:
 
 
 def lower_priority(niceness: int, process_id: int = 0) -> None:
-    """Let other processes run first, where the system can be asked for it.
+    """Let other processes run first, if the system has priorities.
 
     Parameters
     ----------
     niceness : int
-        The niceness of POSIX, from 0 to 19.
+        The niceness of POSIX, from 0 to 19. A process that has a higher one keeps it.
     process_id : int
         The number of the process; 0 for this one. One that has ended is left alone.
     """
@@ -267,9 +269,10 @@ def lower_priority(niceness: int, process_id: int = 0) -> None:
 
 @contextmanager
 def call_on_end_signal(request_end: Callable[[], None]) -> Iterator[None]:
-    """Call a function when SIGINT or SIGTERM comes, and restore the former handlers at the end.
+    """Return a context in which SIGINT and SIGTERM call a function instead of ending the process.
 
-    Only the main thread of a process may set handlers. In another thread nothing is changed.
+    The former handlers are restored at the end. Only the main thread of a process may set handlers:
+    in another thread the context changes nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -285,9 +288,10 @@ def call_on_end_signal(request_end: Callable[[], None]) -> Iterator[None]:
 
 
 def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
-    """Yield the pieces of a stream as they come, and None while nothing has come, to its end.
+    """Yield the pieces of a stream as they come, until it ends, without ever waiting.
 
-    Windows can ask sockets alone whether something has come, so a thread reads the stream there.
+    While nothing has come, None is yielded. Windows can tell of sockets only whether something has
+    come, so a thread reads the stream there.
 
     Parameters
     ----------
@@ -311,7 +315,7 @@ def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
 
 
 def _can_poll(stream: ReadableStream) -> bool:
-    """Return whether the system can be asked whether something has come on a stream."""
+    """Return whether the system can tell whether something has come on a stream."""
     try:
         select.select([stream], [], [], 0.0)
     except OSError:
@@ -320,7 +324,10 @@ def _can_poll(stream: ReadableStream) -> bool:
 
 
 def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
-    """Yield the pieces of a stream that a thread reads; see `polled_pieces`."""
+    """Yield what `polled_pieces` yields of a stream that a thread reads.
+
+    An error of the thread is raised here.
+    """
     pieces: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
 
     def read() -> None:
@@ -348,5 +355,5 @@ def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes |
 
 
 def is_same_beginning(file: BinaryIO, beginning: bytes) -> bool:
-    """Return whether an open file still begins with some bytes; its position stays."""
+    """Return whether an open file still begins with some bytes, without moving its position."""
     return read_at(file.fileno(), len(beginning), 0) == beginning

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from reporting.units import BASE_UNITS, exact_meaning, meaning_of
+from reporting.units import BASE_UNITS, conversion_of, exact_conversion
 
 SYMBOLS = (
     "m mm g kg s A ampere gram K degC degF °C rad N Nm V Qm % ° 1 statC dB Np blorp Hz turn G lb"
@@ -39,7 +39,7 @@ TEXTS = st.one_of(
 @example("ﷺ" * 40, False)
 def test_any_text_is_a_unit_or_is_refused(text, gravity):
     try:
-        exponents, factor, offset = exact_meaning(text, gravity=gravity)
+        exponents, factor, offset = exact_conversion(text, gravity=gravity)
     except ValueError:
         return
 
@@ -58,9 +58,9 @@ def test_any_text_is_a_unit_or_is_refused(text, gravity):
 )
 def test_a_name_with_a_number_is_no_unit(text):
     with pytest.raises(ValueError, match="is not a unit"):
-        exact_meaning(text)
+        exact_conversion(text)
 
-    assert meaning_of(text) is None
+    assert conversion_of(text) is None
 
 
 @pytest.mark.parametrize(
@@ -76,22 +76,22 @@ def test_a_name_with_a_number_is_no_unit(text):
     ],
 )
 def test_powers_and_reciprocals_are_units(text, same):
-    assert exact_meaning(text) == exact_meaning(same)
+    assert exact_conversion(text) == exact_conversion(same)
 
 
 def test_a_unit_with_a_half_power_of_length_is_none_of_si():
     """A statcoulomb is 1 g^(1/2) cm^(3/2) / s."""
     with pytest.raises(ValueError, match="not an SI unit"):
-        exact_meaning("statC")
+        exact_conversion("statC")
 
 
 def test_a_unit_beyond_all_numbers_is_refused():
     with pytest.raises(ValueError, match="beyond the numbers"):
-        exact_meaning("Qm9.Qm9.m-9.m-8")
+        exact_conversion("Qm9.Qm9.m-9.m-8")
 
 
 def test_a_large_factor_is_exact():
     """A quettametre is 10^30 m."""
-    _, factor, _ = exact_meaning("Qm2")
+    _, factor, _ = exact_conversion("Qm2")
 
     assert factor == Fraction(10) ** 60

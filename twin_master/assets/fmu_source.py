@@ -19,7 +19,7 @@ from reporting.files import hash_file
 from reporting.formats.toml_file import Check, Number, Positive
 from reporting.progress import Progress
 from reporting.system.log import module_logger
-from reporting.units import meaning_of
+from reporting.units import conversion_of
 from twin_master.assets.asset_source import (
     BINDING_COPY,
     FLOWN_DESIGN_HASH,
@@ -533,7 +533,7 @@ def _check_unit(binding: Binding, what: str, bound_unit: str, key: str, unit: st
     """
     if bound_unit == unit:
         return  # saves the third of a second in which the library of units loads
-    meaning = meaning_of(bound_unit)
+    meaning = conversion_of(bound_unit)
     is_scaled_fraction = (
         meaning is not None and not any(meaning.exponents) and meaning.factor != 1.0
     )

@@ -23,7 +23,7 @@ from fmu_asset.client.units import Conversion, contradictions, conversion, same_
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from reporting import units
-from reporting.units import Meaning, exact_meaning, meaning_of
+from reporting.units import SiConversion, conversion_of, exact_conversion
 from tests.fmu_asset.client.kinds import WING_BINDING
 from tests.fmu_asset.making import MODELS, changed, tables
 from tests.refusals import refused
@@ -222,22 +222,22 @@ NEWTON = exponents_of(kg=1, m=1, s=-2)
 
 @pytest.mark.parametrize("unit", UNITS["unit"], ids=lambda unit: unit["text"])
 def test_unit_texts_mean_what_is_defined(unit):
-    meaning = meaning_of(unit["text"])
+    meaning = conversion_of(unit["text"])
 
     factor = pytest.approx(unit["factor"] / unit.get("divisor", 1.0), rel=1e-12)
-    assert meaning == Meaning(exponents_of(**unit["of"]), factor, unit.get("offset", 0.0))
+    assert meaning == SiConversion(exponents_of(**unit["of"]), factor, unit.get("offset", 0.0))
 
 
 @pytest.mark.parametrize("unit", units._COMMON_UNITS)
 def test_units_that_pint_is_not_asked_for_mean_what_it_says(unit):
-    exponents, factor, offset = exact_meaning(unit)
+    exponents, factor, offset = exact_conversion(unit)
 
-    assert meaning_of(unit) == Meaning(exponents, float(factor), float(offset))
+    assert conversion_of(unit) == SiConversion(exponents, float(factor), float(offset))
 
 
 @pytest.mark.parametrize("text", [*UNITS["nothing"], "(" * 3000 + "m" + ")" * 3000], ids=repr)
 def test_other_texts_mean_nothing(text):
-    assert meaning_of(text) is None
+    assert conversion_of(text) is None
 
 
 @pytest.mark.parametrize(
