@@ -167,26 +167,17 @@ def investigate(
         If the campaign cannot be compared with the model at all.
     """
     campaign, model = _read_input(campaign, model)
-    progress_reporter = reporter(progress)
-    seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(description: str, key: str) -> Iterator[OnProgress]:
-        """Report a stage of the work, and record its duration [s]."""
-        start = time.perf_counter()
-        with progress_reporter.stage(description) as shown_stage:
-            yield lambda message: shown_stage.advance(0, message)
-        seconds[key] = time.perf_counter() - start
-
-    with stage("Checking the data", "check"):
+    stages = _Stages(progress)
+    with stages.stage("Checking the data", "check"):
         campaign, faults = check_and_prepare(campaign, model)
     remarks = [fault.sentence for fault in faults]
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
         kind = VerdictKind.DATA_ERROR
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
-        return Investigation(campaign, model, faults, verdict, seconds=seconds)
-    with stage("Fitting the known parameters, and searching the catalogue", "name") as show_message:
+        return Investigation(campaign, model, faults, verdict, seconds=stages.seconds)
+    searching = "Fitting the known parameters, and searching the catalogue"
+    with stages.stage(searching, "name") as show_message:
         problem = problem_without_wrong_ends(campaign, model)
         campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
@@ -195,14 +186,9 @@ def investigate(
         )
         verdict = verdict_with_untested_effects(verdict, problem.setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
-    with stage("Checking the time steps", "steps"):
-        step_error = time_step_error(problem, fit)
-        if step_error > SEARCH.largest_step_error:
-            remarks.append(
-                f"The time steps cost up to {step_error:.2g} of the noise (rms), more than the "
-                f"permitted {SEARCH.largest_step_error:g}: probabilities may be too sharp."
-            )
-    with stage("Residuals", "residuals"):
+    with stages.stage("Checking the time steps", "steps"):
+        remarks += _remarks_on_time_steps(problem, fit)
+    with stages.stage("Residuals", "residuals"):
         before = search.residuals(search.no_effect)
         if thorough:
             before = residual_set(problem, search.no_effect)
@@ -212,22 +198,17 @@ def investigate(
     proof = None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
-        with stage("Locating the gap", "locate"):
+        with stages.stage("Locating the gap", "locate"):
             location = locate(before, seed=seed)
-            windows = gap_windows(
-                problem,
-                fit,
-                before,
-                leaves_no_force=_laws_leave_no_force(verdict, search, fit),
-                seed=seed,
-            )
+            no_force_is_left = _laws_leave_no_force(verdict, search, fit)
+            windows = gap_windows(problem, fit, before, leaves_no_force=no_force_is_left, seed=seed)
             if after is not before:
                 windows += windows_of_residuals(after, seed=seed, with_effect=True)
             windows = add_window_sizes(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
-        with stage("Estimating the missing force", "force"):
+        with stages.stage("Estimating the missing force", "force"):
             missing = missing_force_of_verdict(
                 problem,
                 search.force_search,
@@ -236,19 +217,15 @@ def investigate(
                 is_named=verdict.kind is not VerdictKind.UNEXPLAINED,
             )
     if fit.candidate.terms:
-        with stage("Proving on held-out trials", "prove"):
+        with stages.stage("Proving on held-out trials", "prove"):
             errors = errors_of_fit(search, fit)
             proof = prove_effects(
                 before, after, errors=errors, effects=effect_labels(fit), seed=seed
             )
-    # Sensors are estimated beside effects only if these are named. Parameters are estimated beside
-    # the effects of the fit also if these have no name, unless there is no gap.
-    has_unnamed_effects = bool(fit.candidate.terms) and verdict.kind not in KINDS_WITH_NAME
-    fit_of_sensors = search.no_effect if has_unnamed_effects else fit
-    fit_of_parameters = fit_of_sensors if verdict.kind in KINDS_WITHOUT_GAP else fit
+    fit_of_sensors, fit_of_parameters = _fits_of_estimates(verdict, search, fit)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
-        with stage("Looking for the next experiment", "next"):
+        with stages.stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, comparison_of(search).open_hypotheses())
     verdict = replace(
         verdict,
@@ -273,9 +250,56 @@ def investigate(
         problem=problem,
         search=search,
         fit=fit,
-        seconds=seconds,
+        seconds=stages.seconds,
         missing=missing,
     )
+
+
+class _Stages:
+    """The stages of an investigation: each is reported to the user, and its duration is kept.
+
+    Attributes
+    ----------
+    seconds : dict of str to float
+        Wall time of the finished stages by their keys [s].
+    """
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._reporter = reporter(progress)
+
+    @contextmanager
+    def stage(self, description: str, key: str) -> Iterator[OnProgress]:
+        """Report a stage of the work, and yield the function that shows messages in it."""
+        start = time.perf_counter()
+        with self._reporter.stage(description) as shown_stage:
+            yield lambda message: shown_stage.advance(0, message)
+        self.seconds[key] = time.perf_counter() - start
+
+
+def _remarks_on_time_steps(problem: Problem, fit: CandidateFit) -> list[str]:
+    """Return a remark if the error of the time steps may be visible in the noise; else nothing."""
+    step_error = time_step_error(problem, fit)
+    if step_error <= SEARCH.largest_step_error:
+        return []
+    return [
+        f"The time steps cost up to {step_error:.2g} of the noise (rms), more than the "
+        f"permitted {SEARCH.largest_step_error:g}: probabilities may be too sharp."
+    ]
+
+
+def _fits_of_estimates(
+    verdict: Verdict, search: Search, fit: CandidateFit
+) -> tuple[CandidateFit, CandidateFit]:
+    """Return the fit from which sensors are estimated, and the one for the parameters.
+
+    Sensors are estimated beside the effects of `fit` only if these are named, else without effects.
+    Parameters are estimated beside the effects also if these have no name, unless there is no gap.
+    """
+    has_unnamed_effects = bool(fit.candidate.terms) and verdict.kind not in KINDS_WITH_NAME
+    fit_of_sensors = search.no_effect if has_unnamed_effects else fit
+    fit_of_parameters = fit_of_sensors if verdict.kind in KINDS_WITHOUT_GAP else fit
+    return fit_of_sensors, fit_of_parameters
 
 
 def effect_labels(fit: CandidateFit) -> tuple[str, ...]:

@@ -333,7 +333,7 @@ def find_line(series: FloatArray) -> LineTest:
     Returns
     -------
     LineTest
-        Its statistic is the fraction of the variance of the record that the line has.
+        The test, whose statistic is the fraction of the record's variance in the line.
     """
     count = len(series)
     ordinates = periodogram(series)  # (M,), at the frequencies 1 / n, 2 / n, ... per sample

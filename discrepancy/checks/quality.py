@@ -253,11 +253,11 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
 def _is_clipped_over_load(
     values: FloatArray, start: int, stop: int, quantum: float, load: FloatArray
 ) -> bool:
-    """Return whether a line through all other readings at rest exceeds a run of equal readings.
+    """Return whether a run of equal readings at rest lies off the line through all other readings.
 
-    The line must exceed the run by 1.5 quanta plus six standard deviations of the scatter about the
-    line, and the run must span three different loads. Readings and loads (N,) are in the order of
-    load, and the run goes from the index `start` to the one before `stop`.
+    The line must depart from the run by more than 1.5 quanta plus six standard deviations of the
+    scatter about the line, and the run must span three different loads. Readings and loads (N,) are
+    in the order of load, and the run goes from the index `start` to the one before `stop`.
     """
     run = slice(start, stop)
     loads_of_run = load[run]

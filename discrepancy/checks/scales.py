@@ -91,7 +91,7 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
     """Return the amplitude of readings (N,) in a trial.
 
     The amplitude is the root mean square about the median for a dynamic trial, else the largest
-    magnitude.
+    magnitude; 0 without readings.
     """
     if len(values) == 0:
         return 0.0

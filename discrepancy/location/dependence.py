@@ -312,7 +312,8 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
     The sum of squares that a decaying sine explains is computed for the frequencies of a Fourier
     transform with four-fold zero padding, from one period in the record upwards, and for decays by
     0, 1, 3, 10 and 30 e-folds within the record. The explained sum of squares is summed over all
-    channels. The result is None for records of fewer than eight samples.
+    channels, and over the trials that are sampled like the first one. The result is None for
+    records of fewer than eight samples.
     """
     length = max(len(fitted_trial.trial.time) for fitted_trial in trials)
     interval = trials[0].trial.interval

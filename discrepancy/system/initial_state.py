@@ -48,7 +48,7 @@ def state_at_first_stamp(
     first_stamp = excitation.time[:1]
     motions = list(excitation.prescribed_motions.values())
     drive_positions = np.array([float(motion.values_at(first_stamp)[0]) for motion in motions])
-    drive_speeds = np.array([float(motion.values_at(first_stamp, 1)[0]) for motion in motions])
+    drive_speeds = _drive_speeds(system, excitation)
     # modal coordinates and their speeds, those of the drives last
     q = np.zeros(mode_count + len(motions))
     v = np.zeros(mode_count + len(motions))
@@ -59,46 +59,72 @@ def state_at_first_stamp(
         initial_state[: len(excitation.initial)] = excitation.initial[: len(initial_state)]
         q[:displacement_mode_count] = initial_state[:displacement_mode_count]
         v[:mode_count] = initial_state[displacement_mode_count:]
-    else:
-        largest_speeds = [
-            np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
-        ]
-        # The slope of a spline through recorded displacements is set to zero if it is nearly so:
-        # dry friction acts at any other speed. A recorded speed stays as it is.
-        is_at_rest = np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)
-        has_recorded_displacement = np.array(
-            [motion.motion_order == 0 for motion in motions], dtype=np.bool_
+    elif excitation.begins is Start.SETTLED:
+        amplitudes, memory = _settled_amplitudes(
+            system, excitation, laws, drive_positions, drive_speeds
         )
-        is_slope = has_recorded_displacement & ~system.prescribes_state
-        drive_speeds[is_at_rest & is_slope] = 0.0
-    # equilibrium under the first loads and the first positions of the drives
-    if excitation.begins is Start.SETTLED:
-        load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))  # (1, N)
-        # a state is the speed of its coordinate, and a prescribed one acts through the damping
-        prescribed_states = np.where(system.prescribes_state, drive_speeds, 0.0)
-        if prescribed_states.any():
-            load = load - system.damping @ (system.drive_shapes @ prescribed_states)
-        if load.any() or drive_positions.any():
-            drive_displacement = system.drive_shapes @ drive_positions
-            equilibrium = system.static_path(
-                load - system.stiffness @ drive_displacement,
-                laws,
-                offset=drive_displacement,
-                time=float(first_stamp[0]),
-            )
-            memory = equilibrium.memory
-            # modal amplitudes (M,) by the orthogonality of mass-normalised shapes; those of states
-            # are speeds
-            amplitudes = system.shapes.T @ (
-                system.mass @ (equilibrium.values[0] - drive_displacement)
-            )
-            q[:displacement_mode_count] = amplitudes[:displacement_mode_count]
-            v[displacement_mode_count:mode_count] = amplitudes[displacement_mode_count:]
+        q[:displacement_mode_count] = amplitudes[:displacement_mode_count]
+        v[displacement_mode_count:mode_count] = amplitudes[displacement_mode_count:]
     if motions:
         # coordinates of drives are mass-normalised like those of modes
         q[mode_count:] = system.root_drive_mass * drive_positions
         v[mode_count:] = system.root_drive_mass * drive_speeds
     return InitialMotion(q, v, memory)
+
+
+def _drive_speeds(system: LinearSystem, excitation: Excitation) -> FloatArray:
+    """Return the speeds (P,) of the P prescribed motions at the first stamp of a record.
+
+    The slope of a spline through recorded displacements is set to zero if it is nearly so, because
+    dry friction acts at any other speed. A recorded speed, a prescribed state, and the drives of a
+    record that begins in an unknown state, keep their values.
+    """
+    motions = excitation.prescribed_motions.values()
+    first_stamp = excitation.time[:1]
+    drive_speeds = np.array([float(motion.values_at(first_stamp, 1)[0]) for motion in motions])
+    if excitation.begins is Start.UNKNOWN:
+        return drive_speeds
+    largest_speeds = [np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions]
+    is_at_rest = np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)
+    has_recorded_displacement = np.array(
+        [motion.motion_order == 0 for motion in motions], dtype=np.bool_
+    )
+    is_slope = has_recorded_displacement & ~system.prescribes_state
+    drive_speeds[is_at_rest & is_slope] = 0.0
+    return drive_speeds
+
+
+def _settled_amplitudes(
+    system: LinearSystem,
+    excitation: Excitation,
+    laws: PortLaws,
+    drive_positions: FloatArray,
+    drive_speeds: FloatArray,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return the amplitudes (M,) of the modes in equilibrium at the first stamp of a record.
+
+    The first loads act, and the drives have their first positions and speeds (P,). The amplitude of
+    a mode of displacements is its coordinate, that of a mode of states its speed. The second result
+    is the memory of the laws; None if nothing acts, and all amplitudes are then zero.
+    """
+    first_stamp = excitation.time[:1]
+    load = excitation.loads_at(first_stamp, np.eye(system.unknown_count))  # (1, N)
+    # a state is the speed of its coordinate, and a prescribed one acts through the damping
+    prescribed_states = np.where(system.prescribes_state, drive_speeds, 0.0)
+    if prescribed_states.any():
+        load = load - system.damping @ (system.drive_shapes @ prescribed_states)
+    if not (load.any() or drive_positions.any()):
+        return np.zeros(len(system.angular_frequency)), None
+    drive_displacement = system.drive_shapes @ drive_positions
+    equilibrium = system.static_path(
+        load - system.stiffness @ drive_displacement,
+        laws,
+        offset=drive_displacement,
+        time=float(first_stamp[0]),
+    )
+    # by the orthogonality of mass-normalised shapes
+    amplitudes = system.shapes.T @ (system.mass @ (equilibrium.values[0] - drive_displacement))
+    return amplitudes, equilibrium.memory
 
 
 def released_state(

@@ -183,8 +183,8 @@ class LumpedDescription(ModelDescription):
     def is_structure_on_springs(self) -> bool:
         """Whether the file describes only a structure on springs with forces as inputs.
 
-        It then has no states, constant loads, prescribed motions, damping parts or controllers. Its
-        inputs act along vectors of their own, and its outputs are vectors without a constant.
+        Such a file has no states, constant loads, prescribed motions, damping parts or controllers.
+        The inputs act along vectors of their own, and the outputs are vectors without a constant.
         """
         is_held_and_forced = bool(self.input) and not self.free
         has_other_parts = bool(

@@ -15,9 +15,10 @@ def ported_system(
 ) -> PortedSystem:
     """Return the linear system from missing forces g at the P ports to the outputs.
 
-    In the coordinates q it is M q'' + D q' + K q = -sum_p acts_p g_p. It is returned in first
-    order, with the state s = (q, q'). Of a coordinate that stands for a state (its speed is the
-    state, and nothing depends on its position) only the speed is kept.
+    In the coordinates q the equation of motion is M q'' + D q' + K q = -sum_p acts_p g_p, where
+    acts_p is the direction of the force at port p. The system is returned in first order, with the
+    state s = (q, q'). Of a coordinate that stands for a state (its speed is the state, and nothing
+    depends on its position) only the speed is kept.
 
     Parameters
     ----------

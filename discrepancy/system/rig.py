@@ -70,7 +70,8 @@ class ControlLoop:
     def output_rows(self) -> FloatArray:
         """Rows (4, N) of the controller's output at a reference of zero.
 
-        They have the form of `OutputEquation.rows`; the error is then minus the measured quantity.
+        The rows have the form of `OutputEquation.rows`; without a reference the error is minus the
+        measured quantity.
         """
         # row k multiplies the k-th time derivative: a shift by one row differentiates (the last
         # row, which is zero, comes first)

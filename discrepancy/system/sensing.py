@@ -285,7 +285,8 @@ def observe_response(
     response : Response
         Values and rates (N, C) of the channels' outputs.
     across : iterable of (N, C) array
-        Transverse and shear strain, on which the reading of a turned gauge depends.
+        Transverse strain and shear strain, on which the reading of a turned gauge depends; nothing
+        if no gauge is turned.
 
     Raises
     ------
