@@ -425,20 +425,20 @@ class IdentifiedFmu(FmuRuns):
         system, excitation, steps_per_sample = self._system_that_shows_all_modes(
             self._probing_excitation(trial, state), interval
         )
-        frequency = self.description.scales.angular_frequency
-        if not frequency:
+        angular_frequency = self.description.scales.angular_frequency
+        if not angular_frequency:
             mode = None
             if system is not None and self.ports:
                 mode = system.most_flexible_mode(self.displacement_columns[0], 0)
             if mode is not None:
-                frequency = mode.angular_frequency
+                angular_frequency = mode.angular_frequency
             else:
-                frequency = self._dominant_frequency(excitation)
+                angular_frequency = self._dominant_angular_frequency(excitation)
         step = self.description.motion.step
         if not step:
-            phase_in_interval = frequency * interval
+            phase_in_interval = angular_frequency * interval
             step = interval / max(steps_per_sample, ceil(phase_in_interval / LARGEST_STEP_PHASE))
-        return StepChoice(frequency, step)
+        return StepChoice(angular_frequency, step)
 
     def _probing_excitation(self, trial: Trial, state: OperatingPoint) -> FmuExcitation:
         """Return the excitation that shows the modes of the FMU at the sampling of a trial.
@@ -482,7 +482,7 @@ class IdentifiedFmu(FmuRuns):
             parts *= 2
         return SampledSystem(system, excitation, parts)
 
-    def _dominant_frequency(self, excitation: FmuExcitation) -> float:
+    def _dominant_angular_frequency(self, excitation: FmuExcitation) -> float:
         """Return the angular frequency of the highest peak in the spectrum of a record [rad/s].
 
         Raises

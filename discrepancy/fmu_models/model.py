@@ -141,7 +141,7 @@ class FmuModel(DescribedModel):
         conditions = Conditions(self.prior_mean(campaign))
         largest_displacements = self._largest_displacements(campaign, conditions)
         stiffnesses = self._port_stiffnesses(campaign, conditions)
-        frequency = self._first_frequency(campaign, conditions)
+        angular_frequency = self._first_angular_frequency(campaign, conditions)
         load_point = self._load_point_stiffness(stiffnesses)
         ports = {}
         for port, displacement, stiffness in zip(
@@ -150,7 +150,7 @@ class FmuModel(DescribedModel):
             ports[port] = PortScale(
                 displacement=float(displacement) or 1.0,
                 stiffness=stiffness.modal,
-                angular_frequency=frequency,
+                angular_frequency=angular_frequency,
                 static_stiffness=stiffness.static,
             )
         file_scales = self.description.scales
@@ -158,8 +158,8 @@ class FmuModel(DescribedModel):
         return Scales(
             length=file_scales.length or 1.0,
             tip_stiffness=file_scales.tip_stiffness or load_point.static,
-            modal_mass=file_scales.modal_mass or load_point.modal / frequency**2,
-            angular_frequency=frequency,
+            modal_mass=file_scales.modal_mass or load_point.modal / angular_frequency**2,
+            angular_frequency=angular_frequency,
             force=largest["force"],
             load_factor=largest["load_factor"],
             duration=largest["duration"],
@@ -218,7 +218,7 @@ class FmuModel(DescribedModel):
             stiffnesses.append(PortStiffness(modal, static))
         return stiffnesses
 
-    def _first_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
+    def _first_angular_frequency(self, campaign: Campaign, conditions: Conditions) -> float:
         """Return the angular frequency of the first mode [rad/s].
 
         The frequency is that of the file, or else that of the FMU in the first dynamic trial. In a

@@ -103,6 +103,6 @@ def release_values(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> d
             f"{fmu.description.name!r} can follow only if [release] names parameters of "
             "displacement and velocity."
         )
-    frequency = fmu.nominal_step_choice(trial).angular_frequency
-    amplitudes = release.displacement * first_mode * (1.0, frequency)
+    angular_frequency = fmu.nominal_step_choice(trial).angular_frequency
+    amplitudes = release.displacement * first_mode * (1.0, angular_frequency)
     return dict(zip(variables, amplitudes.tolist(), strict=True))

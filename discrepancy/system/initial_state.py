@@ -161,11 +161,14 @@ def released_state(
         first_load = excitation.loads_at(excitation.time[:1], np.eye(system.unknown_count))
     if point.release.at_rest:
         return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
-    frequency = system.angular_frequency
+    angular_frequency = system.angular_frequency
     # the loads shift the position of rest: a load f has the modal amplitudes shapes.T f / omega^2
-    under_load = (first_load @ system.shapes)[0] / frequency**2 if first_load.any() else 0.0
+    under_load: FloatArray | float = 0.0
+    if first_load.any():
+        under_load = (first_load @ system.shapes)[0] / angular_frequency**2
     q = relative_displacements * unit_amplitudes + under_load
-    return ReleasedState(InitialMotion(q, relative_velocities * unit_amplitudes * frequency), None)
+    v = relative_velocities * unit_amplitudes * angular_frequency
+    return ReleasedState(InitialMotion(q, v), None)
 
 
 def _held_state(
@@ -214,6 +217,8 @@ def _held_state(
             memory[:, FADING_POSITION] = holding_force * (
                 law_rows @ system.residual_displacements(row)
             )
-    frequency = system.angular_frequency
-    q = total_force @ system.shapes / frequency**2 + deviation
-    return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding_force * row)
+    angular_frequency = system.angular_frequency
+    q = total_force @ system.shapes / angular_frequency**2 + deviation
+    return ReleasedState(
+        InitialMotion(q, np.zeros(len(angular_frequency)), memory), holding_force * row
+    )

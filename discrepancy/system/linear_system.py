@@ -297,7 +297,7 @@ class LinearSystem:
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
         # the coordinates are the modes, then the drives, which count as modes of frequency zero
-        frequency = np.pad(self.angular_frequency, (0, drive_count))
+        angular_frequency = np.pad(self.angular_frequency, (0, drive_count))
         shapes = self.shapes_with_drives  # (unknowns, modes + drives)
         damping = shapes.T @ self.damping @ shapes
         stiffness = shapes.T @ self.stiffness @ shapes
@@ -308,9 +308,10 @@ class LinearSystem:
         diagonal = np.diag(np.diag(damping))
         if not drive_count and not _differ_beyond_rounding(damping, diagonal):
             damping = diagonal
-        is_coupled = drive_count > 0 or _differ_beyond_rounding(stiffness, np.diag(frequency**2))
+        uncoupled = np.diag(angular_frequency**2)
+        is_coupled = drive_count > 0 or _differ_beyond_rounding(stiffness, uncoupled)
         return ModalSystem(
-            frequency,
+            angular_frequency,
             damping,
             {name: np.asarray(row @ shapes) for name, row in self.ports.items()},
             self._port_residuals(),
