@@ -341,8 +341,9 @@ class Campaign:
         Returns
         -------
         list of dict of str to float
-            Times by name [s]. If several events are used, every occurrence of one is combined with
-            every occurrence of the others. Empty if a name has no time in the trial.
+            Times by name [s]. If the names belong to several events, every occurrence of one event
+            is combined with every occurrence of the others. Empty if a name has no time in the
+            trial.
         """
         occurrences: dict[str, list[dict[str, float]]] = {}
         for event in self.events:

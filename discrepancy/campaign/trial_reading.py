@@ -306,7 +306,10 @@ def _read_channel(
 def _read_temperature(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> FloatArray:
-    """Return the temperature of a trial (N,) minus the reference temperature [K]; 0 if unknown."""
+    """Return the temperature of a trial (N,) minus the reference temperature [K]; 0 if unknown.
+
+    Raises `CampaignFileError` if the temperature is given twice, or without a reference.
+    """
     has_column = "temperature" in table.columns
     if has_column and section.temperature is not None:
         raise CampaignFileError(

@@ -400,7 +400,9 @@ class StructureModel(SystemModel):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, with those of supports that may yield.
 
-        A support that hardly carries the structure has a compliance of one.
+        The natural compliance of a support motion is the one that changes a static compliance or an
+        inverse squared frequency of the structure by 100 % (to first order). It is 1 if the support
+        does not carry the structure.
         """
         scales = super().scales(campaign)
         if not isinstance(self.model, ChangeableModel):
@@ -408,6 +410,7 @@ class StructureModel(SystemModel):
         state = SystemState(
             tuple(self.prior_mean(campaign).tolist()), losses=(0.0,) * len(self.regions)
         )
+        # (support motions, loads + modes)
         gains = self.model.compliance_gains(self._input_vector(state, {}))
         largest_gains = gains.max(axis=1, initial=0.0).tolist()
         compliances = {
