@@ -11,23 +11,20 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
-from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
-from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.effects import EffectLaws
 from discrepancy.trials_in_motion.trial import PortedTrial
-from fe.runtime.laws.interface import PortForce
-from fe.runtime.patch import ModelPatch
 
-from .estimate import NO_EFFECT_VALUES, NO_EFFECTS, Estimate, estimate_of_processes
+from .estimate import NO_EFFECTS, Estimate, estimate_of_processes
 from .estimator import SMALL_FRACTION, USUAL_WINDOW, MotionEstimator
 from .force_states import Process
-from .gauss_newton import EstimatorStart, GaussNewton, linearise_trials, start_from_estimate
+from .gauss_newton import EstimatorStart, GaussNewton, start_from_estimate
 from .linearisation import Linearisation, plain_linearisation
 from .log_prior import log_prior
+from .ported_problem import PortedProblem
 from .process_search import Processes, scale_processes
-from .regression import Priors
-from .trial_set import TrialSet, start_in_other_trials, trajectory_in_all_samples
+from .trial_set import start_in_other_trials, trajectory_in_all_samples
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
@@ -47,23 +44,11 @@ MOST_THINNED_SAMPLES = 3000
 tell laws from each other, and records that are shorter are not thinned."""
 THINNED_AT_LEAST = 2.0
 """Ratio of the number of samples to that number above which records are thinned at first."""
-WIDE_WINDOW = 0.1
-"""Half width of the window of speeds where the model's own laws are linear along a first motion."""
 
 
 def _best(estimates: Iterable[Estimate]) -> Estimate:
     """Return the estimate with the largest evidence."""
     return max(estimates, key=lambda estimate: estimate.log_evidence)
-
-
-def can_estimate_forces(problem: Problem) -> bool:
-    """Return whether missing forces can be estimated in a problem.
-
-    That needs trials in motion, and a model that describes how its ports move.
-    """
-    model = problem.model
-    has_motion = any(data.trial.is_dynamic for data in problem.trials)
-    return has_motion and model.shows_ports and bool(model.ports)
 
 
 class ForceSearch:
@@ -83,75 +68,55 @@ class ForceSearch:
     thinned : ForceSearch or None
         The search in thinned records, from which that in all samples begins; None if the records
         are short.
-    ports : tuple of str
-        The names of the ports.
-    problem_with_laws : Problem
-        The problem as it was given; `problem` has the same trials, and a model without laws.
-    model_laws : ModelPatch
-        The model's own laws at its ports, which its linear system does not contain.
-    trial_set : TrialSet
-        The trials in motion, of which linear systems are made.
-    shared_priors : Priors
-        The priors of the unknowns that all trials share.
+    ported : PortedProblem
+        The problem, with its trials as linear systems with ports.
     """
 
     def __init__(self, problem: Problem, sample_limit: int | None = None) -> None:
-        self.problem_with_laws = problem
-        linear_model, self.model_laws = problem.model.without_laws()
-        trials = tuple(data.trial for data in problem.trials)
-        self.model = problem.model
-        self.problem = problem.with_trials(trials, linear_model)
-        self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
-        self.ports = tuple(linear_model.ports)
-        start = self.problem.prior_mean_point(NO_EFFECTS)
-        self.trial_set = TrialSet(
-            problem=self.problem,
-            trial_indices=self.trial_indices,
-            evaluate_model_laws=self.evaluate_model_laws,
-            unknowns_of_model_laws=self._unknowns_of_model_laws(start.shared),
-            sample_limit=sample_limit,
-        )
-        low, high = self.problem.shared.bounds
-        self.shared_priors = Priors(self.problem.shared.precision, low, high)
+        self.ported = PortedProblem(problem, sample_limit)
         self.thinned = self._in_thinned_records() if sample_limit is None else None
         if self.thinned is None:
-            self.estimate_by_port = self._estimates_of_ports(start)
+            self.estimate_by_port = self._estimates_of_ports()
         else:
             self.estimate_by_port = self._estimates_of_ports_like(self.thinned)
 
     def _in_thinned_records(self) -> "ForceSearch | None":
         """Return the search in thinned records; None if they are short or cannot be thinned."""
-        sample_count = sum(len(self.problem.trials[k].trial.time) for k in self.trial_indices)
+        sample_count = sum(
+            len(self.ported.problem.trials[k].trial.time) for k in self.ported.trial_indices
+        )
         if sample_count < THINNED_AT_LEAST * MOST_THINNED_SAMPLES:
             return None
-        thinned = ForceSearch(self.problem_with_laws, MOST_THINNED_SAMPLES)
+        thinned = ForceSearch(self.ported.problem_with_laws, MOST_THINNED_SAMPLES)
         is_thinned = any(trial.trial.stride > 1 for trial in thinned.best_port_estimate.trials)
         return thinned if is_thinned else None
 
-    def _estimates_of_ports(self, start: Point) -> dict[str, Estimate]:
+    def _estimates_of_ports(self) -> dict[str, Estimate]:
         """Return the missing force at each port alone, by the name of the port.
 
         It is estimated twice: first along the motion of the model, which gives the initial states
         of the trials; then along the motion that was estimated first, with the model's own laws and
         with the parameters linear about their first estimates.
-
-        Parameters
-        ----------
-        start : Point
-            The values of the unknowns about which the trials are linear at first.
         """
-        linearisation = plain_linearisation(self.trial_set.trials_about(start), self.shared_priors)
+        start = self.ported.prior_means
+        linearisation = plain_linearisation(
+            self.ported.trial_set.trials_about(start), self.ported.shared_priors
+        )
         first_estimates = []
-        for port in range(len(self.ports)):
-            processes = self.prior_processes((port,))
+        for port in range(len(self.ported.ports)):
+            processes = self.ported.prior_processes((port,))
             first_estimates.append(estimate_of_processes(linearisation, processes, processes))
         # about the unknowns of the best port
-        trials_about_best = self.trial_set.trials_about(self._point_of(_best(first_estimates)))
+        trials_about_best = self.ported.trial_set.trials_about(
+            self.ported.point_of(_best(first_estimates))
+        )
         return {
             name: self._estimate_along_motion(
-                trials_about_best, first_estimates[port].processes, self.prior_processes((port,))
+                trials_about_best,
+                first_estimates[port].processes,
+                self.ported.prior_processes((port,)),
             )
-            for port, name in enumerate(self.ports)
+            for port, name in enumerate(self.ported.ports)
         }
 
     def _estimates_of_ports_like(self, thinned: "ForceSearch") -> dict[str, Estimate]:
@@ -160,25 +125,18 @@ class ForceSearch:
         The trials are linear about the parameters that the thinned records gave, and the search for
         the most probable process needs no grid.
         """
-        trials = self.trial_set.trials_about(thinned._point_of(thinned.best_port_estimate))
+        trials = self.ported.trial_set.trials_about(
+            thinned.ported.point_of(thinned.best_port_estimate)
+        )
         return {
             name: self._estimate_along_motion(
                 trials,
                 thinned.estimate_by_port[name].processes,
-                self.prior_processes((port,)),
+                self.ported.prior_processes((port,)),
                 skip_grid=True,
             )
-            for port, name in enumerate(self.ports)
+            for port, name in enumerate(self.ported.ports)
         }
-
-    @property
-    def has_channel_for_each_port(self) -> bool:
-        """Whether each trial has at least as many channels as there are ports.
-
-        Free forces at more ports than that fit any reading, whatever law acts at one of them.
-        """
-        trials = [self.problem.trials[number] for number in self.trial_indices]
-        return all(len(data.trial.channels) >= len(self.ports) for data in trials)
 
     # ---------------------------------------------------------------- where a force is missing
 
@@ -204,7 +162,7 @@ class ForceSearch:
             processes = self.thinned.estimate_without_effects.processes
             return estimate_of_processes(
                 self._linearise_along(best_alone),
-                self.prior_processes(processes),
+                self.ported.prior_processes(processes),
                 processes,
                 skip_grid=True,
             )
@@ -213,7 +171,7 @@ class ForceSearch:
             # alone, each port takes the whole gap: the further ports begin with a smaller force
             # of the same correlation time
             start_processes |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
-        prior_medians = self.prior_processes(start_processes)
+        prior_medians = self.ported.prior_processes(start_processes)
         estimate = estimate_of_processes(best_alone.linearisation, prior_medians, start_processes)
         # the model's own laws depend on the motion, so forces and motion are estimated twice
         return estimate_of_processes(
@@ -237,9 +195,9 @@ class ForceSearch:
                 for number, process in estimate.processes.items()
             }
             estimate = self._estimate_along_motion(
-                self.trial_set.trials_about(self._point_of(estimate)),
+                self.ported.trial_set.trials_about(self.ported.point_of(estimate)),
                 jumping_processes,
-                self.prior_processes(jumping_processes),
+                self.ported.prior_processes(jumping_processes),
             )
         return estimate
 
@@ -265,10 +223,10 @@ class ForceSearch:
             Whether the search begins at the first forces, as they are nearly the most probable
             ones; else at the best point of a grid.
         """
-        linearisation = plain_linearisation(trials, self.shared_priors)
+        linearisation = plain_linearisation(trials, self.ported.shared_priors)
         solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
         trajectories = tuple(trial.trajectory for trial in smoothed_trials)
-        along_motion = self._linearise(trials, trajectories, solution.mean)
+        along_motion = self.ported.linearise(trials, trajectories, solution.mean)
         return estimate_of_processes(
             along_motion, prior_medians, first_processes, skip_grid=skip_grid
         )
@@ -277,71 +235,7 @@ class ForceSearch:
         """Return the trials of an estimate without effects, linear along its motion."""
         trials = estimate.ported_trials
         trajectories = tuple(smoothed_trial.trajectory for smoothed_trial in estimate.trials)
-        return self._linearise(trials, trajectories, estimate.shared)
-
-    def _linearise(
-        self,
-        trials: tuple[PortedTrial, ...],
-        trajectories: tuple[Trajectory, ...],
-        shared_values: FloatArray,
-    ) -> Linearisation:
-        """Return trials along trajectories with the model's own laws, without effects.
-
-        If the laws are not possible there, they are left out.
-
-        Parameters
-        ----------
-        trials : tuple of PortedTrial
-            The trials as linear systems with ports.
-        trajectories : tuple of Trajectory
-            The motion of each trial.
-        shared_values : (K,) array
-            The values of the shared unknowns.
-        """
-        no_local_values = tuple(np.zeros(0) for _ in trials)
-        start = EstimatorStart(NO_EFFECT_VALUES, shared_values, no_local_values, trajectories, {})
-        laws = self.trial_set.laws(NO_EFFECTS, trials)
-        linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, self.shared_priors)
-        return linearisation or plain_linearisation(trials, self.shared_priors)
-
-    def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
-        """Return the prior medians of missing forces, by the number of the port.
-
-        The median standard deviation is 5 % of the elastic force at the port. The median
-        correlation time is the time in which the vibration advances by one radian, or the duration
-        of the trials if the port has no frequency.
-
-        Parameters
-        ----------
-        ports : iterable of int
-            The numbers of the ports.
-        """
-        scales = self.problem.setting.scales
-        processes = {}
-        for port in ports:
-            scale = scales.ports[self.ports[port]]
-            rate = scale.angular_frequency or 1.0 / scales.duration
-            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
-            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
-        return processes
-
-    def evaluate_model_laws(self, shared_values: FloatArray) -> ModelPatch:
-        """Return the model's own laws at values (K,) of the shared unknowns."""
-        parameters = self.problem.shared.parameters(shared_values)
-        return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
-
-    def _unknowns_of_model_laws(self, shared_values: FloatArray) -> tuple[int, ...]:
-        """Return the numbers of the shared unknowns that change the model's own laws.
-
-        They are compared at values (K,) of the shared unknowns, and a small step away.
-        """
-        laws_at_point = self.evaluate_model_laws(shared_values)
-        return tuple(
-            number
-            for number in range(self.problem.shared.parameter_count)
-            if self.evaluate_model_laws(with_step(shared_values, number, HALF_DIFFERENCE))
-            != laws_at_point
-        )
+        return self.ported.linearise(trials, trajectories, estimate.shared)
 
     def force_deviation(self, port: int) -> float:
         """Return the standard deviation of the missing force at a port without any effect.
@@ -356,7 +250,7 @@ class ForceSearch:
         """
         process = self.estimate_without_effects.processes.get(port)
         if process is None:
-            process = self.prior_processes((port,))[port]
+            process = self.ported.prior_processes((port,))[port]
         return process.standard_deviation
 
     # ---------------------------------------------------------------- effects
@@ -371,21 +265,17 @@ class ForceSearch:
         effect_count : int
             The number of effects that are compared.
         """
-        prior = log_prior(estimate.candidate, effect_count, self.problem.setting)
+        prior = log_prior(estimate.candidate, effect_count, self.ported.problem.setting)
         return estimate.log_evidence + prior
 
     def estimator(self, trials: Sequence[PortedTrial]) -> MotionEstimator:
         """Return the estimator of hypotheses in some trials."""
         processes = self.estimate_without_effects.processes
-        prior_medians = self.prior_processes(processes)
+        prior_medians = self.ported.prior_processes(processes)
         return MotionEstimator(
-            GaussNewton(tuple(trials), self.shared_priors, prior_medians),
+            GaussNewton(tuple(trials), self.ported.shared_priors, prior_medians),
             small_processes=scale_processes(processes, SMALL_FRACTION, 1.0),
         )
-
-    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
-        """Return the laws and sensor errors of a hypothesis in some of the trials."""
-        return self.trial_set.laws(candidate, trials)
 
     def estimate_effects(
         self, base: Estimate, candidate: Candidate, effect: FloatArray
@@ -417,7 +307,7 @@ class ForceSearch:
             )
             for port, process in base.processes.items()
         }
-        laws = self.laws(candidate, trials)
+        laws = self.ported.laws(candidate, trials)
         estimator = self.estimator(trials)
         # without effects, the shared unknowns have taken the place of laws
         first_shared = base.shared if base.candidate.terms else np.zeros_like(base.shared)
@@ -489,16 +379,16 @@ class ForceSearch:
         point : Point
             The values of all unknowns, as a simulation was fitted to the readings.
         """
-        trials = self.trial_set.trials_about(point)
+        trials = self.ported.trial_set.trials_about(point)
         estimator = self.estimator(trials)
         start = replace(
             start_in_other_trials(self.estimate_without_effects, trials),
             effect=point.effect,
             shared=point.shared,
-            local=tuple(point.local[number] for number in self.trial_indices),
+            local=tuple(point.local[number] for number in self.ported.trial_indices),
             processes=estimator.small_processes,
         )
-        return estimator.follow_laws(self.laws(candidate, trials), start)
+        return estimator.follow_laws(self.ported.laws(candidate, trials), start)
 
     def begin_along_simulation(self, point: Point) -> None:
         """Estimate the model without effects along its simulation, as effects are estimated.
@@ -541,7 +431,7 @@ class ForceSearch:
         """
         trials = base.ported_trials
         start = replace(start_from_estimate(base), effect=effect)
-        laws = self.laws(candidate, trials)
+        laws = self.ported.laws(candidate, trials)
         return self.estimator(trials).estimate_roughly(laws, start, processes)
 
     def polish_effects(
@@ -567,7 +457,9 @@ class ForceSearch:
         start = replace(start_from_estimate(base), effect=effect)
         # the estimate without effects has no window
         speed_window = base.speed_window or USUAL_WINDOW
-        return self.estimator(trials).polish(self.laws(candidate, trials), start, speed_window)
+        return self.estimator(trials).polish(
+            self.ported.laws(candidate, trials), start, speed_window
+        )
 
     def estimate_about_own_values(self, estimate: Estimate) -> Estimate:
         """Return an estimate in trials that are linear about its own unknowns.
@@ -584,13 +476,13 @@ class ForceSearch:
         """
         for number in range(MOST_LINEARISATIONS):
             trials = estimate.ported_trials
-            point = self._point_of(estimate)
+            point = self.ported.point_of(estimate)
             point_of_trials = trials[0].linearisation_point[: len(point.shared)]
             is_same_point = bool(np.all(np.abs(point.shared - point_of_trials) < SAME_POINT))
             if is_same_point and number > 0:
                 break
-            next_trials = trials if is_same_point else self.trial_set.trials_about(point)
-            laws = self.laws(estimate.candidate, next_trials)
+            next_trials = trials if is_same_point else self.ported.trial_set.trials_about(point)
+            laws = self.ported.laws(estimate.candidate, next_trials)
             estimator = self.estimator(next_trials)
             start = start_in_other_trials(estimate, next_trials)
             if number == 0 and not estimate.follows_laws:
@@ -609,12 +501,12 @@ class ForceSearch:
 
         The trials are linear about the same unknowns as the thinned ones.
         """
-        shared_count = self.problem.shared.unknown_count
+        shared_count = self.ported.problem.shared.unknown_count
         points = [trial.trial.linearisation_point for trial in thinned_estimate.trials]
-        point = self.point_of_unknowns(
+        point = self.ported.point_of_unknowns(
             points[0][:shared_count], [values[shared_count:] for values in points]
         )
-        trials = self.trial_set.trials_about(point)
+        trials = self.ported.trial_set.trials_about(point)
         trajectories = []
         for smoothed_trial, trial in zip(thinned_estimate.trials, trials, strict=True):
             unknowns = np.concatenate((thinned_estimate.shared, smoothed_trial.local))
@@ -624,38 +516,12 @@ class ForceSearch:
                 )
             )
         start = replace(start_from_estimate(thinned_estimate), trajectories=tuple(trajectories))
-        laws = self.laws(thinned_estimate.candidate, trials)
+        laws = self.ported.laws(thinned_estimate.candidate, trials)
         return self.estimator(trials).polish(laws, start, thinned_estimate.speed_window)
 
     # ---------------------------------------------------------------- values of unknowns
 
     def point(self, estimate: Estimate) -> Point:
         """Return the unknowns of an estimate with its effects, from which a fit may begin."""
-        point = self._point_of(estimate)
+        point = self.ported.point_of(estimate)
         return Point(estimate.shared.copy(), point.local, estimate.effect.copy())
-
-    def _point_of(self, estimate: Estimate) -> Point:
-        """Return the unknowns of an estimate without its effects, clipped to their ranges."""
-        return self.point_of_unknowns(estimate.shared, estimate.local)
-
-    def point_of_unknowns(
-        self, shared_values: FloatArray, local_of_trials: Iterable[FloatArray]
-    ) -> Point:
-        """Return values of the unknowns as a point of the problem, clipped to their ranges.
-
-        Parameters
-        ----------
-        shared_values : (K,) array
-            The scaled values of the K unknowns that all trials share.
-        local_of_trials : iterable of (L,) array
-            The unknowns of each trial in motion.
-        """
-        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
-        for number, values in zip(self.trial_indices, local_of_trials, strict=True):
-            local_values[number] = values
-        low, high = self.problem.shared.bounds
-        # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
-        # within two prior standard deviations
-        low = np.maximum(low + PARAMETER_STEP, -2.0)
-        high = np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))

@@ -312,6 +312,20 @@ def _start_after_step(
     )
 
 
+def _at_start_of_step(estimate: Estimate, start: EstimatorStart) -> Estimate:
+    """Return an estimate with the unknowns about which its trials are linear.
+
+    The unknowns of each trial alone are the most probable ones beside them.
+    """
+    unknowns = replace(estimate.solution, mean=np.concatenate((start.shared, start.effect)))
+    return replace(
+        estimate,
+        effect=start.effect,
+        shared=start.shared,
+        trials=estimate.linearisation.smooth(start.processes, unknowns),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class GaussNewton:
     """Gauss-Newton iterations of hypotheses on the same trials, under given missing forces.
@@ -410,7 +424,7 @@ class GaussNewton:
         This is a shooting method: each trajectory is simulated with the unknowns of the last
         estimate, so that laws with kinks, such as dry friction, are linear about a motion that they
         make. It is meant for small missing forces, which the simulation leaves out. A step is
-        halved where the evidence at its end is lower.
+        halved where the evidence at its end is lower, and the next one is at most twice as long.
 
         Parameters
         ----------
@@ -437,12 +451,12 @@ class GaussNewton:
                 laws, self.trials, start, speed_window, self.shared_priors
             )
             if linearisation is None:
-                return best_estimate
+                break
             estimate = self._estimate_of_linearisation(
                 laws.candidate, linearisation, start, -inf, speed_window
             )
             if estimate is None:
-                return best_estimate
+                break
             # the laws are linear about the unknowns of the start, where the evidence is lower
             decrement = _newton_decrement(start, estimate)
             estimate = replace(
@@ -454,13 +468,16 @@ class GaussNewton:
             if best_estimate is None or estimate.log_evidence > best_estimate.log_evidence:
                 best_estimate = estimate
                 best_start = start
-                fraction = 1.0
+                fraction = min(2.0 * fraction, 1.0)
             else:
                 fraction = 0.5 * fraction
             if best_estimate.converged or fraction < SHORTEST_FRACTION:
-                return best_estimate
+                break
             start = _start_after_step(laws, best_start, best_estimate, fraction)
-        return best_estimate
+        if best_estimate is None or best_estimate.converged:
+            return best_estimate
+        # the evidence is that at the start of the last step, whose end may be worse
+        return _at_start_of_step(best_estimate, best_start)
 
     def _estimate_of_linearisation(
         self,

@@ -282,7 +282,9 @@ class _Ranking:
             return None
         base = self.search.estimate_without_effects
         port = max(base.processes, key=self.search.force_deviation)
-        scale = self.search.problem.setting.scales.ports.get(self.search.ports[port])
+        ported = self.search.ported
+        port_name = ported.ports[port]
+        scale = ported.problem.setting.scales.ports.get(port_name)
         if scale is not None and scale.of_state:
             return None
         force = np.concatenate([trial.missing_forces[port] for trial in base.trials])
@@ -299,13 +301,13 @@ class _Ranking:
         estimates = []
         for correlation_length in CORRELATION_LENGTHS:
             curve = force_curve(
-                self.search.ports[port],
+                port_name,
                 variable,
                 (float(values.min()), float(values.max())),
                 CURVE_DEVIATION * self.search.force_deviation(port),
                 correlation_length,
             )
-            candidate = Candidate((EffectTerm(curve, self.search.ports[port], free_shape=True),))
+            candidate = Candidate((EffectTerm(curve, port_name, free_shape=True),))
             self.on_progress(f"estimating {candidate.description} together with the motion")
             estimate = self.search.estimate_effects(base, candidate, candidate.start_values())
             if estimate is not None:

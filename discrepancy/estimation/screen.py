@@ -15,7 +15,7 @@ from scipy.special import erf
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.errors import DiscrepancyError
+from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.trials_in_motion.effects import EffectLaws
 from discrepancy.trials_in_motion.laws import LawForce
@@ -30,9 +30,10 @@ from reporting.arrays import LEAST_DIVISOR
 from .estimate import Estimate
 from .estimator import NARROWEST_WINDOW
 from .filtered import SmoothedTrial
-from .force_search import WIDE_WINDOW, ForceSearch
+from .force_search import ForceSearch
 from .linearisation import Linearisation
 from .linearised import LinearisedTrial
+from .ported_problem import WIDE_WINDOW
 from .process_search import Processes, processes_within_range, scale_processes
 from .regression import Priors
 
@@ -162,7 +163,11 @@ def screen_effects(
 
 
 def values_to_try(term: EffectTerm) -> list[FloatArray]:
-    """Return sets of standard normal parameter values (E,) at which an effect is tried."""
+    """Return sets of standard normal parameter values (E,) at which an effect is tried.
+
+    Of several magnitudes that may have both signs, such as the rate and the zero of a clock, each
+    is also tried alone, with the others at zero: their ratio is not known.
+    """
     shape_indices = [
         number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
     ]
@@ -173,6 +178,18 @@ def values_to_try(term: EffectTerm) -> list[FloatArray]:
         values = np.full(len(term.parameters), MAGNITUDE_VALUE)
         values[shape_indices] = shape_values
         combinations.append(values)
+    signed_magnitudes = [
+        number
+        for number, parameter in enumerate(term.parameters)
+        if parameter.magnitude and parameter.prior.low < 0.0
+    ]
+    if len(signed_magnitudes) > 1:
+        for values in list(combinations):
+            for number in signed_magnitudes:
+                alone = values.copy()
+                alone[signed_magnitudes] = 0.0
+                alone[number] = MAGNITUDE_VALUE
+                combinations.append(alone)
     return combinations
 
 
@@ -182,7 +199,7 @@ def _terms_to_add(
     """Yield the effects at places where an estimate lacks them, also with a free shape."""
     in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
     for effect in effects:
-        for place in effect.places(search.problem.setting):
+        for place in effect.places(search.ported.problem.setting):
             if (effect.identifier, place) in in_base:
                 continue
             yield EffectTerm(effect, place)
@@ -195,22 +212,28 @@ def _try_effects(
 ) -> list[TriedEffect]:
     """Return the columns of all effects that may be added, at several values of each.
 
-    Effects that change nothing, or are not possible along the motion, are left out.
+    Effects that change nothing are left out, and those that are not possible along the motion, for
+    which the problem records why.
     """
     trials = base.ported_trials
     tried_effects = []
     for term in _terms_to_add(search, base, effects):
-        laws = search.laws(Candidate((term,)), trials)
+        laws = search.ported.laws(Candidate((term,)), trials)
         for values in values_to_try(term):
             try:
                 columns = [
                     _column_in_trial(laws, number, smoothed_trial, values)
                     for number, smoothed_trial in enumerate(base.trials)
                 ]
-            except (DiscrepancyError, InvalidPatchError):
+            except (DiscrepancyError, InvalidPatchError) as cause:
+                search.ported.problem_with_laws.record_refusal(laws.candidate, cause)
                 continue
-            is_finite = all(np.all(np.isfinite(column.readings)) for column in columns)
-            if is_finite and not all(column.is_zero for column in columns):
+            if not all(np.all(np.isfinite(column.readings)) for column in columns):
+                not_finite = ModelError(
+                    "What the effect adds to the readings is not a finite number at every time."
+                )
+                search.ported.problem_with_laws.record_refusal(laws.candidate, not_finite)
+            elif not all(column.is_zero for column in columns):
                 tried_effects.append(TriedEffect(term, values, columns))
     return tried_effects
 

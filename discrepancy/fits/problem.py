@@ -20,7 +20,7 @@ import numpy as np
 from discrepancy.campaign.noise import NoiseModel, noise_model, whiteness_is_tested
 from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
-from discrepancy.errors import CampaignDataError, DiscrepancyError
+from discrepancy.errors import CampaignDataError
 from discrepancy.system.interface import Model
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
@@ -162,7 +162,7 @@ class Problem:
             np.add.at(counts, data.channel_indices, data.weight.sum(axis=0))
         return counts
 
-    def record_refusal(self, candidate: Candidate, cause: DiscrepancyError) -> None:
+    def record_refusal(self, candidate: Candidate, cause: Exception) -> None:
         """Record why a single effect could not be evaluated or fitted.
 
         Nothing is recorded for a set of several effects, as any of them may be the cause.

@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import DiscrepancyError
 from discrepancy.estimation.estimate import LEAST_EVIDENCE, Estimate
-from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
+from discrepancy.estimation.force_search import ForceSearch
+from discrepancy.estimation.ported_problem import can_estimate_forces
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.verdict import RATE_OF, STATE, ForceAtPort, ForceLeft, ForceMoment
@@ -263,23 +264,23 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
     if max(evidence_by_port.values()) < LEAST_EVIDENCE:
         return None
     terms = estimate.candidate.terms
-    law_ports = {term.place for term in terms if term.place in search.ports}
+    law_ports = {term.place for term in terms if term.place in search.ported.ports}
     if len(law_ports) == 1:
         (port,) = law_ports
     else:
         port = max(evidence_by_port, key=lambda name: evidence_by_port[name])
-    number = search.ports.index(port)
+    number = search.ported.ports.index(port)
     # an estimate without a missing force at this port: take the force at the port alone
     if number not in estimate.processes:
         estimate = search.estimate_by_port[port]
     law_name = " and ".join(
         term.name_in_words for term in estimate.candidate.terms if term.place == port
     )
-    recorded = {trial.name: trial for trial in search.problem.campaign.trials}
+    recorded = {trial.name: trial for trial in search.ported.problem.campaign.trials}
     trial_forces = _with_history_of_motion(
         _forces_by_trial(estimate, number, recorded, has_law=bool(law_name))
     )
-    unit, *_ = search.problem.model.port_units(port)
+    unit, *_ = search.ported.problem.model.port_units(port)
     correlation_time = estimate.processes[number].correlation_time
     force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
     return MissingForce(force, trial_forces, law_name)

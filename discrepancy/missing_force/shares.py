@@ -10,13 +10,14 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.estimation.estimate import NO_EFFECTS, Estimate
 from discrepancy.estimation.filtered import SmoothedTrial
-from discrepancy.estimation.force_search import WIDE_WINDOW, ForceSearch
+from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.estimation.gauss_newton import (
     EstimatorStart,
     linearise_along_laws,
     linearise_trials,
 )
 from discrepancy.estimation.linearisation import Linearisation, plain_linearisation
+from discrepancy.estimation.ported_problem import WIDE_WINDOW
 from discrepancy.estimation.process_search import Processes
 from discrepancy.estimation.trial_set import TrialSet
 from discrepancy.fits.candidate import Point
@@ -61,14 +62,16 @@ class ForceShares:
 
     def __init__(self, search: ForceSearch) -> None:
         self.search = search
-        campaign = search.problem.campaign
+        campaign = search.ported.problem.campaign
         held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
         self._held_out: TrialSet | None = None
         self._held_out_trials: dict[bytes, tuple[PortedTrial, ...]] = {}
         self._without_effect: dict[bool, tuple[SmoothedTrial, ...]] = {}
         if held_out:
-            problem = search.problem.with_trials(held_out)
-            self._held_out = search.trial_set.with_problem(problem, range(len(problem.trials)))
+            problem = search.ported.problem.with_trials(held_out)
+            self._held_out = search.ported.trial_set.with_problem(
+                problem, range(len(problem.trials))
+            )
 
     @property
     def has_held_out(self) -> bool:
@@ -121,7 +124,7 @@ class ForceShares:
 
     def _law_ports(self, estimate: Estimate) -> set[int]:
         """Return the numbers of the ports at which a hypothesis has laws."""
-        names = self.search.ports
+        names = self.search.ported.ports
         places = [term.place for term in estimate.candidate.terms]
         return {names.index(place) for place in places if place in names}
 
@@ -203,7 +206,7 @@ class ForceShares:
         if held_out not in self._without_effect:
             estimate = self.search.estimate_without_effects
             # an unknown with a flat prior has no bound
-            has_prior = self.search.problem.shared.precision > 0.0
+            has_prior = self.search.ported.problem.shared.precision > 0.0
             bounds = np.where(has_prior, SHARED_BOUND, np.inf)
             bounded_estimate = replace(estimate, shared=np.clip(estimate.shared, -bounds, bounds))
             _, self._without_effect[held_out] = self.smooth_trials(
@@ -232,7 +235,7 @@ class ForceShares:
                 processes, estimate.solution
             )
         assert self._held_out is not None
-        priors = self.search.shared_priors
+        priors = self.search.ported.shared_priors
         trials = self._held_out_linearised_as(estimate)
         without_laws = plain_linearisation(trials, priors)
         linearisation = without_laws

@@ -107,7 +107,7 @@ def _windows_of_missing_force(
     port = max(search.estimate_by_port, key=lambda name: search.estimate_by_port[name].log_evidence)
     channels_by_trial = [data.trial.channels for data in problem.trials]
     port_number, estimate = _port_or_channel_error(
-        search.ports.index(port), search.estimate_with_jumps(port), channels_by_trial
+        search.ported.ports.index(port), search.estimate_with_jumps(port), channels_by_trial
     )
     # no windows without a missing force
     if estimate.leaves_no_force:

@@ -16,7 +16,8 @@ import numpy as np
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
 from discrepancy.estimation.estimate import Estimate
-from discrepancy.estimation.force_search import ForceSearch, can_estimate_forces
+from discrepancy.estimation.force_search import ForceSearch
+from discrepancy.estimation.ported_problem import can_estimate_forces
 from discrepancy.estimation.ranking import rank_by_missing_force
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, try_fit

@@ -72,7 +72,7 @@ def search(
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
     force_search = result.force_search if result.is_all_in_motion else None
-    if force_search is not None and force_search.has_channel_for_each_port:
+    if force_search is not None and force_search.ported.has_channel_for_each_port:
         result.search_by_missing_force(force_search)
     else:
         result.search_single_effects()

@@ -25,7 +25,7 @@ def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
     first = search.estimate_without_effects
     trials = [trial.trial for trial in first.trials]
     again = search.estimator(trials).estimate_nearby(
-        search.laws(NO_EFFECTS, trials), start_from_estimate(first), 0.005
+        search.ported.laws(NO_EFFECTS, trials), start_from_estimate(first), 0.005
     )
     assert again.log_evidence == pytest.approx(first.log_evidence, abs=0.05)
     for trial, first_trial in zip(again.trials, first.trials, strict=True):

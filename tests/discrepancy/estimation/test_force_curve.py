@@ -50,7 +50,7 @@ def test_the_curve_leaves_no_force(ranked):
 
 def test_the_curve_is_that_of_the_magnet(search, ranked):
     """But for a line, which a small error of the stiffness adds."""
-    (table,) = ranked[0].candidate.patch(search.problem.setting, ranked[0].effect)
+    (table,) = ranked[0].candidate.patch(search.ported.problem.setting, ranked[0].effect)
     displacements = np.array(table.displacements)
     truth = np.array([law_force(MAGNET.truth, 0.0, x, 0.0, 0.0) for x in displacements])
     difference = np.array(table.forces) - truth

@@ -93,7 +93,7 @@ def test_friction_in_one_direction_is_estimated_in_its_size(search: ForceSearch)
     best, *_ = rank_by_missing_force(search, effects)
 
     assert best.candidate.identifiers == ("coulomb_friction",)
-    (law,) = best.candidate.patch(search.problem.setting, best.effect)
+    (law,) = best.candidate.patch(search.ported.problem.setting, best.effect)
     assert law.coefficient == pytest.approx(FRICTION, abs=2.0)
     assert best.processes[0].standard_deviation < 0.05 * FRICTION
 

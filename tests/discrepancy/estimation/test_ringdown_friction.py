@@ -46,9 +46,9 @@ def test_little_of_the_force_is_left(ranked, held_out):
 
 def test_the_size_of_friction_is_that_of_the_truth(ranked):
     search, (best, *_) = ranked
-    (law,) = best.candidate.patch(search.problem.setting, best.effect)
+    (law,) = best.candidate.patch(search.ported.problem.setting, best.effect)
     (true_law,) = chosen("coulomb_friction")[0].patch(
-        search.problem.setting, {"friction_ratio": RATIO}, "slide"
+        search.ported.problem.setting, {"friction_ratio": RATIO}, "slide"
     )
     assert law.coefficient == pytest.approx(true_law.coefficient, rel=0.01)
 

@@ -25,7 +25,7 @@ def search() -> ForceSearch:
 def friction_of(search: ForceSearch, estimate: Estimate) -> float:
     """Return the force of the dry friction of a hypothesis [N]."""
     (term,) = estimate.candidate.terms
-    (law,) = term.patch(search.problem.setting, estimate.effect)
+    (law,) = term.patch(search.ported.problem.setting, estimate.effect)
     return float(law.coefficient)
 
 
@@ -82,7 +82,7 @@ def test_a_thinned_trial_has_every_third_sample_and_stamp(search: ForceSearch) -
 @pytest.fixture
 def search_from_thinned(search: ForceSearch, monkeypatch: pytest.MonkeyPatch) -> ForceSearch:
     monkeypatch.setattr(force_search, "MOST_THINNED_SAMPLES", 400)
-    return ForceSearch(search.problem_with_laws)
+    return ForceSearch(search.ported.problem_with_laws)
 
 
 def test_long_records_are_thinned_at_first(search_from_thinned: ForceSearch) -> None:

@@ -596,7 +596,7 @@ def test_a_gain_error_acts_on_the_motion_of_the_model_and_not_on_that_by_a_missi
     estimate = search.estimate_without_effects
     (gain,) = chosen("gauge_gain")
     candidate = Candidate((EffectTerm(gain, "leaf_strain"),))
-    laws = search.laws(candidate, estimate.ported_trials)
+    laws = search.ported.laws(candidate, estimate.ported_trials)
     moved = estimate.trials[0].trajectory
     still = replace(moved, added_state=np.zeros_like(moved.added_state))
     changes = []

@@ -1,0 +1,189 @@
+"""A problem whose trials in motion are linear systems with the ports of its model.
+
+The model's own laws are left out of them: their forces act at the ports, as missing forces and laws
+of effects do.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
+from discrepancy.fits.problem import Problem
+from discrepancy.trials_in_motion.effects import HALF_DIFFERENCE, EffectLaws
+from discrepancy.trials_in_motion.trajectory import Trajectory
+from discrepancy.trials_in_motion.trial import PortedTrial
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
+
+from .estimate import NO_EFFECT_VALUES, NO_EFFECTS, Estimate
+from .force_states import Process
+from .gauss_newton import EstimatorStart, linearise_trials
+from .linearisation import Linearisation, plain_linearisation
+from .regression import Priors
+from .trial_set import TrialSet
+
+WIDE_WINDOW = 0.1
+"""Half width of the window of speeds where the model's own laws are linear along a first motion."""
+
+
+def can_estimate_forces(problem: Problem) -> bool:
+    """Return whether missing forces can be estimated in a problem.
+
+    That needs trials in motion, and a model that describes how its ports move.
+    """
+    model = problem.model
+    has_motion = any(data.trial.is_dynamic for data in problem.trials)
+    return has_motion and model.shows_ports and bool(model.ports)
+
+
+class PortedProblem:
+    """A problem whose trials are linear systems between the ports of the model.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem with trials in motion, whose model has ports.
+    sample_limit : int, optional
+        The number of samples of all trials together to which trials are thinned, if they can be.
+
+    Attributes
+    ----------
+    ports : tuple of str
+        The names of the ports.
+    problem_with_laws : Problem
+        The problem as it was given; `problem` has the same trials, and a model without laws.
+    model_laws : ModelPatch
+        The model's own laws at its ports, which its linear system does not contain.
+    prior_means : Point
+        The prior means of all unknowns, about which the trials are linear at first.
+    trial_indices : list of int
+        The indices of the trials in motion in the problem.
+    trial_set : TrialSet
+        The trials in motion, of which linear systems are made.
+    shared_priors : Priors
+        The priors of the unknowns that all trials share.
+    """
+
+    def __init__(self, problem: Problem, sample_limit: int | None) -> None:
+        self.problem_with_laws = problem
+        linear_model, self.model_laws = problem.model.without_laws()
+        trials = tuple(data.trial for data in problem.trials)
+        self.model = problem.model
+        self.problem = problem.with_trials(trials, linear_model)
+        self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
+        self.ports = tuple(linear_model.ports)
+        self.prior_means = self.problem.prior_mean_point(NO_EFFECTS)
+        self.trial_set = TrialSet(
+            problem=self.problem,
+            trial_indices=self.trial_indices,
+            evaluate_model_laws=self.evaluate_model_laws,
+            unknowns_of_model_laws=self._unknowns_of_model_laws(self.prior_means.shared),
+            sample_limit=sample_limit,
+        )
+        low, high = self.problem.shared.bounds
+        self.shared_priors = Priors(self.problem.shared.precision, low, high)
+
+    @property
+    def has_channel_for_each_port(self) -> bool:
+        """Whether each trial has at least as many channels as there are ports.
+
+        Free forces at more ports than that fit any reading, whatever law acts at one of them.
+        """
+        trials = [self.problem.trials[number] for number in self.trial_indices]
+        return all(len(data.trial.channels) >= len(self.ports) for data in trials)
+
+    def linearise(
+        self,
+        trials: tuple[PortedTrial, ...],
+        trajectories: tuple[Trajectory, ...],
+        shared_values: FloatArray,
+    ) -> Linearisation:
+        """Return trials along trajectories with the model's own laws, without effects.
+
+        If the laws are not possible there, they are left out.
+
+        Parameters
+        ----------
+        trials : tuple of PortedTrial
+            The trials as linear systems with ports.
+        trajectories : tuple of Trajectory
+            The motion of each trial.
+        shared_values : (K,) array
+            The values of the shared unknowns.
+        """
+        no_local_values = tuple(np.zeros(0) for _ in trials)
+        start = EstimatorStart(NO_EFFECT_VALUES, shared_values, no_local_values, trajectories, {})
+        laws = self.trial_set.laws(NO_EFFECTS, trials)
+        linearisation = linearise_trials(laws, trials, start, WIDE_WINDOW, self.shared_priors)
+        return linearisation or plain_linearisation(trials, self.shared_priors)
+
+    def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
+        """Return the prior medians of missing forces, by the number of the port.
+
+        The median standard deviation is 5 % of the elastic force at the port. The median
+        correlation time is the time in which the vibration advances by one radian, or the duration
+        of the trials if the port has no frequency.
+
+        Parameters
+        ----------
+        ports : iterable of int
+            The numbers of the ports.
+        """
+        scales = self.problem.setting.scales
+        processes = {}
+        for port in ports:
+            scale = scales.ports[self.ports[port]]
+            rate = scale.angular_frequency or 1.0 / scales.duration
+            # 5 % of the elastic force is a small gap; the prior allows sizes far from this median
+            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
+        return processes
+
+    def evaluate_model_laws(self, shared_values: FloatArray) -> ModelPatch:
+        """Return the model's own laws at values (K,) of the shared unknowns."""
+        parameters = self.problem.shared.parameters(shared_values)
+        return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
+
+    def _unknowns_of_model_laws(self, shared_values: FloatArray) -> tuple[int, ...]:
+        """Return the numbers of the shared unknowns that change the model's own laws.
+
+        They are compared at values (K,) of the shared unknowns, and a small step away.
+        """
+        laws_at_point = self.evaluate_model_laws(shared_values)
+        return tuple(
+            number
+            for number in range(self.problem.shared.parameter_count)
+            if self.evaluate_model_laws(with_step(shared_values, number, HALF_DIFFERENCE))
+            != laws_at_point
+        )
+
+    def laws(self, candidate: Candidate, trials: Sequence[PortedTrial]) -> EffectLaws:
+        """Return the laws and sensor errors of a hypothesis in some of the trials."""
+        return self.trial_set.laws(candidate, trials)
+
+    def point_of_unknowns(
+        self, shared_values: FloatArray, local_of_trials: Iterable[FloatArray]
+    ) -> Point:
+        """Return values of the unknowns as a point of the problem, clipped to their ranges.
+
+        Parameters
+        ----------
+        shared_values : (K,) array
+            The scaled values of the K unknowns that all trials share.
+        local_of_trials : iterable of (L,) array
+            The unknowns of each trial in motion.
+        """
+        local_values = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
+        for number, values in zip(self.trial_indices, local_of_trials, strict=True):
+            local_values[number] = values
+        low, high = self.problem.shared.bounds
+        # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
+        # within two prior standard deviations
+        low = np.maximum(low + PARAMETER_STEP, -2.0)
+        high = np.minimum(high - PARAMETER_STEP, 2.0)
+        return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))
+
+    def point_of(self, estimate: Estimate) -> Point:
+        """Return the unknowns of an estimate without its effects, clipped to their ranges."""
+        return self.point_of_unknowns(estimate.shared, estimate.local)
