@@ -313,17 +313,14 @@ def _start_after_step(
 
 
 def _at_start_of_step(estimate: Estimate, start: EstimatorStart) -> Estimate:
-    """Return an estimate with the unknowns about which its trials are linear.
-
-    The unknowns of each trial alone are the most probable ones beside them.
-    """
-    unknowns = replace(estimate.solution, mean=np.concatenate((start.shared, start.effect)))
-    return replace(
-        estimate,
-        effect=start.effect,
-        shared=start.shared,
-        trials=estimate.linearisation.smooth(start.processes, unknowns),
+    """Return an estimate with the unknowns about which its trials are linear."""
+    shared_and_effect = np.concatenate((start.shared, start.effect))
+    filtered_trials = estimate.linearisation.filter(start.processes)
+    trials = tuple(
+        filtered_trial.smooth(np.concatenate((shared_and_effect, local)))
+        for filtered_trial, local in zip(filtered_trials, start.local, strict=True)
     )
+    return replace(estimate, effect=start.effect, shared=start.shared, trials=trials)
 
 
 @dataclass(frozen=True, eq=False)

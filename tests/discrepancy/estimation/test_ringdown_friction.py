@@ -1,9 +1,13 @@
 """Ring-downs that dry friction ends: its law leaves no force, in fitted and in held-out trials."""
 
+from dataclasses import replace
+
 import pytest
 
 from discrepancy.estimation.estimate import Estimate
+from discrepancy.estimation.estimator import WINDOW_AT_REST
 from discrepancy.estimation.force_search import ForceSearch
+from discrepancy.estimation.gauss_newton import start_from_estimate
 from discrepancy.estimation.ranking import rank_hypotheses
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.system.lumped_model import LumpedModel
@@ -56,3 +60,18 @@ def test_the_size_of_friction_is_that_of_the_truth(ranked):
 def test_the_hypothesis_without_effects_leaves_a_force(ranked):
     search, _ = ranked
     assert not search.estimate_without_effects.leaves_no_force
+
+
+def test_an_estimate_that_did_not_converge_goes_on_where_its_evidence_was_found(ranked):
+    """The whole step from there may lead to a lower evidence, so it is no beginning."""
+    search, (best, *_) = ranked
+    laws = search.ported.laws(best.candidate, best.ported_trials)
+    gauss_newton = search.estimator(best.ported_trials).gauss_newton
+    start = replace(start_from_estimate(best), effect=best.effect + 0.05)
+    unfinished = gauss_newton.iterate_along_laws(laws, start, WINDOW_AT_REST, most_iterations=1)
+    again = gauss_newton.iterate_along_laws(
+        laws, start_from_estimate(unfinished), WINDOW_AT_REST, most_iterations=1
+    )
+    assert not unfinished.converged
+    assert unfinished.effect == pytest.approx(start.effect)
+    assert again.log_evidence == pytest.approx(unfinished.log_evidence, abs=1.0)
