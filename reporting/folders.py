@@ -158,14 +158,10 @@ def restore_folder(folder: Path) -> bool:
 
 
 def _restore_from(parking: Path, folder: Path) -> bool:
-    """Move old content back to its folder if the folder is missing; return whether it was moved.
+    """Move the content that `replace_folder` had parked back, if its folder is missing.
 
-    Parameters
-    ----------
-    parking : Path
-        The folder into which `replace_folder` had moved the old content.
-    folder : Path
-        The folder to restore.
+    If the folder is there and is the one that replaced this content, the content is removed. The
+    result says whether the content was moved back.
     """
     old_content = parking / folder.name
     if not old_content.is_dir():

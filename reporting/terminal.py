@@ -176,8 +176,11 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     shown_headings = [headings[column] for column in shown_columns]
     shown_cells = [[row[column] for column in shown_columns] for row in cells]
     printed_cells = shown_cells
-    if width < WIDE:
-        printed_cells = [_with_broken_words(row) for row in shown_cells]
+    if width < WIDE and shown_columns:
+        printed_cells = []
+        for name, *other_cells in shown_cells:
+            broken = [break_words(cell, LONGEST_WORD) for cell in other_cells]
+            printed_cells.append([break_words(name, LONGEST_NAME), *broken])
     widths = _column_widths(shown_headings, printed_cells, width)
     if widths is None and len(shown_columns) > 2:
         shown_headings, printed_cells, widths = _folded(shown_headings, shown_cells, width)
@@ -245,14 +248,6 @@ def _folded(
 def _longest(texts: Iterable[str]) -> int:
     """Return the number of characters of the longest line of some texts."""
     return max((len(line) for text in texts for line in text.split("\n")), default=0)
-
-
-def _with_broken_words(row: Sequence[str]) -> list[str]:
-    """Return the cells of a row with their long words broken; the first cell is a name."""
-    return [
-        break_words(text, LONGEST_WORD if column else LONGEST_NAME)
-        for column, text in enumerate(row)
-    ]
 
 
 def break_words(text: str, longest: int) -> str:

@@ -62,15 +62,11 @@ def _inner_types(annotation: object, step: int | str) -> list[object]:
     if step in types_of_keys:
         return [*_alternatives(types_of_keys[step])]
     arguments = get_args(annotation)
-    if len(arguments) == 2 and _is_mapping(annotation):
+    origin = get_origin(annotation)
+    is_mapping = isinstance(origin, type) and issubclass(origin, Mapping)
+    if is_mapping and len(arguments) == 2:
         return [*_alternatives(arguments[1])]
     return []
-
-
-def _is_mapping(annotation: object) -> bool:
-    """Return whether a type is a dictionary or another mapping."""
-    origin = get_origin(annotation)
-    return isinstance(origin, type) and issubclass(origin, Mapping)
 
 
 def _types_of_keys(annotation: object) -> dict[str, object]:

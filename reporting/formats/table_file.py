@@ -329,17 +329,16 @@ def table_text(columns: Mapping[str, Sequence[str] | Float]) -> str:
     columns : mapping of str to sequence of str or array
         The cells or numbers of each column; NaN becomes an empty cell.
     """
-    cells_by_column = [_cells_of(column) for column in columns.values()]
+    cells_by_column: list[Sequence[str]] = []
+    for column in columns.values():
+        if isinstance(column, np.ndarray):
+            # NaN alone is not equal to itself.
+            cells = ["" if value != value else repr(value) for value in column.tolist()]
+            cells_by_column.append(cells)
+        else:
+            cells_by_column.append(column)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*cells_by_column, strict=True))
     return stream.getvalue()
-
-
-def _cells_of(column: Sequence[str] | Float) -> Sequence[str]:
-    """Return the cells of a column as texts; NaN becomes an empty cell."""
-    if not isinstance(column, np.ndarray):
-        return column
-    # NaN alone is not equal to itself.
-    return ["" if value != value else repr(value) for value in column.tolist()]

@@ -258,7 +258,8 @@ class _TableFinder:
             for alternative in node.get(key, ()):
                 self._visit(alternative, location)
         if "items" in node:
-            self._visit(node["items"], self._location_of_row(location))
+            row = f"{location}[]" if self._notation == "json" else f"[{location}]"
+            self._visit(node["items"], row)
         for entry in node.get("prefixItems", ()):
             self._visit(entry, location)
         if isinstance(node.get("additionalProperties"), dict):
@@ -283,10 +284,6 @@ class _TableFinder:
             return f"{location}.{key}".lstrip(".")
         inner_location = location.strip("[]")
         return f"[{inner_location}.{key}]".replace("[.", "[")
-
-    def _location_of_row(self, location: str) -> str:
-        """Return the location of a table in a list of tables."""
-        return f"{location}[]" if self._notation == "json" else f"[{location}]"
 
 
 def _resolved(node: JsonSchema, root: JsonSchema) -> JsonSchema:

@@ -36,6 +36,8 @@ TomlTable: TypeAlias = dict[str, Any]
 LONGEST_ARRAY = 90
 """Largest number of characters in the entries of an array that is written in one line."""
 
+_TYPE_NAME = re.compile(r"[^\w]|^constrained")
+"""What the names of types have that pydantic adds to locations, such as "list[float]"."""
 _LONGEST_SHOWN_VALUE = 60  # in a message, in characters
 
 
@@ -143,7 +145,7 @@ def toml_text(content: Mapping[str, object]) -> str:
     for key, value in content.items():
         if isinstance(value, dict):
             tables[key] = value
-        elif isinstance(value, list) and _is_array_of_tables(value):
+        elif isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
             arrays_of_tables[key] = value
         else:
             values[key] = value
@@ -154,11 +156,6 @@ def toml_text(content: Mapping[str, object]) -> str:
         for row in rows:
             sections.append(f"[[{_toml_key(key)}]]\n{_key_value_lines(row)}")
     return "\n".join(section for section in sections if section)
-
-
-def _is_array_of_tables(entries: list[object]) -> bool:
-    """Return whether a list holds tables, and at least one."""
-    return bool(entries) and all(isinstance(entry, dict) for entry in entries)
 
 
 def _key_value_lines(table: dict[str, object]) -> str:
@@ -460,11 +457,6 @@ def _location_in_file(location: tuple[int | str, ...], first_index: int) -> str:
     for step in location:
         if isinstance(step, int):
             text += f"[{step + first_index}]"
-        elif not _is_type_name_of_pydantic(step):
+        elif not _TYPE_NAME.search(step):
             text += f".{step}" if text else step
     return text
-
-
-def _is_type_name_of_pydantic(step: str) -> bool:
-    """Return whether a part of a location is a type, such as "list[float]", and no key."""
-    return re.search(r"[^\w]|^constrained", step) is not None

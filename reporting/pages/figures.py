@@ -316,7 +316,7 @@ def swatches(
 def shared_legend(
     figure: Figure, rows: int = 1, bbox_to_anchor: tuple[float, float] = (0.53, 1.0)
 ) -> None:
-    """Draw one legend for all panels above them; equal labels appear once.
+    """Draw one legend above all panels of a figure; equal labels appear once.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ reads both.
 
 import html
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -168,9 +168,10 @@ def _is_in_data_coordinates(artist: Line2D | PathCollection, axes: Axes) -> bool
 
 
 def _line_names(figure: Figure) -> dict[_LineLook, str]:
-    """Return the names of lines by their appearance.
+    """Return a name for each appearance of lines in a figure.
 
-    A name comes from a legend, or from a labelled line of any panel that looks the same.
+    The name is that of the first entry of a legend with this appearance, else the label of the
+    first such line.
     """
     names: dict[_LineLook, str] = {}
     for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
@@ -279,7 +280,9 @@ def _map_records(axes: Axes) -> list[JsonObject]:
         if values.ndim != 2 or values.size > _MOST_CELLS:
             continue
         x, y = _cell_edges(artist, values.shape)
-        value_rows = [_rounded_cells(row) for row in values.tolist()]
+        value_rows = []
+        for row in values.tolist():  # three significant digits keep the page small
+            value_rows.append([None if cell is None else float(f"{cell:.3g}") for cell in row])
         records.append(
             {"x": x.tolist(), "y": y.tolist(), "values": value_rows, "name": quantity or "value"}
         )
@@ -303,11 +306,6 @@ def _cell_edges(artist: QuadMesh | AxesImage, shape: tuple[int, int]) -> tuple[F
     left, right, bottom, top = artist.get_extent()
     first, last = (bottom, top) if artist.origin == "lower" else (top, bottom)
     return np.linspace(left, right, columns + 1), np.linspace(first, last, rows + 1)
-
-
-def _rounded_cells(row: Sequence[float | None]) -> list[float | None]:
-    """Return values with three significant digits, which keeps the page small."""
-    return [None if value is None else float(f"{value:.3g}") for value in row]
 
 
 def _is_colour_bar(axes: Axes) -> bool:
@@ -343,12 +341,8 @@ def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str)
     texts = axis.get_major_formatter().format_ticks(ticks)
     if not name and not any(texts):
         record["unsaid"] = True
-    if any(_is_word(text) for text in texts):
+    # Ticks of numbers may have the minus sign of typography.
+    if any(text and not is_number(text.replace("\N{MINUS SIGN}", "-")) for text in texts):
         pairs = zip(ticks, texts, strict=True)
         record["texts"] = [[tick, " ".join(text.split())] for tick, text in pairs]
     return record
-
-
-def _is_word(tick_text: str) -> bool:
-    """Return whether the text of a tick is neither empty nor a number."""
-    return bool(tick_text) and not is_number(tick_text.replace("\N{MINUS SIGN}", "-"))

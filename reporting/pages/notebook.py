@@ -50,14 +50,14 @@ def html_table(
 
 
 def new_panels(count: int, axes: "Axes | Sequence[Axes] | None" = None) -> "list[Axes]":
-    """Return panels below one another for a picture.
+    """Return the panels of a picture: those of the user, or new ones of pyplot in one column.
 
     Parameters
     ----------
     count : int
         The number of panels.
     axes : Axes or sequence of Axes, optional
-        Panels of the user; new ones of pyplot by default.
+        The panels of the user.
 
     Raises
     ------

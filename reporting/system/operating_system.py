@@ -131,16 +131,16 @@ def lock_folder(folder: Path, *, shared: bool = False) -> int | None:
     """Lock a folder for this process.
 
     The lock belongs to the folder itself, so it stays when the folder is renamed. The system
-    releases it when the process ends. Where folders cannot be opened (Windows), a file in the
-    folder for temporary files, named after the number of the folder, is locked in its place: then
-    only processes with the same folder for temporary files see the lock.
+    releases it when the process ends. Windows cannot open a folder: there a file in the folder for
+    temporary files, named after the number of the folder, is locked instead, and only processes
+    with the same folder for temporary files see the lock.
 
     Parameters
     ----------
     folder : Path
         The folder.
     shared : bool
-        Whether others may hold a shared lock at the same time; see `lock_descriptor`.
+        Whether other processes may hold shared locks at the same time; see `lock_descriptor`.
 
     Returns
     -------
