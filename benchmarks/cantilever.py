@@ -303,7 +303,7 @@ def _motion(
         system = _system(float(modulus[0]), structural)
         excitation = Excitation(trial.time, conditions.motion_times(trial.time))
         if trial.kind is TrialKind.RINGDOWN:
-            point = ReleasePoint(TIP, require_release(trial))
+            point = ReleasePoint(TIP, TIP, require_release(trial))
             excitation = replace(excitation, release=point, initial=conditions.initial)
         else:
             history = RecordedHistory(trial.time, force, trial.hold)

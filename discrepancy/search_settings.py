@@ -65,6 +65,15 @@ class SearchSettings:
 
     The grid is fine, because friction that ends motions has many local optima over its size, and
     the right one is narrow."""
+    coarse_level_step: int = 5
+    """Every how many levels of that grid one is tried at each of many places first."""
+    first_periods: float = 4.0
+    """Periods of the first mode that choose the places."""
+    places_far_from_data: int = 3
+    """Places at which all levels are then tried."""
+    small_remainder: float = 0.05
+    """Part of the squared residuals of the model without effect below which effects that change the
+    structure are not tried at further places beside a set that has one of them."""
     few_places: int = 3
     """Effects with more places than this concern single channels, and are linear in their size."""
     least_gain_to_fit: float = 2.0

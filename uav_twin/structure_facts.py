@@ -119,7 +119,8 @@ def _structure_parts(structure: Structure) -> Iterator[StructurePart]:
     for number, material in enumerate(design.material):
         count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield StructurePart("material", material.name, material.set, count, "elements", note)
+        sets = ", ".join(material.sets)
+        yield StructurePart("material", material.name, sets, count, "elements", note)
     for number, damage in enumerate(design.damage):
         count = int((structure.region_of == number).sum())
         yield StructurePart("damage region", damage.name, damage.set, count, "elements")

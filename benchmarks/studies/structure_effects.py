@@ -171,7 +171,9 @@ def campaign(file: Path, hidden: BracketEffect, seed: int, *, ringdown: bool = F
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
-            excitation = Excitation(time, time, initial=initial, release=ReleasePoint(end, release))
+            excitation = Excitation(
+                time, time, initial=initial, release=ReleasePoint(end, end, release)
+            )
             moved = simulate_motion(system, excitation, laws)
             values = moved.response([OutputEquation.from_row(row) for row in rows]).values
         else:

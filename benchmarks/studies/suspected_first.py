@@ -5,25 +5,27 @@ displacements at rest and its modes. It hides a support that yields, a mass, a p
 stiffness, a load or a gauge beside its place, a gain error, two of these, or nothing. The model
 knows none of it. The figures stand in docs/how_to/soft_clamp.md.
 
-    python -m benchmarks.studies.suspected_first FOLDER            # all cases
-    python -m benchmarks.studies.suspected_first FOLDER arm plate  # two parts
+    python -m benchmarks.studies.suspected_first FOLDER                    # all cases
+    python -m benchmarks.studies.suspected_first FOLDER --seed 8           # other places and sizes
+    python -m benchmarks.studies.suspected_first FOLDER --parts arm plate  # two parts
+    python -m benchmarks.studies.suspected_first FOLDER --cases 2 3        # two campaigns
 
 Truths are kept in FOLDER, so that a second run needs no CalculiX.
 """
 
+import argparse
 import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.linalg import spsolve
 
-from benchmarks.studies.suspected_parts import PARTS, Fault, Part, write_part
+from benchmarks.studies.suspected_parts import PARTS, Fault, Part, Point, write_part
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.system.structures import StructureModel
@@ -32,6 +34,7 @@ from discrepancy.workflow import investigate
 from fe.reduction.model_cache import changeable_model
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel
+from fe.runtime.patch import PlaceMass
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_deck import Step, structure_deck
 from fe.verification.calculix_run import read_frequencies, read_tables, run_calculix
@@ -52,58 +55,145 @@ RELEASES = (("first", 0, 0.6), ("second", 1, 0.5), ("held out", 0, 0.4))
 """Name of each release, number of its load, and fraction of the largest force."""
 
 
-def support(place: str, motion: str, spring: float) -> Fault:
-    """Return a support that yields against a spring [N/m or N m/rad]."""
-    return Fault("support_compliance", place, motion, spring)
+Span = tuple[float, float]
 
 
-def mass(x: float, y: float, z: float, kilograms: float) -> Fault:
-    """Return a mass at a point of the grid [mm]."""
-    return Fault("added_mass", value=kilograms, point=(x, y, z))
+@dataclass(frozen=True)
+class Hidden:
+    """What may be hidden in a part, with the ranges from which places and sizes are drawn.
+
+    Attributes
+    ----------
+    springs : dict of str to float
+        For each support that may turn about y, the spring about which that of the truth is drawn
+        [N m/rad].
+    mass : float
+        The mass about which that of the truth is drawn [kg].
+    mass_box : three pairs of float
+        Where the mass may be, on the grid of the part [mm].
+    loss_boxes : tuple of pairs of (3,) tuples
+        Cells of which one box may lose stiffness [mm].
+    loss_shift : (3,) tuple of float
+        Largest shift of these boxes [mm].
+    load_offsets, gauge_offsets : tuple of (str, str)
+        Loads with the axis of their offset, and gauges with the direction.
+    """
+
+    springs: dict[str, float]
+    mass: float
+    mass_box: tuple[Span, Span, Span]
+    loss_boxes: tuple[tuple[Point, Point], ...]
+    loss_shift: Point
+    load_offsets: tuple[tuple[str, str], ...] = ()
+    gauge_offsets: tuple[tuple[str, str], ...] = ()
 
 
-def loss(low: tuple[float, ...], high: tuple[float, ...], fraction: float) -> Fault:
-    """Return a loss of stiffness in a box of the grid [mm]."""
-    x, y, z = 0.5 * (np.array(low) + np.array(high))
-    return Fault(
-        "region_stiffness_loss",
-        value=fraction,
-        point=(float(x), float(y), float(z)),
-        box=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
-    )
-
-
-GAIN_OF_G2 = Fault("gauge_gain", "g2", value=0.06)
-BRACKET_MASS = mass(70.0, 15.0, 8.0, 0.04)
-PORTAL_MASS = mass(67.0, 8.0, 150.0, 0.06)
-PLATE_LOSS = loss((49.0, 0.0, 0.0), (81.0, 45.0, 4.0), 0.4)
-CASES: tuple[tuple[str, tuple[Fault, ...]], ...] = (
+HIDDEN = {
+    "bracket": Hidden(
+        springs={"CLAMP": 3e4},
+        mass=0.04,
+        mass_box=((45.0, 96.0), (4.0, 26.0), (8.0, 8.0)),
+        loss_boxes=(((15.0, 0.0, 0.0), (34.0, 30.0, 8.0)),),
+        loss_shift=(30.0, 0.0, 0.0),
+        gauge_offsets=(("g3", "along"), ("g4", "along")),
+    ),
+    "portal": Hidden(
+        springs={"LEFT": 8e3, "RIGHT": 8e3},
+        mass=0.06,
+        mass_box=((40.0, 200.0), (8.0, 8.0), (150.0, 150.0)),
+        loss_boxes=(
+            ((232.0, 0.0, 8.0), (240.0, 16.0, 41.0)),
+            ((0.0, 0.0, 8.0), (8.0, 16.0, 41.0)),
+        ),
+        loss_shift=(0.0, 0.0, 80.0),
+        load_offsets=(("down", "x"),),
+    ),
+    "plate": Hidden(
+        springs={"CLAMP": 1.2e5},
+        mass=0.05,
+        mass_box=((80.0, 150.0), (10.0, 90.0), (4.0, 4.0)),
+        loss_boxes=(
+            ((25.0, 0.0, 0.0), (57.0, 45.0, 4.0)),
+            ((25.0, 55.0, 0.0), (57.0, 100.0, 4.0)),
+        ),
+        loss_shift=(50.0, 0.0, 0.0),
+        load_offsets=(("corner", "y"), ("corner", "x"), ("edge", "y"), ("edge", "x")),
+    ),
+    "arm": Hidden(
+        springs={"CLAMP": 2.5e4},
+        mass=0.03,
+        mass_box=((80.0, 150.0), (4.0, 16.0), (8.0, 8.0)),
+        loss_boxes=(((10.0, 0.0, 0.0), (26.0, 20.0, 8.0)),),
+        loss_shift=(60.0, 0.0, 0.0),
+        gauge_offsets=(("g2", "along"), ("g3", "along")),
+    ),
+}
+"""What may be hidden in each part."""
+CASES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("bracket", ()),
-    ("bracket", (support("CLAMP", "ry", 3e4),)),
-    ("bracket", (BRACKET_MASS,)),
-    ("bracket", (loss((35.0, 0.0, 0.0), (54.0, 30.0, 8.0), 0.45),)),
-    ("bracket", (Fault("gauge_offset", "g3", "along", 0.006),)),
-    ("bracket", (support("CLAMP", "ry", 3e4), GAIN_OF_G2)),
+    ("bracket", ("support_compliance",)),
+    ("bracket", ("added_mass",)),
+    ("bracket", ("region_stiffness_loss",)),
+    ("bracket", ("gauge_offset",)),
+    ("bracket", ("support_compliance", "gauge_gain")),
     ("portal", ()),
     ("portal", ()),
-    ("portal", (support("LEFT", "ry", 8e3),)),
-    ("portal", (PORTAL_MASS,)),
-    ("portal", (loss((232.0, 0.0, 15.0), (240.0, 16.0, 48.0), 0.45),)),
-    ("portal", (Fault("load_offset", "down", "x", 0.009),)),
-    ("portal", (PORTAL_MASS, GAIN_OF_G2)),
+    ("portal", ("support_compliance",)),
+    ("portal", ("added_mass",)),
+    ("portal", ("region_stiffness_loss",)),
+    ("portal", ("load_offset",)),
+    ("portal", ("added_mass", "gauge_gain")),
     ("plate", ()),
-    ("plate", (support("CLAMP", "ry", 1.2e5),)),
-    ("plate", (mass(110.0, 85.0, 4.0, 0.05),)),
-    ("plate", (PLATE_LOSS,)),
-    ("plate", (Fault("load_offset", "corner", "y", -0.007),)),
-    ("plate", (mass(110.0, 85.0, 4.0, 0.05), PLATE_LOSS)),
+    ("plate", ("support_compliance",)),
+    ("plate", ("added_mass",)),
+    ("plate", ("region_stiffness_loss",)),
+    ("plate", ("load_offset",)),
+    ("plate", ("added_mass", "region_stiffness_loss")),
     ("arm", ()),
     ("arm", ()),
-    ("arm", (Fault("gauge_offset", "g2", "along", -0.006),)),
-    ("arm", (Fault("gauge_gain", "g3", value=-0.06),)),
-    ("arm", (support("CLAMP", "ry", 2.5e4), mass(120.0, 10.0, 8.0, 0.03))),
+    ("arm", ("gauge_offset",)),
+    ("arm", ("gauge_gain",)),
+    ("arm", ("support_compliance", "added_mass")),
 )
-"""Part and faults of each campaign."""
+"""Part and effects of each campaign."""
+
+
+def drawn_fault(effect: str, part_name: str, generator: np.random.Generator) -> Fault:
+    """Return a fault at a place and of a size that are drawn."""
+    hidden = HIDDEN[part_name]
+    scale = float(np.exp(generator.uniform(np.log(0.7), np.log(1.5))))
+    sign = float(generator.choice((-1.0, 1.0)))
+    if effect == "support_compliance":
+        place = str(generator.choice(list(hidden.springs)))
+        return Fault(effect, place, "ry", hidden.springs[place] * scale)
+    if effect == "added_mass":
+        x, y, z = [float(generator.uniform(*span)) for span in hidden.mass_box]
+        return Fault(effect, value=hidden.mass * scale, point=(x, y, z))
+    if effect == "region_stiffness_loss":
+        corners = np.array(hidden.loss_boxes[generator.integers(len(hidden.loss_boxes))])
+        low, high = corners + generator.uniform(0.0, 1.0) * np.array(hidden.loss_shift)
+        x, y, z = 0.5 * (low + high)
+        return Fault(
+            effect,
+            value=float(generator.uniform(0.35, 0.5)),
+            point=(float(x), float(y), float(z)),
+            box=((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+        )
+    if effect == "gauge_gain":
+        gauges = [gauge.name for gauge in PARTS[part_name].gauges]
+        return Fault(effect, str(generator.choice(gauges)), value=0.06 * sign * scale)
+    offsets = hidden.load_offsets if effect == "load_offset" else hidden.gauge_offsets
+    place, axis = offsets[generator.integers(len(offsets))]
+    return Fault(effect, place, axis, 0.007 * sign * scale)
+
+
+def drawn_cases(seed: int) -> list[tuple[str, tuple[Fault, ...]]]:
+    """Return the part and the faults of each campaign."""
+    generator = np.random.default_rng(seed)
+    return [
+        (part, tuple(drawn_fault(effect, part, generator) for effect in effects))
+        for part, effects in CASES
+    ]
 
 
 class Truth(NamedTuple):
@@ -190,7 +280,7 @@ def _mode_tables(text: str) -> list[FloatArray]:
 
 
 def write_campaign(
-    folder: Path, part: Part, truth: Truth, faults: Sequence[Fault], seed: int
+    folder: Path, part: Part, truth: Truth, faults: Sequence[Fault], seed: tuple[int, int]
 ) -> None:
     """Write the campaign of a truth: load lines, releases and the noise at rest."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -269,12 +359,16 @@ class Score(NamedTuple):
     places : list of bool
         For each mass and loss that is named: whether it lies within one patch.
     sizes : list of bool
-        For each fault that is named at exactly its place: whether the 90 % interval holds it.
+        For each fault that is named at exactly its place, and each mass: whether the 90 % interval
+        holds its size.
+    distances : list of bool
+        For each mass, whether the 90 % intervals hold its distances along and across.
     """
 
     outcome: str
     places: list[bool]
     sizes: list[bool]
+    distances: list[bool]
 
 
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
@@ -285,33 +379,41 @@ def score(verdict: Verdict, part: Part, faults: Sequence[Fault], model: Changeab
     """Return what a verdict is worth against the faults that are hidden."""
     places: list[bool] = []
     sizes: list[bool] = []
+    distances: list[bool] = []
     if verdict.kind is VerdictKind.GROUP:
         hidden = {fault.effect for fault in faults}
         members = [set(member.split(" + ")) for member in verdict.group]
         holds_truth = any(member <= hidden for member in members)
         outcome = "in part" if holds_truth else "wrong" if faults else "open"
-        return Score(outcome, places, sizes)
+        return Score(outcome, places, sizes, distances)
     if verdict.kind not in NAMING:
         is_closed = verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-        return Score("right" if is_closed and not faults else "open", places, sizes)
+        return Score("right" if is_closed and not faults else "open", places, sizes, distances)
     matched = 0
     for effect in verdict.effects:
         faults_of_kind = [fault for fault in faults if fault.effect == effect.identifier]
         if not faults_of_kind:
-            return Score("wrong", places, sizes)
+            return Score("wrong", places, sizes, distances)
         (fault,) = faults_of_kind
-        if fault.effect in ("added_mass", "region_stiffness_loss"):
-            candidates = model.mass_places
-            if fault.effect == "region_stiffness_loss":
-                candidates = model.loss_places
-            places.append(_is_within_one_patch(effect.place, part.place(fault.point), candidates))
+        if fault.effect == "region_stiffness_loss":
+            at_patch = _is_within_one_patch(
+                effect.place, part.place(fault.point), model.loss_places
+            )
+            places.append(at_patch)
+            matched += at_patch
+        elif fault.effect == "added_mass":
+            point, held = _place_of_mass(effect, part.place(fault.point), model)
+            reach = 1.5e3 * float(model.mass_reaches.max())
+            places.append(float(np.linalg.norm(point - np.array(part.place(fault.point)))) <= reach)
             matched += places[-1]
+            sizes.append(_holds(effect, fault))
+            distances += held
         elif _is_at(effect, fault):
             matched += 1
             sizes.append(_holds(effect, fault))
     if matched < len(verdict.effects):
-        return Score("wrong", places, sizes)
-    return Score("right" if matched == len(faults) else "in part", places, sizes)
+        return Score("wrong", places, sizes, distances)
+    return Score("right" if matched == len(faults) else "in part", places, sizes, distances)
 
 
 def _is_at(effect: NamedEffect, fault: Fault) -> bool:
@@ -325,8 +427,8 @@ def _is_at(effect: NamedEffect, fault: Fault) -> bool:
 def _holds(effect: NamedEffect, fault: Fault) -> bool:
     """Return whether the 90 % interval of an effect's size holds that of a fault."""
     (primitive,) = effect.patch.primitives
-    (estimate,) = effect.parameters
-    sizes = ("compliance", "distance", "gain")
+    estimate = effect.parameters[0]
+    sizes = ("compliance", "distance", "gain", "mass")
     (size,) = [getattr(primitive, name) for name in sizes if hasattr(primitive, name)]
     unit = size / estimate.value
     true_size = fault.value
@@ -334,6 +436,26 @@ def _holds(effect: NamedEffect, fault: Fault) -> bool:
         true_size = 1.0 / fault.value
     low, high = sorted((unit * estimate.low, unit * estimate.high))
     return bool(low <= true_size <= high)
+
+
+def _place_of_mass(
+    effect: NamedEffect, true_point: Sequence[float], model: ChangeableModel
+) -> tuple[FloatArray, list[bool]]:
+    """Return the point of a named mass [mm], and whether its intervals hold that of the truth."""
+    (primitive,) = effect.patch
+    assert isinstance(primitive, PlaceMass)
+    number = model.mass_places.index(primitive.place)
+    reach = float(model.mass_reaches[number])
+    if reach == 0.0:  # a set
+        return np.full(3, np.nan), []
+    axes = model.mass_axes[number]
+    point = model.mass_points[number] + primitive.along * axes[0] + primitive.across * axes[1]
+    true_distances = axes @ (1e-3 * np.array(true_point) - model.mass_points[number])
+    held = [
+        bool(reach * estimate.low <= distance <= reach * estimate.high)
+        for estimate, distance in zip(effect.parameters[1:], true_distances, strict=True)
+    ]
+    return 1e3 * point, held
 
 
 def _is_within_one_patch(name: str, point: Sequence[float], candidates: Sequence[str]) -> bool:
@@ -353,12 +475,13 @@ def _is_within_one_patch(name: str, point: Sequence[float], candidates: Sequence
     return float(np.linalg.norm(positions[name] - point)) <= reach
 
 
-def results(folder: Path, parts: Sequence[str], cases: Sequence[int]) -> Iterator[str]:
+def results(folder: Path, seed: int, parts: Sequence[str], cases: Sequence[int]) -> Iterator[str]:
     """Yield a line for each campaign: what is hidden, the verdict and its worth; then the sums."""
     outcomes: Counter[str] = Counter()
     null_outcomes: Counter[str] = Counter()
     places: list[bool] = []
     sizes: list[bool] = []
+    distances: list[bool] = []
     seconds = []
     models = {}
     for part_name in parts:
@@ -369,13 +492,13 @@ def results(folder: Path, parts: Sequence[str], cases: Sequence[int]) -> Iterato
         error = models[part_name].change_errors.max()
         built = time.process_time() - begin
         yield f"{part_name}: largest error of the reduced model {error:.1e} [{built:.0f} s]"
-    for number, (part_name, faults) in enumerate(CASES):
+    for number, (part_name, faults) in enumerate(drawn_cases(seed)):
         if part_name not in parts or (cases and number not in cases):
             continue
         part = PARTS[part_name]
-        folder_of_case = folder / f"case{number:02}"
+        folder_of_case = folder / f"seed{seed}" / f"case{number:02}"
         truth = truth_of(folder_of_case, part, faults)
-        write_campaign(folder_of_case / "campaign", part, truth, faults, seed=number)
+        write_campaign(folder_of_case / "campaign", part, truth, faults, seed=(seed, number))
         begin = time.process_time()
         campaign = read_campaign(folder_of_case / "campaign")
         model = StructureModel(models[part_name])
@@ -386,8 +509,10 @@ def results(folder: Path, parts: Sequence[str], cases: Sequence[int]) -> Iterato
         counted[worth.outcome] += 1
         places += worth.places
         sizes += worth.sizes
+        distances += worth.distances
         hidden = " and ".join(
-            f"{fault.effect} {fault.place} {fault.motion} {fault.value:g}" for fault in faults
+            f"{fault.effect} {fault.place} {fault.motion} {fault.value:.3g} {_point_text(fault)}"
+            for fault in faults
         )
         yield (
             f"{number:2} {part_name:7} {worth.outcome:7} {hidden or 'nothing'}: "
@@ -396,7 +521,13 @@ def results(folder: Path, parts: Sequence[str], cases: Sequence[int]) -> Iterato
     yield f"with faults: {dict(outcomes)}; without: {dict(null_outcomes)}"
     yield f"places within one patch {sum(places)} of {len(places)}"
     yield f"sizes in their 90 % intervals {sum(sizes)} of {len(sizes)}"
+    yield f"distances of masses in their 90 % intervals {sum(distances)} of {len(distances)}"
     yield f"processor time: mean {np.mean(seconds):.0f} s, largest {np.max(seconds):.0f} s"
+
+
+def _point_text(fault: Fault) -> str:
+    """Return the point of a mass or a loss [mm]; empty for other faults."""
+    return "" if fault.place else f"({', '.join(f'{value:.0f}' for value in fault.point)})"
 
 
 def _verdict_text(verdict: Verdict) -> str:
@@ -412,8 +543,11 @@ def _verdict_text(verdict: Verdict) -> str:
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[2:]
-    chosen_parts = [name for name in arguments if name in PARTS] or list(PARTS)
-    chosen_cases = [int(name) for name in arguments if name.isdigit()]
-    for line in results(Path(sys.argv[1]), chosen_parts, chosen_cases):
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--cases", nargs="+", type=int, default=[])
+    options = parser.parse_args()
+    for line in results(options.folder, options.seed, options.parts, options.cases):
         print(line, flush=True)

@@ -139,7 +139,7 @@ class EffectParameter:
     """True if the effect vanishes with this parameter."""
     levels: Annotated[int, Strict()] = 0
     """Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the
-    search."""
+    search. With 1, fits begin at the median, which also holds where no value is given."""
 
 
 @dataclass(frozen=True)
@@ -298,8 +298,14 @@ class Effect(EffectKeys):
         setting : Setting
             Campaign and model.
         values : mapping of str to float
-            Values of the parameters, and of shape parameters that are not canonical, by name.
+            Values of the parameters, and of shape parameters that are not canonical, by name. A
+            parameter with one level may be left out.
         place : str
             Name of the place where the effect acts; empty if there is no choice.
         """
-        return self.build(setting, {**self.canonical_shape(), **values}, place)
+        medians = {
+            parameter.name: parameter.prior.value(0.0)
+            for parameter in self.parameters
+            if parameter.levels == 1
+        }
+        return self.build(setting, {**medians, **self.canonical_shape(), **values}, place)

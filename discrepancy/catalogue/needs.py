@@ -42,6 +42,13 @@ def _no_trial(effect: EffectInSetting, kinds: Kinds = frozenset()) -> str | None
     return f"The campaign has no {' or '.join(needed_names)} trial to fit."
 
 
+def _no_motion_or_weight(effect: EffectInSetting) -> str | None:
+    """Return the reason if an added mass has neither inertia nor weight in any trial, else None."""
+    model = effect.setting.model
+    kinds = DYNAMIC | {TrialKind.FLIGHT} if not model.shows_weight else frozenset(TrialKind)
+    return _no_trial(effect, kinds & effect.section.acts_on)
+
+
 def _no_event(effect: EffectInSetting) -> str | None:
     """Return the reason if no fitted trial has the events that an effect needs, else None."""
     campaign = effect.setting.campaign
@@ -171,6 +178,7 @@ def _no_strain_across(effect: EffectInSetting) -> str | None:
 
 NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
     "trial": _no_trial,
+    "motion or weight": _no_motion_or_weight,
     "event": _no_event,
     "law": _no_law,
     "place": _no_place,

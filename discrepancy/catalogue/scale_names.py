@@ -195,10 +195,20 @@ def _largest_region_loss(context: BuildContext) -> float:
     return max(1.0 - (1.0 - largest_loss) / remaining, 0.0)
 
 
+def _region_has_gauge(context: BuildContext) -> float:
+    """Return 1 if a gauge sits on the patch that the place names, else 0."""
+    return float(context.target.name in context.setting.model.places_with_gauges)
+
+
 def _support_compliance(context: BuildContext) -> float:
     """Return the compliance of the support's motion that doubles the structure's compliance."""
     target = context.target
     return context.setting.scales.support_compliance(target.name, target.motion)
+
+
+def _mass_reach(context: BuildContext) -> float:
+    """Return the distance from the place within which a mass is nearest to it [m]."""
+    return context.setting.model.mass_reaches.get(context.target.name, 0.0)
 
 
 def _station_of_end(end: int, context: BuildContext) -> float:
@@ -226,7 +236,9 @@ SCALES: dict[str, Callable[[BuildContext], float]] = {
     "largest_release": _largest_release,
     "sampling_interval": _sampling_interval,
     "region_largest_loss": _largest_region_loss,
+    "region_has_gauge": _region_has_gauge,
     "support_compliance": _support_compliance,
+    "mass_reach": _mass_reach,
     "number": lambda context: context.target.number,
     "port_displacement": lambda context: context.port.displacement,
     "port_stiffness": lambda context: context.port.stiffness,

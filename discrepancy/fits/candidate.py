@@ -78,6 +78,14 @@ class EffectTerm:
         """Return the change of the model by the effect, given its scaled parameters (E,)."""
         return self.effect.patch(setting, self.physical_values(scaled_values), self.place)
 
+    def depends_on(self, setting: Setting, scaled_values: FloatArray, number: int) -> bool:
+        """Return whether the change of the model at scaled parameters (E,) depends on one of them.
+
+        A distance from the place does not act at a set of nodes, for example.
+        """
+        stepped = with_step(scaled_values, number)
+        return self.patch(setting, stepped) != self.patch(setting, scaled_values)
+
     def start_values(self) -> FloatArray:
         """Return the scaled parameters (E,) at the median of the prior and the canonical shape."""
         scaled_values = []

@@ -147,19 +147,25 @@ def hypothesis_record(
 def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[NamedEffect, ...]:
     """Return the effects of a hypothesis with the values and 90 % intervals of their parameters.
 
-    Intervals are those of the posterior draws if the fit has any, else of its covariance.
+    Intervals are those of the posterior draws if the fit has any, else of its covariance. A
+    parameter that changes nothing at the place is left out.
     """
     low, high = _intervals(hypothesis, np.eye(hypothesis.candidate.parameter_count))
     first_parameter = 0
     effects = []
     for term, values in hypothesis.candidate.split_by_term(hypothesis.effect):
-        parameter_count = len(term.effect.parameters)
+        parameter_count = 0
         estimates = []
         if term.effect.table is not None:
             estimates = _forces_of_table(problem, term.place, hypothesis, term.effect.table)
             parameter_count = len(estimates)
         else:
-            for number, parameter in enumerate(term.parameters, start=first_parameter):
+            for index, parameter in enumerate(term.parameters):
+                number = first_parameter + index
+                if parameter.levels == 1 and not term.depends_on(problem.setting, values, index):
+                    continue
+                if index < len(term.effect.parameters):
+                    parameter_count += 1
                 bounds = (float(low[number]), float(high[number]))
                 estimates.append(_estimate(parameter, float(hypothesis.effect[number]), bounds))
         first_parameter += len(term.parameters)

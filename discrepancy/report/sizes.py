@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 
-from discrepancy.campaign.records import Campaign, Quantity
+import numpy as np
+
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.report.text import NAMING, unit_text
@@ -15,6 +17,7 @@ from discrepancy.workflow import Investigation
 from fe.runtime.patch import (
     CHANNEL_UNIT,
     ModelPatch,
+    PlaceMass,
     Primitive,
     SupportCompliance,
     TableDamping,
@@ -22,7 +25,16 @@ from fe.runtime.patch import (
 )
 from reporting.words import between, rounded
 
-BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
+BESIDE = (
+    "reference_velocity",
+    "reference_displacement",
+    "time",
+    "start",
+    "length",
+    "station",
+    "along",
+    "across",
+)
 """Parameters of primitives that say where or when an effect acts, and not how large it is."""
 
 
@@ -67,7 +79,10 @@ def si_sizes(
         if isinstance(primitive, SupportCompliance):
             motion = _motion_text(primitive.motion)
             name = f"the support {primitive.support} {motion} against a spring of"
-        place_text = _location_text(primitive, size, model, campaign)
+        if isinstance(primitive, PlaceMass):
+            place_text = _point_text(size.primitive, primitive, intervals, model)
+        else:
+            place_text = _location_text(primitive, size, model, campaign)
         sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
     return ", ".join(sizes)
 
@@ -159,6 +174,33 @@ def _location_text(
             unit = definite_unit(reference_unit, primitive, model, campaign)
             marks.append(f"{value:.3g} {unit}")
     return f" at {' and '.join(marks)}" if marks else ""
+
+
+def _point_text(
+    number: int, primitive: PlaceMass, intervals: Sequence[PrimitiveInterval], model: Model
+) -> str:
+    """Return the point of a mass beside a place and how precisely it is known; empty at a place.
+
+    `number` is that of the primitive in its patch.
+    """
+    location = model.point_of_mass(primitive)
+    if location is None:
+        return ""
+    precisions = []
+    for parameter, axis in zip(("along", "across"), location.axes, strict=True):
+        for size in intervals:
+            is_of_mass = size.primitive == number and size.parameter == parameter
+            if is_of_mass and isfinite(size.low) and isfinite(size.high):
+                half_width = 0.5 * (size.high - size.low)
+                precisions.append(f"to {half_width:.2g} m along {_vector_text(axis, 2)}")
+    known = f", known {' and '.join(precisions)}" if precisions else ""
+    return f" at {_vector_text(location.point, 4)} m{known}"
+
+
+def _vector_text(vector: FloatArray, digits: int) -> str:
+    """Return the components of a vector (3,) in brackets, without negative zeros."""
+    components = [f"{value + 0.0:g}" for value in np.round(vector, digits)]
+    return f"({', '.join(components)})"
 
 
 def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:

@@ -58,7 +58,7 @@ def points_at_other_stretches(fit: CandidateFit) -> list[Point]:
     points = []
     first_parameter = 0
     for term in fit.candidate.terms:
-        numbers_with_levels = [k for k, item in enumerate(term.parameters) if item.levels]
+        numbers_with_levels = [k for k, item in enumerate(term.parameters) if item.levels > 1]
         if len(numbers_with_levels) > 1:  # both ends
             for number in numbers_with_levels:
                 half_level = 0.5 / term.parameters[number].levels

@@ -114,8 +114,8 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     """Return the changes of the prediction by an effect from which its fits should begin.
 
     They are those with the least expected objective over all places and a grid of parameters. An
-    effect with several parameters besides its magnitude, such as the place and width of a box, gets
-    more starts than others.
+    effect with several parameters to begin at besides its magnitude, such as the place and width of
+    a box, gets more starts than others.
 
     Parameters
     ----------
@@ -128,7 +128,9 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     places = free_places(effect, screen.fit.candidate, setting)
     has_few_places = len(places) <= SEARCH.few_places
     moves_frequencies = _moves_frequencies(effect, setting)
-    other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
+    other_parameter_count = sum(
+        not parameter.magnitude and parameter.levels != 1 for parameter in effect.parameters
+    )
     start_count = (
         SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
     )
@@ -263,7 +265,9 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     """Return the points of a grid of an effect's parameters at which the objective is least.
 
     A grid is used if the residuals are so large that a screen, which is linear, is not reliable. It
-    costs a simulation for each point.
+    costs a simulation for each point. If mass or stiffness changes at one of many places, few
+    sizes are tried at all places, then all sizes at the best of these, and each start is at another
+    place.
 
     Parameters
     ----------
@@ -274,18 +278,89 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
     effect : Effect
         The effect; all its places are tried where the base does not have it.
     """
-    valued_starts = []
-    for place in free_places(effect, base.candidate, problem.setting):
+    places = free_places(effect, base.candidate, problem.setting)
+    varied_count = sum(parameter.levels != 1 for parameter in effect.parameters)
+    level_counts = SEARCH.grid_levels_far_from_data
+    level_count = level_counts[min(varied_count, len(level_counts) - 1)]
+    # medians of intervals of equal prior probability
+    levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
+    is_chosen_by_place = len(places) > SEARCH.few_places and _moves_frequencies(
+        effect, problem.setting
+    )
+    if is_chosen_by_place:
+        places = _best_places(problem, base, effect, places, levels)
+    points = _grid_points(problem, base, effect, places, levels)
+    if is_chosen_by_place:
+        best_of_places = {point.place: point for point in reversed(points)}
+        points = sorted(best_of_places.values(), key=lambda point: point.objective)
+        return [point.start for point in points]
+    return [point.start for point in points[: SEARCH.starts_far_from_data]]
+
+
+def _best_places(
+    problem: Problem,
+    base: CandidateFit,
+    effect: Effect,
+    places: Sequence[str],
+    levels: FloatArray,
+) -> tuple[str, ...]:
+    """Return the places at which an effect lowers the objective most in the first periods.
+
+    At each place, few of the levels (L,) are tried first, then those about the best of these: the
+    same first frequency belongs to another size at each place. Places that hardly differ stay in
+    their order, in which named sets come first.
+    """
+    early_problem = _problem_of_first_periods(problem)
+    half_step = SEARCH.coarse_level_step // 2
+    coarse_numbers = np.arange(half_step, len(levels), SEARCH.coarse_level_step)
+    best_of_place = {}
+    for place in places:
+        coarse = _grid_points(early_problem, base, effect, [place], levels[coarse_numbers])
+        if not coarse:
+            continue
+        number = int(np.argmin(np.abs(levels - coarse[0].start.point.effect[len(base.effect)])))
+        nearby = levels[max(number - half_step, 0) : number + half_step + 1]
+        fine = _grid_points(early_problem, base, effect, [place], nearby)
+        best_of_place[place] = min(point.objective for point in (*coarse, *fine))
+    ranked = sorted(best_of_place, key=lambda place: float(f"{best_of_place[place]:.1e}"))
+    return tuple(ranked[: SEARCH.places_far_from_data])
+
+
+def _problem_of_first_periods(problem: Problem) -> Problem:
+    """Return the problem with the first periods of the first mode of each trial in motion."""
+    period = 2.0 * np.pi / problem.setting.scales.angular_frequency
+    intervals = [data.trial.interval for data in problem.trials if data.trial.is_dynamic]
+    if not intervals:
+        return problem
+    return problem.with_first_samples(int(SEARCH.first_periods * period / min(intervals)))
+
+
+class _GridPoint(NamedTuple):
+    """A point of a grid, the place of its effect and its objective [nat]."""
+
+    objective: float
+    place: str
+    start: FitStart
+
+
+def _grid_points(
+    problem: Problem,
+    base: CandidateFit,
+    effect: Effect,
+    places: Sequence[str],
+    levels: FloatArray,
+) -> list[_GridPoint]:
+    """Return the points of a grid of an effect's parameters at some places, the best first.
+
+    `levels` (L,) are the scaled values of each parameter that fits may begin at.
+    """
+    points = []
+    for place in places:
         term = EffectTerm(effect, place)
-        parameter_count = len(term.parameters)
-        level_counts = SEARCH.grid_levels_far_from_data
-        level_count = level_counts[min(parameter_count, len(level_counts) - 1)]
-        # medians of intervals of equal prior probability
-        levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
-        for values in product(levels, repeat=parameter_count):
+        axes = [(0.0,) if parameter.levels == 1 else levels for parameter in term.parameters]
+        for values in product(*axes):
             start = start_with_added_effect(base, term, np.array(values))
             with suppress(DiscrepancyError):  # the effect is larger than the model allows
-                start_objective = objective(problem, start.candidate, start.point)
-                valued_starts.append((start_objective, start))
-    valued_starts.sort(key=lambda valued_start: valued_start[0])
-    return [start for _, start in valued_starts[: SEARCH.starts_far_from_data]]
+                value = objective(problem, start.candidate, start.point)
+                points.append(_GridPoint(value, place, start))
+    return sorted(points, key=lambda point: point.objective)

@@ -326,8 +326,12 @@ class Search(FittedCandidates):
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
         if not self.best().candidate.has_free_shape:
-            self.fit_effects_at_several_places()
+            begins_with_structure = self._is_one_change_of_structure(self.best())
+            if not begins_with_structure:
+                self.fit_effects_at_several_places()
             self.add_effects()
+            if begins_with_structure and self._leaves_much(self.best()):
+                self.fit_effects_at_several_places()
         if not self.best().candidate.has_free_shape and self.is_unexplained():
             self.fit_pairs()
         self.move_effects()
@@ -378,20 +382,22 @@ class Search(FittedCandidates):
                 break
             current_fit = exact_fits[0]
 
+    def _is_one_change_of_structure(self, fit: CandidateFit) -> bool:
+        """Return whether a fit has a single effect, which may act at several places."""
+        terms = fit.candidate.terms
+        return len(terms) == 1 and terms[0].effect.at_several_places
+
+    def _leaves_much(self, fit: CandidateFit) -> bool:
+        """Return whether a fit leaves more than noise, and more than a small part of the gap."""
+        largest_remainder = SEARCH.small_remainder * self.no_effect.chi_square
+        return self.is_unexplained() and fit.chi_square > largest_remainder
+
     def fit_effects_at_several_places(self) -> None:
         """Fit effects that may act at several places at once at more and more places.
 
         At one place such an effect explains little if it acts at two, so that errors of sensors may
-        lead and no set with it would be tried. The places are therefore compared beside each other,
-        unless one change of the structure at one place is enough.
+        lead and no set with it would be tried. The places are therefore compared beside each other.
         """
-        leading_terms = self.best().candidate.terms
-        if (
-            len(leading_terms) == 1
-            and leading_terms[0].effect.at_several_places
-            and not self.is_unexplained()
-        ):
-            return
         for effect in self.effects:
             if not effect.at_several_places:
                 continue

@@ -55,13 +55,16 @@ class ReleasePoint:
     Attributes
     ----------
     row : (n,) ndarray
-        row . u is the displacement of the release point; the force that holds it acts along the
-        row.
+        row . u is the displacement of the release point.
+    pull : (n,) ndarray
+        The load of a unit of the force that holds the structure: the row, unless the force acts at
+        another point or in another direction.
     release : Release
-        The displacement there, and whether the motion begins at rest.
+        The displacement of the release point, and whether the motion begins at rest.
     """
 
     row: FloatArray
+    pull: FloatArray
     release: Release
 
 

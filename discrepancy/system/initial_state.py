@@ -197,28 +197,28 @@ def _held_state(
     load : (1, n) array
         The sum of the other loads [N].
     """
-    row = point.row
-    unit_force_displacement = system.apply_flexibility(row)
+    row, pull = point.row, point.pull
+    unit_force_displacement = system.apply_flexibility(pull)
     compliance = float(row @ unit_force_displacement)
     # the first entry scales the whole shape, by the holding force
     deviation = displacements * unit_amplitudes
     deviation[0] = 0.0
     holding_force = point.release.displacement * (1.0 + displacements[0]) / compliance
-    memory = system.static_path(holding_force * row + load, laws, fixed_row=row, time=0.0).memory
-    total_force = holding_force * row + load[0]
+    memory = system.static_path(holding_force * pull + load, laws, fixed_row=row, time=0.0).memory
+    total_force = holding_force * pull + load[0]
     if memory is not None:
         law_rows = system.rows_of_laws(laws, 0.0)  # (J, N)
         holding_force += (
             float(law_rows @ unit_force_displacement @ memory[:, LAGGED_FORCE]) / compliance
         )
-        total_force = holding_force * row + load[0] - memory[:, LAGGED_FORCE] @ law_rows
+        total_force = holding_force * pull + load[0] - memory[:, LAGGED_FORCE] @ law_rows
         if system.is_truncated:
             # the part of the port's position that fades after the release
             memory[:, FADING_POSITION] = holding_force * (
-                law_rows @ system.residual_displacements(row)
+                law_rows @ system.residual_displacements(pull)
             )
     angular_frequency = system.angular_frequency
     q = total_force @ system.shapes / angular_frequency**2 + deviation
     return ReleasedState(
-        InitialMotion(q, np.zeros(len(angular_frequency)), memory), holding_force * row
+        InitialMotion(q, np.zeros(len(angular_frequency)), memory), holding_force * pull
     )

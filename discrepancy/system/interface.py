@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from types import MappingProxyType
-from typing import ClassVar, Self, cast
+from typing import ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
     ModelPatch,
+    PlaceMass,
     PortForce,
     Primitive,
     RegionStiffnessLoss,
@@ -43,6 +44,21 @@ def _weight_of_response(cached: object) -> int:
     _, response = cast(tuple[Trial, Response], cached)
     size = response.values.nbytes + (0 if response.rates is None else response.rates.nbytes)
     return max(size, RESPONSE_CACHE_BYTES // MOST_RESPONSES)
+
+
+class MassPoint(NamedTuple):
+    """Where an added mass lies.
+
+    Attributes
+    ----------
+    point : (3,) array
+        The point [m].
+    axes : (2, 3) array
+        Unit vectors along which its distances from its place are measured.
+    """
+
+    point: FloatArray
+    axes: FloatArray
 
 
 class Model(ABC):
@@ -77,8 +93,16 @@ class Model(ABC):
         The supports that may yield, each with a motion, such as "rx".
     mass_places : tuple of str
         Places where a mass may be added or lost.
+    mass_reaches : mapping of str to float
+        Distance from a place within which a mass is nearest to it [m]; a mass lies exactly at the
+        places that are left out.
+    shows_weight : bool
+        Whether an acceleration, such as gravity, acts on the masses that are added at places, so
+        that these show at rest.
     loss_places : tuple of str
         Patches that are no damage regions and may lose stiffness.
+    places_with_gauges : frozenset of str
+        The patches on which a gauge sits.
     load_changes : tuple of (str, str, str)
         Changes of forces: the control, "offset" of its place or "tilt", and the axis.
     gauge_shifts : tuple of (str, str)
@@ -110,7 +134,10 @@ class Model(ABC):
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
     support_motions: tuple[tuple[str, str], ...] = ()
     mass_places: tuple[str, ...] = ()
+    mass_reaches: Mapping[str, float] = MappingProxyType({})
+    shows_weight: bool = False
     loss_places: tuple[str, ...] = ()
+    places_with_gauges: frozenset[str] = frozenset()
     load_changes: tuple[tuple[str, str, str], ...] = ()
     gauge_shifts: tuple[tuple[str, str], ...] = ()
     load_places: tuple[str, ...] | None = None
@@ -344,6 +371,10 @@ class Model(ABC):
             campaign_parameters.get(parameter.name, (parameter.mean, parameter.deviation))
             for parameter in self.parameters
         ]
+
+    def point_of_mass(self, mass: PlaceMass) -> MassPoint | None:
+        """Return where a mass lies that may lie beside its place; None if it lies at the place."""
+        return None
 
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
         """Return the prior means (P,) of the parameters of the model without its patch.

@@ -11,11 +11,11 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, Load
-from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.interface import NO_PATCH, MassPoint
 from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
 from discrepancy.system.output_equation import OutputEquation
-from discrepancy.system.response import ACROSS, Conditions, Outputs, Place
+from discrepancy.system.response import ACROSS, Conditions, Outputs, Place, Response
 from discrepancy.system.scales import Scales
 from discrepancy.system.system_model import SystemModel
 from discrepancy.system.system_state import PatchedTrial, SystemState
@@ -129,7 +129,12 @@ class StructureModel(SystemModel):
         if isinstance(model, ChangeableModel):
             self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
             self.mass_places = model.mass_places
+            reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
+            self.shows_weight = bool(model.load_accelerations.any())
+            self.mass_reaches = {place: reach for place, reach in reaches if reach > 0.0}
             self.loss_places = model.loss_places
+            with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
+            self.places_with_gauges = frozenset(model.loss_places[number] for number in with_gauges)
             self.largest_losses |= dict.fromkeys(model.loss_places, LARGEST_LOSS)
             self.length = model.size
             self.load_changes = tuple(
@@ -250,7 +255,10 @@ class StructureModel(SystemModel):
     def _load_of_controls(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls, of which those not given are nominal."""
         coefficients = self.model.load_coefficients(self._input_vector(state, controls))
-        return np.asarray(self._unit_loads @ coefficients)
+        load = self._unit_loads @ coefficients
+        if isinstance(self.model, ChangeableModel):
+            load += self.model.weight_of_masses(state.structure, coefficients)
+        return np.asarray(load)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
         """Return the load (n,) per unit of a control, without the constant loads."""
@@ -276,6 +284,8 @@ class StructureModel(SystemModel):
                 if shift.gauge == output:
                     slope, curvature = rows[f"{output}.{shift.axis}"]
                     row = row + shift.distance * slope + 0.5 * shift.distance**2 * curvature
+            if isinstance(self.model, ChangeableModel) and output in self.model.gauges:
+                row = self.model.strain_factor(output, case.patch) * row
             equations.append(OutputEquation.from_row(row, quantity.order))
         return equations
 
@@ -300,6 +310,23 @@ class StructureModel(SystemModel):
         if primitive is changes.GaugeOffset:
             return bool(self.gauge_shifts)
         return primitive in SENSORS
+
+    def point_of_mass(self, mass: changes.PlaceMass) -> MassPoint | None:
+        """Return where a mass lies that may lie beside a point of the grid, else None."""
+        if not isinstance(self.model, ChangeableModel) or mass.place not in self.mass_reaches:
+            return None
+        number = self.mass_places.index(mass.place)
+        axes = self.model.mass_axes[number]
+        distances = np.array((mass.along, mass.across))
+        return MassPoint(self.model.mass_points[number] + distances @ axes, axes)
+
+    def respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
+        """Return the true response of a trial; added masses without weight change none at rest."""
+        if not trial.is_dynamic and not self.shows_weight:
+            patch = patch.without(changes.PlaceMass)
+        return super().respond(trial, outputs, patch, conditions)
 
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH

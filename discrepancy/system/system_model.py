@@ -39,7 +39,15 @@ from discrepancy.system.system_state import (
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    LOADS,
+    STRUCTURE,
+    LoadOffset,
+    LoadTilt,
+    ModelPatch,
+    PortLoad,
+)
 from fe.runtime.port_laws import NO_LAWS, PortLaws, port_laws
 
 
@@ -208,9 +216,12 @@ class SystemModel(Model):
                     'time can act on; set kind = "driven" and begins = "unknown".'
                 )
             row = self.force_row(trial.load_place, case.state)
-            return replace(
-                excitation, release=ReleasePoint(row, require_release(trial)), initial=initial_state
-            )
+            changes_of_load = case.patch.of(LoadOffset, LoadTilt)
+            pull = row
+            if len(changes_of_load):
+                pull = self.force_row(trial.load_place, case.state, changes_of_load)
+            point = ReleasePoint(row, pull, require_release(trial))
+            return replace(excitation, release=point, initial=initial_state)
         loads, prescribed_motions = self.loads_and_motions(case)
         return replace(
             excitation,

@@ -19,7 +19,7 @@ from scipy import sparse
 from scipy.linalg import eigh
 
 from fe.full.subspace import OrthonormalBasis, affine_product, solve_near
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, SupportCompliance
 from fe.runtime.reduced import ReducedModel
@@ -49,6 +49,10 @@ SNAPSHOT_TOLERANCE = 1e-5
 """Relative residual of solutions with losses from which the basis is made."""
 MOST_STATES = 8
 """Number of states in which unit responses are computed, in addition to the central one."""
+BESIDE = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+"""Distances beside a location for which responses to forces are added, over its reach."""
+LEAST_REMAINDER_BESIDE = 0.3
+"""The same as `LEAST_REMAINDER` for responses to forces beside the location of a mass."""
 INERTIA_RESPONSES = 1
 """Number of static responses to inertia: of the unit response, then of the previous one."""
 LARGE_LOSSES = (0.45, 0.7)
@@ -57,6 +61,8 @@ LEAST_LOSS_REMAINDER = 1e-3
 """The same as `LEAST_REMAINDER` for changes of solutions by a loss, relative to the solutions."""
 MASS_RANGE = (0.01, 0.5)
 """Range of masses in which the errors are measured: the largest relative gain of a modal mass."""
+DIAGONAL = 0.7
+"""Distance along and across a location at which the errors are measured, too, over its reach."""
 LOSS_RANGE = (0.05, 0.7)
 """Range of losses of stiffness in which the errors are measured."""
 GAIN_RANGE = (0.01, 1.0)
@@ -127,8 +133,11 @@ class _Columns:
         self.loss_places = loss_places(yielding)
         self.load_changes = load_changes(yielding)
         # the responses to forces at another point, or in another direction
-        forces = np.array([change.vector[: self.free] for change in self.load_changes])
-        responses = self.factors.whitened(forces.reshape(-1, self.free).T)
+        forces = [change.vector[: self.free] for change in self.load_changes]
+        forces += [
+            change.curvature[: self.free] for change in self.load_changes if change.curvature.any()
+        ]
+        responses = self.factors.whitened(np.array(forces).reshape(-1, self.free).T)
         self._add_remainders(0, responses / np.linalg.norm(responses, axis=0))
 
     def _whitened(self, displacements: FloatArray) -> FloatArray:
@@ -263,28 +272,43 @@ class _Columns:
             whole_stiffness=_projected(terms.stiffness_terms, columns),
             whole_mass=_projected(self.structure.mass_terms, columns),
             whole_load=np.array(loads) @ columns,
+            load_accelerations=self._load_accelerations(),
             whole_output=outputs @ columns,
             column_owner=np.concatenate(self.owners),
             supports=tuple(motion.support for motion in motions),
             motions=tuple(motion.motion for motion in motions),
             support_rows=rows.reshape(len(motions), columns.shape[1]),
             support_springs=np.array([motion.spring for motion in motions], dtype=np.float64),
+            spring_parameters=np.array(
+                [_parameter_number(self.structure, motion.scaled_by) for motion in motions],
+                dtype=np.int64,
+            ),
             mass_places=tuple(place.name for place in self.mass_places),
             mass_rows=np.array([place.rows @ columns for place in self.mass_places]).reshape(
                 len(self.mass_places), 3, columns.shape[1]
             ),
+            mass_slopes=np.array([place.slopes @ columns for place in self.mass_places]).reshape(
+                len(self.mass_places), 15, columns.shape[1]
+            ),
+            mass_points=np.array([place.point for place in self.mass_places]).reshape(-1, 3),
+            mass_axes=np.array([place.axes for place in self.mass_places]).reshape(-1, 2, 3),
+            mass_reaches=np.array([place.reach for place in self.mass_places], dtype=np.float64),
             loss_places=tuple(patch.name for patch in self.loss_places),
             loss_patch=np.array([patch for patch, _, _ in parts], dtype=np.int64),
             loss_term=np.array([term for _, term, _ in parts], dtype=np.int64),
             loss_stiffness=np.array([matrix[lower] for _, _, matrix in parts]).reshape(
                 len(parts), len(lower[0])
             ),
+            patch_of_gauge=self._patch_of_gauges(),
             size=self.structure.mesh.size if isinstance(self.structure, Structure) else 1.0,
             load_controls=tuple(change.control for change in self.load_changes),
             load_change_kinds=tuple(change.change for change in self.load_changes),
             load_change_axes=tuple(change.axis for change in self.load_changes),
             load_changes=np.array(
                 [change.vector @ columns for change in self.load_changes]
+            ).reshape(len(self.load_changes), columns.shape[1]),
+            load_curvatures=np.array(
+                [change.curvature @ columns for change in self.load_changes]
             ).reshape(len(self.load_changes), columns.shape[1]),
             shifted_gauges=tuple(shift.gauge for shift in shifts),
             shift_axes=tuple(shift.axis for shift in shifts),
@@ -295,14 +319,49 @@ class _Columns:
             change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
         )
 
+    def _patch_of_gauges(self) -> IntArray:
+        """Return the index (G,) of the patch on which each gauge sits, -1 for none."""
+        patch_of_gauge = np.full(len(self.structure.gauges), -1, dtype=np.int64)
+        for number, patch in enumerate(self.loss_places):
+            patch_of_gauge[list(patch.gauges)] = number
+        return patch_of_gauge
+
+    def _load_accelerations(self) -> FloatArray:
+        """Return the acceleration (L, 3) by each load of the model, per unit of its control."""
+        structure = self.structure
+        of_control: dict[int, FloatArray] = {}
+        controls = [None, *structure.controls]
+        for load in structure.design.load:
+            if load.acceleration is not None:
+                number = controls.index(structure.loads[load.name])
+                earlier = of_control.get(number, np.zeros(3))
+                of_control[number] = earlier + np.asarray(load.acceleration)
+        rows = [
+            of_control.get(control, np.zeros(3)) if mass == 0 else np.zeros(3)
+            for control, mass in self.held_terms.load_factors.tolist()
+        ]
+        return np.array(rows).reshape(-1, 3)
+
     def add_mass(self, place: MassCandidate) -> None:
-        """Add the columns of a point mass: the static responses to forces at its location."""
-        number = self._first_mass + self.mass_places.index(place)
-        forces = place.rows[:, : self.free].toarray().T
+        """Add the columns of a point mass: the static responses to forces at its location.
+
+        Those to forces beside the location are added as far as they differ from these.
+        """
+        number = 1 + len(self.structure.support_motions) + self._number_of(place)
+        rows = [place.rows]
+        if place.reach > 0.0:
+            rows += [place.rows_beside(*ends) for ends in place.reach * np.array(BESIDE)]
+        forces = sparse.vstack(rows)[:, : self.free].toarray().T
         block = self.factors.whitened(forces)
         lengths = np.linalg.norm(block, axis=0)
         block = block[:, lengths > SAME_DIRECTION * lengths.max()]
-        self._add_remainders(number, block / np.linalg.norm(block, axis=0))
+        block = block / np.linalg.norm(block, axis=0)
+        self._add_remainders(number, block[:, :3])
+        self._add_remainders(number, block[:, 3:], LEAST_REMAINDER_BESIDE)
+
+    def _number_of(self, place: MassCandidate) -> int:
+        """Return the index of a location where a mass may be."""
+        return [candidate.name for candidate in self.mass_places].index(place.name)
 
     def add_loss(self, patch: LossCandidate) -> None:
         """Add the columns of a loss of stiffness: the changes of solutions and modes."""
@@ -399,7 +458,8 @@ class _Columns:
             image = affine_product(self.terms.stiffness_terms, reference, direction)
             factor = 1.0 / (1.0 / compliance + float((direction.T @ image).item()))
         else:
-            change = 1.0 / (1.0 / motion.spring + compliance) - motion.spring
+            spring = float(model.springs_at(vector)[number])
+            change = 1.0 / (1.0 / spring + compliance) - spring
             factor = -change / (1.0 + change * float(response[motion.unknown, 0]))
 
         def full_solution(loads: FloatArray) -> FloatArray:
@@ -414,16 +474,24 @@ class _Columns:
         solution[: self.free] = self.factors.solve(loads[: self.free])
         return solution
 
-    def _case_with_mass(self, model: ChangeableModel, number: int, gain: float) -> "ChangedCase":
-        """Return the case of a point mass; `gain` is the largest relative gain of a modal mass."""
+    def _case_with_mass(
+        self, model: ChangeableModel, number: int, gain: float, distance: float
+    ) -> "ChangedCase":
+        """Return the case of a point mass.
+
+        `gain` is the largest relative gain of a modal mass, `distance` that along and across its
+        location over the reach.
+        """
         place = self.mass_places[number]
+        beside = distance * place.reach
         vector = self._middle_vector(model)
         unchanged = ChangedStructure(model, vector, ModelPatch())
         shapes = unchanged.basis @ unchanged.mode_shapes
         largest = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
-        primitive = PlaceMass(place.name, gain / largest)
+        primitive = PlaceMass(place.name, gain / largest, beside, beside)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
-        mass = (self.mass + primitive.mass * (place.rows.T @ place.rows)).tocsr()
+        rows = place.rows_beside(beside, beside)
+        mass = (self.mass + primitive.mass * (rows.T @ rows)).tocsr()
         return ChangedCase(structure, self._held_solution, mass)
 
     def _case_with_loss(self, model: ChangeableModel, number: int, loss: float) -> "ChangedCase":
@@ -468,9 +536,18 @@ class _Columns:
             return [self._yielding_case(model, number, gain) for gain in GAIN_RANGE]
         if change < self._first_loss:
             place = change - self._first_mass
-            return [self._case_with_mass(model, place, gain) for gain in MASS_RANGE]
+            least, largest = MASS_RANGE
+            cases = [self._case_with_mass(model, place, gain, 0.0) for gain in (least, largest)]
+            if self.mass_places[place].reach > 0.0:
+                cases.append(self._case_with_mass(model, place, largest, DIAGONAL))
+            return cases
         patch = change - self._first_loss
         return [self._case_with_loss(model, patch, loss) for loss in LOSS_RANGE]
+
+
+def _parameter_number(structure: AffineStructure, name: str | None) -> int:
+    """Return the number of a parameter, from one; zero for none."""
+    return 0 if name is None else 1 + [*structure.parameters].index(name)
 
 
 def _projected(terms: tuple[sparse.csr_array, ...], columns: FloatArray) -> FloatArray:

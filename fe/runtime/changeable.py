@@ -34,6 +34,33 @@ KEPT_SUBSPACES = 32
 """Number of sets of changes whose matrices are kept."""
 
 
+class AddedMass(NamedTuple):
+    """A mass at a place, or beside it.
+
+    Attributes
+    ----------
+    number : int
+        Number of the change, from one.
+    kilograms : float
+        The mass [kg].
+    along, across : float
+        Distances from the place [m].
+    """
+
+    number: int
+    kilograms: float
+    along: float
+    across: float
+
+
+def taylor_factors(along: float, across: float) -> FloatArray:
+    """Return the factors (5,) of the derivatives of a displacement beside a place.
+
+    They are those of a Taylor series in the distances s and t: s, t, s^2 / 2, s t, t^2 / 2.
+    """
+    return np.array([along, across, along**2 / 2.0, along * across, across**2 / 2.0])
+
+
 class StructuralChanges(NamedTuple):
     """The structural changes of a patch, by their numbers in `ChangeableModel`, from one.
 
@@ -41,20 +68,20 @@ class StructuralChanges(NamedTuple):
     ----------
     compliances : dict of int to float
         Added compliance of motions of supports [m/N or rad/(N m)].
-    masses : dict of int to float
-        Added masses [kg].
+    masses : tuple of AddedMass
+        Added masses.
     losses : dict of int to float
         Lost fractions of the stiffness of patches [1].
     """
 
     compliances: dict[int, float]
-    masses: dict[int, float]
+    masses: tuple[AddedMass, ...]
     losses: dict[int, float]
 
     @property
     def numbers(self) -> tuple[int, ...]:
         """The numbers of the changes."""
-        return (*self.compliances, *self.masses, *self.losses)
+        return (*self.compliances, *(mass.number for mass in self.masses), *self.losses)
 
 
 class Subspace(NamedTuple):
@@ -97,6 +124,9 @@ class ChangeableModel(ReducedModel):
         The mass terms.
     whole_load : (L, n) array
         The loads.
+    load_accelerations : (L, 3) array
+        Acceleration that each load gives to all that has mass, per unit of its control; zero for a
+        load that is none, and for the part of one that acts on a free mass.
     whole_output : (O, n) array
         The outputs.
     column_owner : (n,) array of int64
@@ -109,22 +139,37 @@ class ChangeableModel(ReducedModel):
         of its own, and zeros.
     support_springs : (S,) array
         Spring that resists each motion [N/m or N m/rad], zero if it is held.
+    spring_parameters : (S,) array of int64
+        Number of the parameter that scales each spring, from one; zero for none.
     mass_places : tuple of str
         Names of the C places where a mass may be added or lost, the next changes.
     mass_rows : (C, 3, n) array
         Rows that give the displacement of a mass at each place.
+    mass_slopes : (C, 15, n) array
+        Derivatives of these rows by distances from the place, see `fe.structure.candidates`.
+    mass_points : (C, 3) array
+        The places, or the centres of sets; zero for matrices [m].
+    mass_axes : (C, 2, 3) array
+        Unit vectors of the distances from each place.
+    mass_reaches : (C,) array
+        Distance from each place within which a mass is nearest to it [m], zero if it can lie there
+        alone.
     loss_places : tuple of str
         Names of the R patches that may lose stiffness, the last changes.
     loss_patch, loss_term : (Q,) array of int64
         Patch, and stiffness term, of each part of the stiffness that patches hold.
     loss_stiffness : (Q, n (n + 1) / 2) array
         Lower triangle, row by row, of each part.
+    patch_of_gauge : (G,) array of int64
+        Patch on which each gauge sits, -1 for none.
     size : float
         Diagonal of the box around the structure, or 1 if that is not known [m].
     load_controls, load_change_kinds, load_change_axes : tuple of str
         Control of a force, "offset" or "tilt", and axis, of D changes of loads.
     load_changes : (D, n) array
         Change of the load per unit of its control, and per metre or radian.
+    load_curvatures : (D, n) array
+        Second derivatives of the load by an offset, per unit of its control and square metre.
     shifted_gauges, shift_axes : tuple of str
         Gauge, and "along" or "across", of E changes of the places of gauges.
     shift_output : (E, 2, n) array
@@ -141,23 +186,31 @@ class ChangeableModel(ReducedModel):
     whole_stiffness: Annotated[FloatArray, "terms", "whole", "whole"]
     whole_mass: Annotated[FloatArray, "masses", "whole", "whole"]
     whole_load: Annotated[FloatArray, "loads", "whole"]
+    load_accelerations: Annotated[FloatArray, "loads", 3]
     whole_output: Annotated[FloatArray, "all outputs", "whole"]
     column_owner: Annotated[IntArray, "whole"]
     supports: tuple[str, ...]
     motions: tuple[str, ...]
     support_rows: Annotated[FloatArray, "supports", "whole"]
     support_springs: Annotated[FloatArray, "supports"]
+    spring_parameters: Annotated[IntArray, "supports"]
     mass_places: tuple[str, ...]
     mass_rows: Annotated[FloatArray, "masses added", 3, "whole"]
+    mass_slopes: Annotated[FloatArray, "masses added", 15, "whole"]
+    mass_points: Annotated[FloatArray, "masses added", 3]
+    mass_axes: Annotated[FloatArray, "masses added", 2, 3]
+    mass_reaches: Annotated[FloatArray, "masses added"]
     loss_places: tuple[str, ...]
     loss_patch: Annotated[IntArray, "parts"]
     loss_term: Annotated[IntArray, "parts"]
     loss_stiffness: Annotated[FloatArray, "parts", "triangle"]
+    patch_of_gauge: Annotated[IntArray, "gauges"]
     size: Annotated[float, float_info.min, inf]
     load_controls: tuple[str, ...]
     load_change_kinds: tuple[str, ...]
     load_change_axes: tuple[str, ...]
     load_changes: Annotated[FloatArray, "changed loads", "whole"]
+    load_curvatures: Annotated[FloatArray, "changed loads", "whole"]
     shifted_gauges: tuple[str, ...]
     shift_axes: tuple[str, ...]
     shift_output: Annotated[FloatArray, "gauge shifts", 2, "whole"]
@@ -178,7 +231,7 @@ class ChangeableModel(ReducedModel):
     def changes_of(self, patch: Iterable[Primitive]) -> "StructuralChanges":
         """Collect the structural changes of a patch.
 
-        Compliances and masses at one location add up; what losses leave of one patch multiplies.
+        Compliances at one location add up; what losses leave of one patch multiplies.
 
         Raises
         ------
@@ -186,7 +239,7 @@ class ChangeableModel(ReducedModel):
             If the structure has no such support or location, or a value is not possible.
         """
         compliances: dict[int, float] = {}
-        masses: dict[int, float] = {}
+        masses: list[AddedMass] = []
         remaining: dict[int, float] = {}
         for primitive in patch:
             if isinstance(primitive, SupportCompliance):
@@ -200,7 +253,7 @@ class ChangeableModel(ReducedModel):
             elif isinstance(primitive, PlaceMass):
                 first = 1 + len(self.supports)
                 number = first + self._place_number(self.mass_places, primitive.place, "a mass")
-                masses[number] = masses.get(number, 0.0) + primitive.mass
+                masses.append(AddedMass(number, primitive.mass, primitive.along, primitive.across))
             elif isinstance(primitive, RegionStiffnessLoss):
                 if not 0.0 <= primitive.loss < 1.0:
                     raise InvalidPatchError(
@@ -211,7 +264,45 @@ class ChangeableModel(ReducedModel):
                 number = first + self._place_number(self.loss_places, primitive.region, "a loss")
                 remaining[number] = remaining.get(number, 1.0) * (1.0 - primitive.loss)
         losses = {number: 1.0 - fraction for number, fraction in remaining.items()}
-        return StructuralChanges(compliances, masses, losses)
+        return StructuralChanges(compliances, tuple(masses), losses)
+
+    def rows_of_mass(self, added: AddedMass) -> FloatArray:
+        """Return the rows (3, n) that give the displacement of an added mass."""
+        place = added.number - 1 - len(self.supports)
+        rows: FloatArray = self.mass_rows[place]
+        if added.along == 0.0 and added.across == 0.0:
+            return rows
+        slopes = self.mass_slopes[place].reshape(-1, *rows.shape)
+        factors = taylor_factors(added.along, added.across)
+        return np.asarray(rows + np.tensordot(factors, slopes, 1))
+
+    def weight_of_masses(self, patch: Iterable[Primitive], coefficients: FloatArray) -> FloatArray:
+        """Return the load (n,) that accelerations exert on the masses of a patch.
+
+        `coefficients` (L,) are those of the loads, from `load_coefficients`.
+        """
+        acceleration = coefficients @ self.load_accelerations
+        load = np.zeros(len(self.column_owner))
+        if acceleration.any():
+            for added in self.changes_of(patch).masses:
+                load += added.kilograms * acceleration @ self.rows_of_mass(added)
+        return load
+
+    def strain_factor(self, gauge: str, patch: Iterable[Primitive]) -> float:
+        """Return the strain under a gauge over that of its patch, which lost stiffness on average.
+
+        A loss d adds the compliance u = d / (1 - d) to a patch of unit length. Over the length f it
+        adds u / f per length, and a gauge on it reads (1 + u / f) / (1 + u) times the mean strain.
+        """
+        factor = 1.0
+        number = int(self.patch_of_gauge[self.gauges.index(gauge)])
+        for primitive in patch:
+            if isinstance(primitive, RegionStiffnessLoss) and (
+                number >= 0 and primitive.region == self.loss_places[number]
+            ):
+                added = primitive.loss / (1.0 - primitive.loss)
+                factor *= (1.0 + added / primitive.extent) / (1.0 + added)
+        return factor
 
     def changed_load(
         self, load: FloatArray, control: str, patch: Iterable[Primitive]
@@ -231,7 +322,11 @@ class ChangeableModel(ReducedModel):
         for primitive in patch:
             if isinstance(primitive, LoadOffset) and primitive.control == control:
                 number = names.index((control, "offset", primitive.axis))
-                load = load + primitive.distance * self.load_changes[number]
+                load = (
+                    load
+                    + primitive.distance * self.load_changes[number]
+                    + 0.5 * primitive.distance**2 * self.load_curvatures[number]
+                )
             elif isinstance(primitive, LoadTilt) and primitive.control == control:
                 number = names.index((control, "tilt", primitive.axis))
                 across = self.load_changes[number]
@@ -306,7 +401,14 @@ class ChangeableModel(ReducedModel):
         is_held = self.support_springs == 0.0
         return np.where(is_held, np.abs(self.support_rows).argmax(axis=1), -1)
 
-    def reactions(self, loads: FloatArray, displacements: FloatArray) -> FloatArray:
+    def springs_at(self, vector: FloatArray) -> FloatArray:
+        """Return the spring (S,) of each motion for values (V,) of the inputs."""
+        factors = np.append(1.0, vector[: len(self.parameters)])
+        return np.asarray(self.support_springs * factors[self.spring_parameters])
+
+    def reactions(
+        self, loads: FloatArray, displacements: FloatArray, springs: FloatArray
+    ) -> FloatArray:
         """Return the reactions of the supports to loads [N or N m].
 
         Parameters
@@ -315,16 +417,18 @@ class ChangeableModel(ReducedModel):
             The loads.
         displacements : (n, k) array
             The static displacements under them, with unchanged supports.
+        springs : (S,) array
+            The springs of the motions.
 
         Returns
         -------
         (S, k) array
             The force or moment along each motion.
         """
-        springs = self.support_springs[:, np.newaxis]
-        is_held = springs == 0.0
+        resisting = springs[:, np.newaxis]
+        is_held = resisting == 0.0
         return np.where(
-            is_held, self.support_rows @ loads, springs * (self.support_rows @ displacements)
+            is_held, self.support_rows @ loads, resisting * (self.support_rows @ displacements)
         )
 
     def compliance_gains(self, vector: FloatArray) -> FloatArray:
@@ -345,14 +449,17 @@ class ChangeableModel(ReducedModel):
         loads = self.whole_load.T
         displacements = structure.basis @ structure.static(structure.basis.T @ loads)
         work = np.sum(loads * displacements, axis=0)
-        by_load = self.reactions(loads, displacements) ** 2 / np.where(work > 0.0, work, np.inf)
+        springs = self.springs_at(vector)
+        by_load = self.reactions(loads, displacements, springs) ** 2 / np.where(
+            work > 0.0, work, np.inf
+        )
         frequency = structure.modes.frequency
         shapes = structure.basis @ structure.mode_shapes
         squares = (2.0 * np.pi * frequency) ** 2
         # a mode is the displacement at rest under its inertia forces
         mass = dense_sum(self.mass_coefficients(vector), self.whole_mass)
         inertia = squares * (mass @ shapes)
-        by_mode = self.reactions(inertia, shapes) ** 2 / squares
+        by_mode = self.reactions(inertia, shapes, springs) ** 2 / squares
         return np.concatenate((by_load, by_mode), axis=1)
 
 
@@ -453,9 +560,9 @@ class ChangedStructure:
         theta = model.stiffness_coefficients(vector)
         self.stiffness = dense_sum(theta, subspace.stiffness)
         self.mass = dense_sum(model.mass_coefficients(vector), subspace.mass)
-        for change, kilograms in changes.masses.items():
-            rows = model.mass_rows[change - 1 - len(model.supports)] @ self.basis
-            self.mass += kilograms * rows.T @ rows
+        for added in changes.masses:
+            rows = model.rows_of_mass(added) @ self.basis
+            self.mass += added.kilograms * rows.T @ rows
         for change, loss in changes.losses.items():
             terms, parts = subspace.lost[change]
             self.stiffness -= dense_sum(loss * theta[terms], parts)
@@ -466,8 +573,9 @@ class ChangedStructure:
         self._scale = np.ones(count)
         released = first_released
         added_springs = np.zeros(count)
+        springs = model.springs_at(vector)
         for number, compliance in sorted(changes.compliances.items()):
-            spring = model.support_springs[number - 1]
+            spring = springs[number - 1]
             if spring == 0.0:
                 self._scale[released] = np.sqrt(compliance)
                 added_springs[released] = 1.0 / compliance if compliance > 0.0 else 0.0

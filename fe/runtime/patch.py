@@ -65,12 +65,21 @@ class PointMass(Primitive):
 
 
 class PlaceMass(Primitive):
-    """A mass is added at a named place of a structure; a negative one is lost."""
+    """A mass is added at a named place of a structure; a negative one is lost.
+
+    If the place is a point of a mesh, the mass may lie beside it on the structure, by `along` in
+    the direction in which the structure extends most about the point and by `across` in the one in
+    which it extends second most.
+    """
 
     place: str
     """Name of the place: a set of nodes, a point or a node."""
     mass: Annotated[float, "kg"]
     """Added mass."""
+    along: Annotated[float, "m"] = 0.0
+    """Distance from the place in the direction of the largest extent."""
+    across: Annotated[float, "m"] = 0.0
+    """Distance from the place in the direction of the second largest extent."""
 
 
 class SupportCompliance(Primitive):
@@ -110,13 +119,17 @@ class ModulusTemperature(Primitive):
 class RegionStiffnessLoss(Primitive):
     """A damage region loses `loss` of the stiffness that it has in a trial.
 
-    The region may also be a patch of a structure that its file does not declare.
+    The region may also be a patch of a structure that its file does not declare. If what lost
+    stiffness extends over `extent` times the length of the patch, it lost more, or less, than the
+    patch on average, and a strain gauge on it reads accordingly.
     """
 
     region: str
     """Name of the damage region."""
     loss: Annotated[float, "1"]
     """Lost fraction of the stiffness."""
+    extent: Annotated[float, "1"] = 1.0
+    """Length of what lost stiffness over that of the patch."""
 
 
 class StiffnessDrift(Primitive):

@@ -68,12 +68,15 @@ class SupportMotion(NamedTuple):
     spring : float
         Stiffness of its spring [N/m or N m/rad]; zero for a motion that is held unless the support
         yields.
+    scaled_by : str or None
+        Parameter that scales the spring.
     """
 
     support: str
     motion: str
     unknown: int
     spring: float
+    scaled_by: str | None = None
 
 
 class SystemMatrices(NamedTuple):

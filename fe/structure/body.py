@@ -85,15 +85,16 @@ class Body(Generic[Mesh]):
     def stiffness_terms(self) -> tuple[StiffnessTerm, ...]:
         """Stiffness of each part, in their order.
 
-        Springs are added to the part without parameter and region, which is made if there is none.
+        Springs are added to the part of their parameter and no region, which is made if there is
+        none.
         """
         terms = {}
         for number, pair in enumerate(self.parts):
             terms[pair] = self.stiffness(np.flatnonzero(self.part == number))
-        if self.supports.springs.any():
-            constant = (None, None)
-            springs = self.supports.stiffness
-            terms[constant] = terms[constant] + springs if constant in terms else springs
+        for parameter, springs in self.supports.springs_by_parameter.items():
+            pair = (parameter, None)
+            stiffness = sparse.diags_array(springs).tocsr()
+            terms[pair] = terms[pair] + stiffness if pair in terms else stiffness
         return tuple(
             StiffnessTerm(matrix, parameter, region)
             for (parameter, region), matrix in terms.items()

@@ -4,7 +4,7 @@ None of them is part of the structure file. They are proposed at the named sets 
 grid that is fine enough to tell an engineer where to look.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -13,10 +13,11 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.changeable import taylor_factors
 from fe.runtime.errors import InvalidDesignError
 
 from .affine import AffineStructure
-from .design import MeshLoad
+from .design import Gauge, MeshLoad
 from .gauges import gauge_rows
 from .matrices import MatrixStructure
 from .matrix_design import MatrixLoad, MatrixMass, NodeOutput
@@ -36,12 +37,19 @@ LARGEST_RADIUS = 0.12
 """Largest radius of a named set of cells that is a patch, relative to the size of the mesh."""
 LARGEST_NODE_SHARE = 0.5
 """A named set with this share of all nodes or more is no candidate: it is the structure itself."""
+FITTED_REACH = 1.5
+"""Radius of the nodes that give the derivatives of the displacement, over the reach of a point."""
+LEAST_SINGULAR_VALUE = 1e-3
+"""Relative singular value below which nodes do not determine a derivative of the displacement."""
+DERIVATIVES = 5
+"""Number of derivatives of a displacement: two first and three second ones along two axes."""
 AXES = ("x", "y", "z")
 """Names of the axes."""
 LEAST_SINE = 0.1
 """Sine of the angle between a force and an axis below which it is not tilted towards the axis."""
-OFFSET_STEP = 0.01
-"""Step by which a force is moved for a finite difference, relative to the size of the mesh."""
+OFFSET_STEP = 0.03
+"""Step by which a force is moved for finite differences, relative to the size of the mesh: about as
+large as the error of its position."""
 GAUGE_STEP = 0.03
 """Step by which a gauge is moved for a finite difference, relative to the size of the mesh.
 
@@ -64,10 +72,31 @@ class MassCandidate(NamedTuple):
         The name of a set, a point or a node.
     rows : csr (3, n)
         Rows that give the displacement of the mass along x, y and z.
+    point : (3,) array
+        The location, or the centre of a set; zero for matrices, which have no places [m].
+    reach : float
+        Distance from the point within which another location is nearer to no other point [m]; zero
+        if the mass can lie at the location alone.
+    axes : (2, 3) array
+        Unit vectors along which the mass may lie beside the point: directions in which the
+        structure extends most about it.
+    slopes : csr (15, n)
+        Derivatives of the displacement by the distances s and t along these axes, three rows each:
+        by s, by t, twice by s, by s and t, twice by t.
     """
 
     name: str
     rows: sparse.csr_array
+    point: FloatArray
+    reach: float
+    axes: FloatArray
+    slopes: sparse.csr_array
+
+    def rows_beside(self, along: float, across: float) -> sparse.csr_array:
+        """Return the rows (3, n) of a mass that lies beside the point by two distances [m]."""
+        factors = np.append(1.0, taylor_factors(along, across))
+        pieces = sparse.vstack((self.rows, self.slopes))
+        return (sparse.kron(factors[np.newaxis], sparse.eye_array(3)) @ pieces).tocsr()
 
 
 class LossCandidate(NamedTuple):
@@ -79,10 +108,13 @@ class LossCandidate(NamedTuple):
         The name of a set, or where the centre of the patch is.
     terms : dict of int to csr (n, n)
         The contribution of the patch to each stiffness term, by the term's index.
+    gauges : tuple of int
+        Numbers of the gauges on the patch.
     """
 
     name: str
     terms: dict[int, sparse.csr_array]
+    gauges: tuple[int, ...]
 
 
 def mass_places(structure: AffineStructure) -> list[MassCandidate]:
@@ -99,33 +131,101 @@ def mass_places(structure: AffineStructure) -> list[MassCandidate]:
     else:
         candidates = []
     places = []
-    for name, weights in candidates:
-        rows = sparse.kron(sparse.csr_array(weights[np.newaxis]), sparse.eye_array(3))
+    for candidate in candidates:
+        rows = sparse.kron(sparse.csr_array(candidate.weights[np.newaxis]), sparse.eye_array(3))
         free_rows = (rows @ structure.expansion).tocsr()
+        slopes = sparse.kron(candidate.slopes, sparse.eye_array(3)) @ structure.expansion
         held_count = len([motion for motion in structure.support_motions if motion.spring == 0.0])
         if abs(free_rows[:, : structure.unknowns - held_count]).max() > 0.0:
-            places.append(MassCandidate(name, free_rows))
+            places.append(
+                MassCandidate(
+                    name=candidate.name,
+                    rows=free_rows,
+                    point=candidate.point,
+                    reach=candidate.reach,
+                    axes=candidate.axes,
+                    slopes=slopes.tocsr(),
+                )
+            )
     return places
 
 
-def places_of_mesh(mesh: StructureMesh) -> Iterator[tuple[str, FloatArray]]:
-    """Yield names and nodal weights (nodes,) of sets of nodes, then of grid points."""
+class MassPlace(NamedTuple):
+    """A location by the nodes of a mesh, or of matrices; see `MassCandidate`.
+
+    Attributes
+    ----------
+    weights : (nodes,) array
+        Weights of the nodes in the displacement of the location.
+    slopes : csr (5, nodes)
+        The same for the derivatives of the displacement.
+    """
+
+    name: str
+    weights: FloatArray
+    point: FloatArray
+    reach: float
+    axes: FloatArray
+    slopes: sparse.csr_array
+
+    @classmethod
+    def fixed(cls, name: str, weights: FloatArray, point: FloatArray) -> "MassPlace":
+        """Return a location beside which no mass is looked for."""
+        no_slopes = sparse.csr_array((DERIVATIVES, len(weights)))
+        return cls(name, weights, point, 0.0, np.eye(3)[:2], no_slopes)
+
+    def point_beside(self, along: float, across: float) -> FloatArray:
+        """Return the point (3,) [m] of a mass that lies beside the location by two distances."""
+        return np.asarray(self.point + along * self.axes[0] + across * self.axes[1])
+
+
+def places_of_mesh(mesh: StructureMesh) -> Iterator[MassPlace]:
+    """Yield the sets of nodes, then the points of a grid."""
     for name, nodes in mesh.node_sets.items():
         is_place = np.all(nodes >= 0) and len(nodes) < LARGEST_NODE_SHARE * len(mesh.points)
         if is_place and not name.startswith(SETS_OF_THE_MESHER):
-            yield name, set_weights(mesh, name, f"the set {name!r}")
-    corners = np.unique(mesh.cells[:, list(mesh.kind.corners)])
-    for number in _spread_points(
+            weights = set_weights(mesh, name, f"the set {name!r}")
+            yield MassPlace.fixed(name, weights, weights @ mesh.points)
+    corners = np.unique(mesh.cells[:, : len(mesh.kind.corners)])
+    numbers = _spread_points(
         mesh.points[corners], GRID_POINTS, LEAST_DISTANCE_OF_POINTS * mesh.size
-    ):
-        node = corners[number]
+    )
+    grid = mesh.points[corners[numbers]]
+    from_grid, _ = KDTree(grid).query(mesh.points)
+    reach = float(from_grid.max())
+    nodes_nearby = KDTree(mesh.points).query_ball_point(grid, FITTED_REACH * reach)
+    for node, neighbours in zip(corners[numbers].tolist(), nodes_nearby, strict=True):
         weights = np.zeros(len(mesh.points))
         weights[node] = 1.0
-        yield f"the point {mesh.describe_point(np.round(mesh.points[node], 9))}", weights
+        point = mesh.points[node]
+        axes, slopes = _slopes_about(mesh.points, node, np.array(neighbours), reach)
+        name = f"the point {mesh.describe_point(np.round(point, 9))}"
+        yield MassPlace(name, weights, point, reach, axes, slopes)
 
 
-def _places_of_nodes(structure: MatrixStructure) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the name and the nodal weights (nodes,) of each node that the design names."""
+def _slopes_about(
+    points: FloatArray, node: int, neighbours: IntArray, reach: float
+) -> tuple[FloatArray, sparse.csr_array]:
+    """Return two axes (2, 3) at a node, and the weights (5, nodes) of derivatives along them.
+
+    The displacements of the neighbours, less that of the node, are fitted by a polynomial with the
+    distances along both axes to the second power, and that across both to the first. What the
+    neighbours do not determine, such as derivatives across a row of nodes, is taken as zero.
+    """
+    arms = points[neighbours] - points[node]
+    _, _, axes = np.linalg.svd(arms - arms.mean(axis=0), full_matrices=True)
+    s, t, u = axes @ arms.T / reach
+    terms = np.column_stack((s, t, s**2 / 2.0, s * t, t**2 / 2.0, u))
+    coefficients = np.linalg.pinv(terms, rcond=LEAST_SINGULAR_VALUE)[:DERIVATIVES]
+    coefficients /= np.array([reach, reach, reach**2, reach**2, reach**2])[:, np.newaxis]
+    weights = sparse.lil_array((DERIVATIVES, len(points)))
+    weights[:, neighbours] = coefficients
+    weights[:, [node]] -= coefficients.sum(axis=1, keepdims=True)
+    return axes[:2], weights.tocsr()
+
+
+def _places_of_nodes(structure: MatrixStructure) -> Iterator[MassPlace]:
+    """Yield each node that the design names."""
     design = structure.design
     named = []
     rows: tuple[MatrixLoad | MatrixMass | NodeOutput, ...] = (
@@ -140,7 +240,7 @@ def _places_of_nodes(structure: MatrixStructure) -> Iterator[tuple[str, FloatArr
     for node in dict.fromkeys(named):
         weights = np.zeros(len(structure.nodes))
         weights[structure.nodes.index(node)] = 1.0
-        yield f"node {node}", weights
+        yield MassPlace.fixed(f"node {node}", weights, np.zeros(3))
 
 
 def _spread_points(
@@ -178,8 +278,32 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
     """
     if not isinstance(structure, Structure):
         return []
-    mesh = structure.mesh
-    is_free_cell = structure.region_of < 0
+    patches = patches_of_mesh(structure.mesh, structure.design.gauge, structure.region_of)
+    pairs = [(term.parameter, term.region) for term in structure.stiffness_terms]
+    cells_at_gauges = _cells_at_gauges(structure.mesh, structure.design.gauge)
+    places = []
+    for name, cells in patches.items():
+        terms = {}
+        for part_number, pair in enumerate(structure.body.parts):
+            cells_of_part = cells[structure.body.part[cells] == part_number]
+            if len(cells_of_part):
+                terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
+        gauges = np.flatnonzero(np.isin(cells_at_gauges, cells)).tolist()
+        places.append(LossCandidate(name, terms, tuple(gauges)))
+    return places
+
+
+def patches_of_mesh(
+    mesh: StructureMesh, gauges: Sequence[Gauge], region_of: IntArray
+) -> dict[str, IntArray]:
+    """Return the cells of each patch that may lose stiffness, see `loss_places`.
+
+    Parameters
+    ----------
+    region_of : (nc,) array of int
+        Index of the damage region of each cell, -1 for none.
+    """
+    is_free_cell = region_of < 0
     patches: dict[str, IntArray] = {}
     for name, cells in mesh.cell_sets.items():
         centres = mesh.centres[cells]
@@ -191,7 +315,7 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
     remaining = np.flatnonzero(is_free_cell)
     if len(remaining):
         centres = mesh.centres[remaining]
-        cells_at_gauges = _cells_at_gauges(structure)
+        cells_at_gauges = _cells_at_gauges(mesh, gauges)
         centre_cells = _spread_points(
             centres,
             GRID_PATCHES,
@@ -202,22 +326,12 @@ def loss_places(structure: AffineStructure) -> list[LossCandidate]:
         for number, centre_cell in enumerate(centre_cells):
             name = f"around {mesh.describe_point(np.round(centres[centre_cell], 4))}"
             patches[name] = remaining[patch_of == number]
-    pairs = [(term.parameter, term.region) for term in structure.stiffness_terms]
-    places = []
-    for name, cells in patches.items():
-        terms = {}
-        for part_number, pair in enumerate(structure.body.parts):
-            cells_of_part = cells[structure.body.part[cells] == part_number]
-            if len(cells_of_part):
-                terms[pairs.index(pair)] = structure.body.stiffness(cells_of_part)
-        places.append(LossCandidate(name, terms))
-    return places
+    return patches
 
 
-def _cells_at_gauges(structure: Structure) -> IntArray:
+def _cells_at_gauges(mesh: StructureMesh, gauges: Sequence[Gauge]) -> IntArray:
     """Return the cell (G,) whose centre is nearest to each gauge."""
-    mesh = structure.mesh
-    points = [mesh.unit * np.asarray(gauge.point) for gauge in structure.design.gauge]
+    points = [mesh.unit * np.asarray(gauge.point) for gauge in gauges]
     if not points:
         return NO_POINTS
     _, cells = KDTree(mesh.centres).query(points)
@@ -237,12 +351,16 @@ class LoadChange(NamedTuple):
         The axis along which it is offset, or towards which it is tilted.
     vector : (n,) array
         Derivative of the load per unit of the control, and per metre or radian.
+    curvature : (n,) array
+        Second derivative of the load by the offset, per unit of the control and square metre; zero
+        for a tilt.
     """
 
     control: str
     change: str
     axis: str
     vector: FloatArray
+    curvature: FloatArray
 
 
 def load_changes(structure: AffineStructure) -> list[LoadChange]:
@@ -266,36 +384,41 @@ def load_changes(structure: AffineStructure) -> list[LoadChange]:
             if length > LEAST_SINE:
                 tilted = np.linalg.norm(force) * across / length
                 vector = structure.expansion.T @ np.outer(weights, tilted).ravel()
-                changes.append(LoadChange(load.control, "tilt", axis, vector))
-            gradient = _gradient_of_weights(mesh, load, direction, label)
-            if gradient is not None:
-                vector = structure.expansion.T @ np.outer(gradient, force).ravel()
-                changes.append(LoadChange(load.control, "offset", axis, vector))
+                no_curvature = np.zeros_like(vector)
+                changes.append(LoadChange(load.control, "tilt", axis, vector, no_curvature))
+            derivatives = _derivatives_of_weights(mesh, load, direction, label)
+            if derivatives is not None:
+                vector, curvature = [
+                    structure.expansion.T @ np.outer(weights, force).ravel()
+                    for weights in derivatives
+                ]
+                changes.append(LoadChange(load.control, "offset", axis, vector, curvature))
     return [change for change in changes if np.any(change.vector)]
 
 
-def _gradient_of_weights(
+def _derivatives_of_weights(
     mesh: StructureMesh, load: MeshLoad, direction: FloatArray, label: str
-) -> FloatArray | None:
-    """Return the derivative (nodes,) of the load's nodal weights per metre along a direction.
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return first and second derivative (nodes,) of the load's nodal weights along a direction.
 
-    It is a central difference, or one-sided where one side lies outside the structure, and None
-    where both do.
+    They are those of a parabola through three points, or of a line where one side lies outside the
+    structure, and None where both do.
     """
     if load.point is None:
         return None
     step = OFFSET_STEP * mesh.size
-    weights_by_sign = []
-    for sign in (1.0, -1.0):
-        point = np.asarray(load.point) + sign * step / mesh.unit * direction
+    middle = point_weights(mesh, load.point, label)
+    difference_quotients = []
+    for distance in (step, -step):
+        point = np.asarray(load.point) + distance / mesh.unit * direction
         with suppress(InvalidDesignError):
-            weights_by_sign.append((sign, point_weights(mesh, tuple(point.tolist()), label)))
-    if not weights_by_sign:
+            weights = point_weights(mesh, tuple(point.tolist()), label)
+            difference_quotients.append((weights - middle) / distance)
+    if not difference_quotients:
         return None
-    if len(weights_by_sign) == 1:
-        weights_by_sign.append((0.0, point_weights(mesh, load.point, label)))
-    (first_sign, first_weights), (second_sign, second_weights) = weights_by_sign
-    return np.asarray((first_weights - second_weights) / (step * (first_sign - second_sign)))
+    slope = 0.5 * (difference_quotients[0] + difference_quotients[-1])
+    curvature = (difference_quotients[0] - difference_quotients[-1]) / step
+    return slope, curvature
 
 
 def strains_across(structure: AffineStructure) -> list[sparse.csr_array]:

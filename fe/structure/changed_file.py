@@ -1,6 +1,7 @@
 """A structure file with the changes of a patch written into its tables."""
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +16,28 @@ from fe.runtime.patch import (
     ModelPatch,
     PlaceMass,
     Primitive,
+    RegionStiffnessLoss,
     SupportCompliance,
 )
 from reporting.formats.toml_file import read_toml
 
-from .candidates import AXES, places_of_mesh
+from .candidates import AXES, patches_of_mesh, places_of_mesh
 from .design import Gauge, MeshDesign, load_structure, parse_structure
 from .gauges import gauge_axes
+from .location import nearest_point
 from .mesh import StructureMesh
 from .nodal_loads import point_weights, set_weights
-from .operators import structure_mesh
+from .operators import part_of_cells, structure_mesh
 from .tables import MOTIONS
 
-WRITTEN = (SupportCompliance, PlaceMass, LoadOffset, LoadTilt, GaugeOffset)
+WRITTEN = (
+    SupportCompliance,
+    PlaceMass,
+    RegionStiffnessLoss,
+    LoadOffset,
+    LoadTilt,
+    GaugeOffset,
+)
 """Kinds of primitives that the structure file of a mesh can express."""
 
 Tables = dict[str, Any]
@@ -65,6 +75,8 @@ def changed_tables(file: Path, patch: ModelPatch, folder: Path) -> Tables:
             _soften_support(tables, mesh, primitive)
         elif isinstance(primitive, PlaceMass):
             _add_mass(tables, mesh, primitive)
+        elif isinstance(primitive, RegionStiffnessLoss):
+            _lose_stiffness(tables, design, mesh, primitive)
         elif isinstance(primitive, LoadOffset):
             row = _load_of(tables, primitive.control, "point")
             point = list(row["point"])
@@ -122,20 +134,50 @@ def _add_mass(tables: Tables, mesh: StructureMesh, primitive: PlaceMass) -> None
     """Add a point mass at the centre of a set, or at a point."""
     if primitive.mass <= 0.0:
         raise _not_stated(primitive, f"a mass must be positive, and this one is {primitive.mass:g}")
-    weights = dict(places_of_mesh(mesh))[primitive.place]
-    point = tuple((weights @ mesh.points / mesh.unit).tolist())
+    place = next(place for place in places_of_mesh(mesh) if place.name == primitive.place)
+    position = place.weights @ mesh.points
+    if place.reach > 0.0:
+        position = nearest_point(mesh, place.point_beside(primitive.along, primitive.across))
+    point = tuple((position / mesh.unit).tolist())
     try:
         point_weights(mesh, point, primitive.place)
     except InvalidDesignError as cause:
         reason = f"the centre of {primitive.place!r} lies outside the structure"
         raise _not_stated(primitive, reason) from cause
     masses = list(tables.get("mass", ()))
-    names = {row["name"] for row in masses}
-    number = 1
-    while f"added_{number}" in names:
-        number += 1
-    masses.append({"name": f"added_{number}", "point": list(point), "mass": primitive.mass})
+    name = _new_name("added", [row["name"] for row in masses])
+    masses.append({"name": name, "point": list(point), "mass": primitive.mass})
     tables["mass"] = masses
+
+
+def _lose_stiffness(
+    tables: Tables, design: MeshDesign, mesh: StructureMesh, primitive: RegionStiffnessLoss
+) -> None:
+    """Take stiffness from the cells of a damage region, a named set or a patch of the search."""
+    set_of_region = {region.name: region.set for region in design.damage}
+    set_name = set_of_region.get(primitive.region, primitive.region)
+    if set_name not in mesh.cell_sets:
+        region_of = part_of_cells(mesh, list(design.numbered("damage")), "damage region")
+        patches = patches_of_mesh(mesh, design.gauge, region_of)
+        if primitive.region not in patches:
+            raise _not_stated(primitive, f"the mesh has no cells {primitive.region!r}")
+        numbers = mesh.cell_numbers[patches[primitive.region]].tolist()
+        sets = list(tables.get("set", ()))
+        set_name = _new_name("softened", (*mesh.cell_sets, *mesh.node_sets))
+        sets.append({"name": set_name, "of": "cells", "numbers": numbers})
+        tables["set"] = sets
+        mesh.cell_sets[set_name] = patches[primitive.region]
+    losses = list(tables.get("stiffness_loss", ()))
+    losses.append({"set": set_name, "fraction": primitive.loss})
+    tables["stiffness_loss"] = losses
+
+
+def _new_name(stem: str, names: Collection[str]) -> str:
+    """Return the first of STEM_1, STEM_2, ... that is no name yet."""
+    number = 1
+    while f"{stem}_{number}" in names:
+        number += 1
+    return f"{stem}_{number}"
 
 
 def _shift_gauge(tables: Tables, mesh: StructureMesh, primitive: GaugeOffset) -> None:

@@ -109,19 +109,24 @@ Spring = Annotated[float, Field(ge=0.0, le=1e15)]
 Springs = tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring]
 
 
-class NamedSet(tables.DesignSection):
-    """Set of nodes, or of cells by their centres, in a box: two corners [unit of length]."""
+class NamedSet(tables.AlternativeKeys):
+    """Set of nodes, or of cells: those in a box, cells by their centres, or those with numbers."""
 
     name: SetName
     """Name of the set."""
     of: Literal["nodes", "cells"]
     """What the set contains."""
-    box: tuple[tables.Vector, tables.Vector]
+    box: tuple[tables.Vector, tables.Vector] | None = None
     """Two opposite corners of the box, the lower one first [unit of length]."""
+    numbers: Annotated[tuple[int, ...], Field(min_length=1)] | None = None
+    """Numbers of the nodes or elements in the mesh file, counted from 1 if it has none."""
+
+    alternatives = (("box",), ("numbers",))
 
     def checks(self) -> Iterator[Check]:
-        """Yield a fault if the box has its corners in the wrong order."""
-        lower, upper = self.box
+        """Yield the checks against two ways at once, and a box with corners in the wrong order."""
+        yield from super().checks()
+        lower, upper = self.box or ((), ())
         is_reversed = any(high < low for low, high in zip(lower, upper, strict=True))
         yield is_reversed, "box must give its lower corner first, then its upper one"
 
@@ -136,8 +141,8 @@ class MeshMaterial(tables.AlternativeKeys):
 
     name: tables.Name
     """Name of the material."""
-    set: SetName = "all"
-    """Set of the cells."""
+    set: SetName | Annotated[tuple[SetName, ...], Field(min_length=1)] = "all"
+    """Set of the cells, or a list of sets."""
     density: float = Field(ge=0.0, le=3e4)
     """Density [kg/m^3]."""
     young_modulus: tables.Modulus | None = None
@@ -169,6 +174,11 @@ class MeshMaterial(tables.AlternativeKeys):
             "the moduli and Poisson's ratios belong to no stable material: its compliance is not "
             "positive definite",
         )
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """The sets of the cells."""
+        return (self.set,) if isinstance(self.set, str) else self.set
 
     @property
     def compliance(self) -> FloatArray:
@@ -208,6 +218,8 @@ class Support(tables.DesignSection):
     m/rad]."""
     rigid_about: tables.Vector | None = None
     """Point about which the set moves as a rigid body [unit of length]."""
+    scaled_by: tables.Name | None = None
+    """Name of the parameter that scales the springs."""
 
     def checks(self) -> Iterator[Check]:
         """Yield the checks against a support that holds nothing, or holds a motion twice."""
@@ -223,6 +235,10 @@ class Support(tables.DesignSection):
             "too, is a rigid set, with the point `rigid_about`",
         )
         yield not self.hold and not has_springs, "a rigid set needs hold, springs or both"
+        yield (
+            self.scaled_by is not None and not has_springs,
+            "`scaled_by` scales springs, and it has none",
+        )
         for motion, spring in zip(tables.MOTIONS, springs, strict=False):
             is_held_twice = bool(spring) and motion in self.hold
             yield is_held_twice, f"the motion {motion} is held, so that no spring can act on it"
@@ -253,6 +269,20 @@ class Damage(tables.Region):
 
     set: SetName
     """Set of the cells."""
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """The set of the cells, as that of a material."""
+        return (self.set,)
+
+
+class StiffnessLoss(tables.DesignSection):
+    """Cells that have lost stiffness for good, such as those about a crack that was found."""
+
+    set: SetName
+    """Set of the cells."""
+    fraction: float = Field(gt=0.0, le=0.95)
+    """Lost fraction of the stiffness that material and parameters give [1]."""
 
 
 class MeshMass(tables.ChosenMass):
@@ -300,6 +330,8 @@ class MeshDesign(tables.StructureDesign, Gauged):
     """Supports."""
     load: tuple[MeshLoad, ...] = ()
     damage: tuple[Damage, ...] = Field(default=(), max_length=MOST_REGIONS)
+    stiffness_loss: tuple[StiffnessLoss, ...] = ()
+    """Losses of stiffness that were found."""
     mass: tuple[MeshMass, ...] = ()
     gauge: tuple[Gauge, ...] = ()
     displacement: tuple[PointOutput, ...] = ()
@@ -307,7 +339,7 @@ class MeshDesign(tables.StructureDesign, Gauged):
     port: tuple[MeshPort, ...] = ()
 
     what = "mesh"
-    scaled_table = "material"
+    scaled_tables = ("material", "support")
     own_names = ("material", "set")
 
     @property
@@ -357,6 +389,16 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     )
 
 
+def _remove_later_keys(content: dict[str, Any]) -> None:
+    """Remove keys without a value that files of earlier versions cannot have, from plain data."""
+    if not content.get("stiffness_loss"):
+        content.pop("stiffness_loss", None)
+    for table, key in (("support", "scaled_by"), ("set", "numbers")):
+        for row in content.get(table, ()):
+            if row.get(key) is None:
+                row.pop(key, None)
+
+
 def structure_hash(
     design: tables.StructureDesign, folder: Path, *, with_ports: bool = False
 ) -> str:
@@ -384,6 +426,7 @@ def structure_hash(
         del content["port"]
     content.pop("mesh", None)  # its bytes count, not its name
     del content["reduction"]  # the structure is the same
+    _remove_later_keys(content)
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode())
     for name in design.files:
         try:

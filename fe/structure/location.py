@@ -1,6 +1,7 @@
 """Locate points in a mesh: in a cell, or on a face of its surface."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -189,12 +190,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     InvalidDesignError
         If the point lies farther from the surface than `FARTHEST` times the radius of a face.
     """
-    spheres = mesh.face_spheres
-    centre_distance = np.linalg.norm(spheres.centre - point, axis=1)
-    # A face can be the nearest one only if its sphere comes as near as the nearest centre of a
-    # face, which itself lies on or close to the surface. A tenth is added, since a curved face may
-    # reach beyond its sphere.
-    faces = np.flatnonzero(centre_distance - 1.1 * spheres.radius <= centre_distance.min())
+    faces = _faces_near(mesh, point)
     cells = mesh.boundary.cell[faces]
     nearest_points = _nearest_on_faces(mesh, point, cells, mesh.boundary.face[faces])
     # the nearest of all faces
@@ -202,7 +198,7 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     normal = unit_vector(np.cross(along_first, along_second))
     distance = np.linalg.norm(nearest_points.residual, axis=1)
     nearest_face = int(distance.argmin())
-    size = float(spheres.radius[faces[nearest_face]])
+    size = float(mesh.face_spheres.radius[faces[nearest_face]])
     if distance[nearest_face] > FARTHEST * size:
         height = float(nearest_points.residual[nearest_face] @ normal[nearest_face])
         side = ", inside" if height < 0.0 else ""
@@ -221,6 +217,27 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
         normal=unit_vector(normal[meeting_faces].mean(axis=0)),
         distance=float(distance[nearest_face]),
     )
+
+
+def nearest_point(mesh: StructureMesh, point: FloatArray) -> FloatArray:
+    """Return the point (3,) of the structure that is nearest to a point, itself if it is inside."""
+    with suppress(InvalidDesignError):
+        attach(mesh, point, "the point")
+        return point
+    faces = _faces_near(mesh, point)
+    cells = mesh.boundary.cell[faces]
+    residuals = _nearest_on_faces(mesh, point, cells, mesh.boundary.face[faces]).residual
+    return np.asarray(point - residuals[np.linalg.norm(residuals, axis=1).argmin()])
+
+
+def _faces_near(mesh: StructureMesh, point: FloatArray) -> IntArray:
+    """Return the faces (f,) of the surface among which the nearest one to a point is."""
+    spheres = mesh.face_spheres
+    centre_distance = np.linalg.norm(spheres.centre - point, axis=1)
+    # A face can be the nearest one only if its sphere comes as near as the nearest centre of a
+    # face, which itself lies on or close to the surface. A tenth is added, since a curved face may
+    # reach beyond its sphere.
+    return np.flatnonzero(centre_distance - 1.1 * spheres.radius <= centre_distance.min())
 
 
 def _nearest_on_faces(

@@ -136,13 +136,13 @@ class MatrixDesign(tables.StructureDesign):
     port: tuple[NodeOutput, ...] = ()
 
     what = "matrix"
-    scaled_table = "part"
+    scaled_tables = ("part",)
 
     def checks(self) -> Iterator[Check]:
         """Yield the checks against tables that do not fit together and regions without parts."""
         yield from super().checks()
         yield from self.wrong_ties(
-            "part",
+            ("part",),
             "damage",
             "damage",
             tied="is of the region",

@@ -20,6 +20,7 @@ from .design import (
     MeshDesign,
     MeshMaterial,
     MeshPort,
+    NamedSet,
     PointOutput,
     load_structure,
     structure_hash,
@@ -61,7 +62,7 @@ class Structure(AffineStructure):
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
-    """Read the mesh of a design, and add the sets in boxes that the design defines.
+    """Read the mesh of a design, and add the sets that the design defines.
 
     The path of the mesh is relative to `file`, the path of the design's file.
 
@@ -74,30 +75,47 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     node_sets = dict(mesh.node_sets)
     cell_sets = dict(mesh.cell_sets)
     tolerance = 1e-9 * mesh.size
-    for box_set in design.set:
-        if box_set.of == "nodes":
-            points = mesh.points
-            sets = node_sets
-        else:
-            points = mesh.centres
-            sets = cell_sets
-        low, high = design.unit * np.array(box_set.box)
+    for label, named_set in design.numbered("set"):
+        of_nodes = named_set.of == "nodes"
+        sets = node_sets if of_nodes else cell_sets
+        if named_set.numbers is not None:
+            numbers = mesh.node_numbers if of_nodes else mesh.cell_numbers
+            sets[named_set.name] = _indices_of(numbers, named_set, f"{file}: {label}")
+            continue
+        points = mesh.points if of_nodes else mesh.centres
+        low, high = design.unit * np.array(named_set.box)
         is_above_low = (points >= low - tolerance).all(axis=1)
         is_below_high = (points <= high + tolerance).all(axis=1)
-        sets[box_set.name] = np.flatnonzero(is_above_low & is_below_high)
+        sets[named_set.name] = np.flatnonzero(is_above_low & is_below_high)
     return replace(mesh, node_sets=node_sets, cell_sets=cell_sets)
 
 
-def _part_of_cells(
+def _indices_of(numbers: IntArray, named_set: NamedSet, where: str) -> IntArray:
+    """Return the indices of nodes or cells by their numbers in the mesh file.
+
+    Raises `MeshError` if the mesh has no node or element of a number.
+    """
+    indices = {number: index for index, number in enumerate(numbers.tolist())}
+    missing = [number for number in named_set.numbers or () if number not in indices]
+    if missing:
+        what = "node" if named_set.of == "nodes" else "element"
+        raise MeshError(f"{where}: the mesh has no {what} {missing[0]}.")
+    return np.array([indices[number] for number in named_set.numbers or ()], dtype=np.int64)
+
+
+def part_of_cells(
     mesh: StructureMesh, labelled: list[tuple[str, MeshMaterial | Damage]], kind: str
 ) -> IntArray:
-    """Return the index (nc,) of the material or region whose set holds each cell, -1 for none.
+    """Return the index (nc,) of the material or region whose sets hold each cell, -1 for none.
 
-    Raises `MeshError` if a set is missing or empty, or two overlap.
+    Raises
+    ------
+    MeshError
+        If a set is missing or empty, or those of two materials or regions overlap.
     """
     part_of_cell = np.full(len(mesh.cells), -1, dtype=np.int64)
     for number, (label, part) in enumerate(labelled):
-        cells = mesh.cells_of(part.set, label)
+        cells = np.unique(np.concatenate([mesh.cells_of(name, label) for name in part.sets]))
         shared_cells = cells[part_of_cell[cells] >= 0]
         if len(shared_cells):
             _, other_part = labelled[part_of_cell[shared_cells[0]]]
@@ -181,9 +199,9 @@ def load_and_assemble(
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
     # what each cell belongs to
-    material_of = _part_of_cells(mesh, list(design.numbered("material")), "material")
+    material_of = part_of_cells(mesh, list(design.numbered("material")), "material")
     _check_materials(mesh, material_of)
-    region_of = _part_of_cells(mesh, list(design.numbered("damage")), "damage region")
+    region_of = part_of_cells(mesh, list(design.numbered("damage")), "damage region")
     # the body, its loads and outputs
     body = _body(
         design,
@@ -235,11 +253,14 @@ def _body(
     """Combine mesh, materials, supports and point masses into a body."""
     parts = _stiffness_parts(design, material_of, region_of)
     elasticities = np.array([material.elasticity for material in design.material])
+    remaining = np.ones(len(mesh.cells))
+    for label, loss in design.numbered("stiffness_loss"):
+        remaining[mesh.cells_of(loss.set, label)] *= 1.0 - loss.fraction
     densities = np.array([material.density for material in design.material])
     return Body(
         mesh=mesh,
         supports=supports,
-        elasticity=elasticities[material_of],
+        elasticity=remaining[:, np.newaxis, np.newaxis] * elasticities[material_of],
         density=densities[material_of],
         part=parts.part_of,
         parts=parts.names,

@@ -31,12 +31,15 @@ class RigidSet(NamedTuple):
         Whether each motion, along x, y, z and about them, is held.
     springs : (6,) array
         Springs to the ground [N/m, N m/rad].
+    scaled_by : str or None
+        Parameter that scales the springs.
     """
 
     nodes: IntArray
     point: FloatArray
     held: BoolArray
     springs: FloatArray
+    scaled_by: str | None = None
 
 
 class Supports(NamedTuple):
@@ -49,7 +52,9 @@ class Supports(NamedTuple):
     free_displacements : (f,) array of int
         Displacements that are free unknowns themselves, the first of these.
     springs : (n,) array
-        Springs to the ground [N/m, N m/rad].
+        Springs to the ground, where each parameter that scales some is one [N/m, N m/rad].
+    scaled_springs : dict of str to (n,) array
+        The springs that each parameter scales, which are parts of these.
     motions : tuple of SupportMotion
         Support motions that are unknowns: those of rigid sets on springs and, if the supports
         yield, the motions that would be held, which come last.
@@ -58,12 +63,20 @@ class Supports(NamedTuple):
     expansion: sparse.csr_array
     free_displacements: IntArray
     springs: FloatArray
+    scaled_springs: dict[str, FloatArray]
     motions: tuple[SupportMotion, ...] = ()
 
     @property
     def stiffness(self) -> sparse.csr_array:
-        """Stiffness (n, n) of the springs."""
+        """Stiffness (n, n) of the springs, where each parameter that scales some is one."""
         return sparse.diags_array(self.springs).tocsr()
+
+    @property
+    def springs_by_parameter(self) -> dict[str | None, FloatArray]:
+        """The springs (n,) that no parameter scales, if there are any, and those of each."""
+        unscaled = self.springs - sum(self.scaled_springs.values(), np.zeros(len(self.springs)))
+        constant: dict[str | None, FloatArray] = {None: unscaled} if unscaled.any() else {}
+        return constant | dict(self.scaled_springs.items())
 
 
 def supports(
@@ -91,7 +104,7 @@ def supports(
     identity = sparse.eye_array(is_free.size, format="csc")
     expansion = sparse.hstack((identity[:, free_displacements], *body_expansions))
     all_springs = np.concatenate((springs.ravel()[free_displacements], *body_springs))
-    return Supports(expansion.tocsr(), free_displacements, all_springs)
+    return Supports(expansion.tocsr(), free_displacements, all_springs, {})
 
 
 def _body_expansion(
@@ -121,10 +134,13 @@ class _NodeSupports:
         Whether each displacement is held.
     springs : (nodes, 3) array
         Springs to the ground [N/m].
+    scaled_springs : dict of str to (nodes, 3) array
+        The parts of them that each parameter scales.
     """
 
     held: BoolArray
     springs: FloatArray
+    scaled_springs: dict[str, FloatArray]
 
     @property
     def resists(self) -> BoolArray:
@@ -155,6 +171,7 @@ def supports_of_design(
     nodal = _NodeSupports(
         held=np.zeros(shape, dtype=bool),
         springs=np.zeros(shape),
+        scaled_springs={},
     )
     for label, support in design.numbered("support"):
         nodes = mesh.nodes_of(support.set, label)
@@ -166,7 +183,11 @@ def supports_of_design(
         if support.springs is not None:
             spring_of_node = np.asarray(support.springs) / len(nodes)
             nodal.springs[nodes] += spring_of_node
-    nodal.springs[nodal.held] = 0.0
+            if support.scaled_by is not None:
+                scaled = nodal.scaled_springs.setdefault(support.scaled_by, np.zeros(shape))
+                scaled[nodes] += spring_of_node
+    for springs in (nodal.springs, *nodal.scaled_springs.values()):
+        springs[nodal.held] = 0.0
     _check_no_shared_nodes(mesh, nodal, bodies)
     rigid_sets = tuple(bodies.values())
     _check_rigid_motions(mesh, nodal, rigid_sets)
@@ -176,7 +197,9 @@ def supports_of_design(
     ]
     first_of_bodies = len(held_supports.free_displacements)
     sprung = _sprung_motions(sets_of_bodies, rigid_sets, first_of_bodies)
-    held_supports = held_supports._replace(motions=sprung)
+    held_supports = held_supports._replace(
+        motions=sprung, scaled_springs=_scaled_springs(held_supports, nodal, rigid_sets)
+    )
     if not yielding:
         return held_supports
     held = dict(_held_motions(design, mesh))
@@ -185,6 +208,25 @@ def supports_of_design(
             column = _body_expansion(mesh.points, body, np.arange(len(MOTIONS)) == number)
             held[set_name, MOTIONS[number]] = column
     return _with_unknown_motions(held_supports, held)
+
+
+def _scaled_springs(
+    held_supports: Supports, nodal: _NodeSupports, bodies: Iterable[RigidSet]
+) -> dict[str, FloatArray]:
+    """Return the springs (n,) on the free unknowns that each parameter scales."""
+    scaled: dict[str, FloatArray] = {}
+    count = len(held_supports.springs)
+    free = held_supports.free_displacements
+    for parameter, springs in nodal.scaled_springs.items():
+        scaled[parameter] = np.pad(springs.ravel()[free], (0, count - len(free)))
+    first = len(free)
+    for body in bodies:
+        springs = body.springs[~body.held]
+        if body.scaled_by is not None:
+            of_parameter = scaled.setdefault(body.scaled_by, np.zeros(count))
+            of_parameter[first : first + len(springs)] += springs
+        first += len(springs)
+    return scaled
 
 
 def _sprung_motions(
@@ -197,7 +239,9 @@ def _sprung_motions(
         for number in np.flatnonzero(~body.held).tolist():
             spring = float(body.springs[number])
             if spring > 0.0:
-                motions.append(SupportMotion(set_name, MOTIONS[number], unknown, spring))
+                motions.append(
+                    SupportMotion(set_name, MOTIONS[number], unknown, spring, body.scaled_by)
+                )
             unknown += 1
     return tuple(motions)
 
@@ -244,6 +288,10 @@ def _with_unknown_motions(
         expansion=expansion.tocsr(),
         free_displacements=held_supports.free_displacements,
         springs=np.pad(held_supports.springs, (0, len(columns))),
+        scaled_springs={
+            parameter: np.pad(springs, (0, len(columns)))
+            for parameter, springs in held_supports.scaled_springs.items()
+        },
         motions=held_supports.motions + motions,
     )
 
@@ -277,7 +325,13 @@ def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: st
     springs = np.zeros(len(MOTIONS))
     if support.springs is not None:
         springs[: len(support.springs)] = support.springs
-    return RigidSet(nodes, point, held=np.isin(MOTIONS, support.hold), springs=springs)
+    return RigidSet(
+        nodes,
+        point,
+        held=np.isin(MOTIONS, support.hold),
+        springs=springs,
+        scaled_by=support.scaled_by,
+    )
 
 
 def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatArray:

@@ -246,7 +246,7 @@ class StructureDesign(DesignSection):
 
     what: ClassVar[str]
     """The content of its files: "mesh" or "matrix"."""
-    scaled_table: ClassVar[str] = ""
+    scaled_tables: ClassVar[tuple[str, ...]] = ()
     """The tables whose stiffness a parameter may scale."""
     own_names: ClassVar[tuple[str, ...]] = ()
     """Further tables whose names must differ from one another."""
@@ -276,13 +276,16 @@ class StructureDesign(DesignSection):
         groups_of_tables += [(key,) for key in self.own_names]
         for keys in groups_of_tables:
             yield from self._equal_names(keys)
-        table = self.scaled_table
-        if table:
+        if self.scaled_tables:
             yield from self.wrong_ties(
-                table, "scaled_by", "parameter", tied="is scaled by", untied=f"scales no {table}"
+                self.scaled_tables,
+                "scaled_by",
+                "parameter",
+                tied="is scaled by",
+                untied=f"scales no {' or '.join(self.scaled_tables)}",
             )
         yield from self.wrong_ties(
-            "load",
+            ("load",),
             "control",
             "control",
             tied="is tied to the control",
@@ -302,14 +305,14 @@ class StructureDesign(DesignSection):
                 )
 
     def wrong_ties(
-        self, table: str, key: str, named_table: str, *, tied: str, untied: str
+        self, tables: tuple[str, ...], key: str, named_table: str, *, tied: str, untied: str
     ) -> Iterator[Check]:
-        """Yield the checks that rows of a table refer to names of another, and that each is used.
+        """Yield the checks that rows of tables refer to names of another, and that each is used.
 
         Parameters
         ----------
-        table, key : str
-            The table whose rows refer to names, and the key that holds the name.
+        tables, key
+            The tables whose rows refer to names, and the key that holds the name.
         named_table : str
             The table whose rows have these names.
         tied, untied : str
@@ -317,7 +320,10 @@ class StructureDesign(DesignSection):
             which no row refers.
         """
         known_names = [row.name for row in getattr(self, named_table)]
-        place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}
+        place_of_name = {}
+        for table in tables:
+            for place, row in self.numbered(table):
+                place_of_name[getattr(row, key)] = place
         for name, place in place_of_name.items():
             is_unknown = name is not None and name not in known_names
             yield is_unknown, f"{place} {tied} {name!r}, but no [[{named_table}]] has that name"

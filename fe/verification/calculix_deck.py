@@ -187,6 +187,15 @@ class CalculixDeck:
             cells = np.flatnonzero(material_of_cell == number)
             yield Material(at_temperatures, density, cells)
 
+    @property
+    def _springs(self) -> FloatArray:
+        """The springs (n,) of the supports in this state [N/m, N m/rad]."""
+        parameters = self.structure.parameters | self.structure.split_values(self.values).parameters
+        springs = np.zeros(len(self.body.supports.springs))
+        for parameter, part in self.body.supports.springs_by_parameter.items():
+            springs += part if parameter is None else parameters[parameter] * part
+        return springs
+
     @cached_property
     def probes(self) -> FloatArray:
         """Rows (m, n) on the free unknowns of the outputs that are compared."""
@@ -224,7 +233,7 @@ class CalculixDeck:
             cells=numbered_cells,
             motion_nodes=range(first_motion_node, first_corner),
             held=map(_node_and_direction, (*np.flatnonzero(is_held), *unused)),
-            springs=[*self.terms(supports.springs)],
+            springs=[*self.terms(self._springs)],
             blocks=[(block.mass, self._corner_positions(block)) for block in blocks],
             block_side=_BLOCK_SIDE,
             probe_nodes=range(first_probe, last_probe + 1),

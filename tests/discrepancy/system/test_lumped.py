@@ -203,7 +203,7 @@ def on_joint(modes: int, beta: float) -> LinearSystem:
 def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
     system = on_joint(how.pop("modes", 3), beta)
     acts = port_laws(ModelPatch(items), list(system.ports))
-    excitation = Excitation(time, time, initial=np.zeros((0, 2)), release=ReleasePoint(row, RELEASE))
+    excitation = Excitation(time, time, initial=np.zeros((0, 2)), release=ReleasePoint(row, row, RELEASE))
     return simulate_motion(system, excitation, acts, **how)
 
 

@@ -1,9 +1,13 @@
 """A mass at a place, and a patch of a mesh that loses stiffness, are causes that are tried."""
 
+import numpy as np
 import pytest
 
+from discrepancy.system.interface import NO_PATCH
+from discrepancy.system.system_state import SystemState
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, PlaceMass
 from tests.discrepancy.rigs import chosen, setting_of, simulated
 
 RIVALS = chosen("added_mass", "support_compliance", "region_stiffness_loss", "gauge_gain", "clock_error")
@@ -20,9 +24,37 @@ def test_it_is_named_at_its_place_with_its_size(beam_model, identifier: str) -> 
     verdict = investigate(campaign, beam_model, RIVALS, seed=3, thorough=False).verdict
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert [(effect.identifier, effect.place) for effect in verdict.effects] == [(identifier, place)]
-    (parameter,) = verdict.effects[0].parameters
+    parameter = verdict.effects[0].parameters[0]
     (value,) = values.values()
     assert parameter.low < value < parameter.high
+
+
+def test_a_mass_beside_a_point_is_named_with_its_distance(beam_model) -> None:
+    place = "the point (100, 20, 10) mm"
+    hidden = ("added_mass", {"mass_ratio": 0.2, "along_ratio": -0.6}, place)
+    campaign = simulated(beam_model, "laboratory", 3, hidden)
+    verdict = investigate(campaign, beam_model, RIVALS, seed=3, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NAMED, verdict.sentence
+    (effect,) = verdict.effects
+    assert effect.identifier == "added_mass"
+    (mass,) = effect.patch
+    assert isinstance(mass, PlaceMass)
+    reach = beam_model.mass_reaches[place]
+    true_point = beam_model.point_of_mass(PlaceMass(place, 0.1, along=-0.6 * reach)).point
+    point = beam_model.point_of_mass(mass).point
+    assert np.linalg.norm(point - true_point) < 0.5 * reach
+
+
+def test_a_mass_shows_by_its_weight_at_rest(beam_model) -> None:
+    """Under the load factor one, a mass of 0.1 kg at the end moves the tip as a force of 0.981 N."""
+    lifts = []
+    for mass in (0.0, 0.1):
+        patch = ModelPatch((PlaceMass("end", mass),))
+        state = SystemState(tuple(beam_model.prior_mean().tolist()), (0.0, 0.0), patch)
+        lifts.append(beam_model.lift_loads(state, NO_PATCH)[0])
+    added = lifts[1] - lifts[0]
+    push = beam_model.force_row("push", state)
+    np.testing.assert_allclose(added, -0.981 * push, atol=1e-6 * np.abs(push).max())
 
 
 def test_places_of_masses_are_sets_and_points(beam_model) -> None:

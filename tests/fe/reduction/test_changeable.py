@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import sparse
 from scipy.optimize import brentq
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
@@ -28,6 +29,7 @@ from fe.runtime.patch import (
 from fe.structure.affine import AffineStructure
 from fe.structure.candidates import GAUGE_STEP, gauge_shifts, loss_places, mass_places
 from fe.structure.gauges import gauge_rows
+from fe.structure.nodal_loads import point_weights
 from fe.structure.operators import Structure, assemble_structure
 
 WriteBeam = Callable[..., Path]
@@ -50,7 +52,11 @@ INNER_PUSH = {
 }
 """Load and outputs between the supports."""
 FLANGE = """support = [{ set = "root", rigid_about = [0, 10, 5], \
-hold = ["x", "y", "z", "rx", "rz"], springs = [0, 0, 0, 0, 2000.0, 0] }]"""
+hold = ["x", "y", "z", "rx", "rz"], springs = [0, 0, 0, 0, 2000.0, 0], scaled_by = "k" }]"""
+SCALED_SPRING = {
+    CLAMP_AT_ROOT: FLANGE,
+    'parameter = [{ name = "e" }]': 'parameter = [{ name = "e" }, { name = "k" }]',
+}
 PUSH = {"push": 50.0, "load_factor": 0.0}
 
 
@@ -81,7 +87,7 @@ class Yielding(NamedTuple):
         held = []
         for number, motion in enumerate(self.full.support_motions):
             if number in compliances:
-                spring = motion.spring
+                spring = motion.spring * values.get(motion.scaled_by or "", 1.0)
                 stiffness[motion.unknown, motion.unknown] += (
                     1.0 / compliances[number]
                     if spring == 0.0
@@ -127,7 +133,7 @@ def propped(write_beam: WriteBeam, tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.fixture(scope="module")
 def flanged(write_beam: WriteBeam, tmp_path_factory: pytest.TempPathFactory) -> Yielding:
     """The beam behind a rigid flange, which turns about y against a spring."""
-    return yielding_beam(write_beam(tmp_path_factory.mktemp("flanged"), {CLAMP_AT_ROOT: FLANGE}))
+    return yielding_beam(write_beam(tmp_path_factory.mktemp("flanged"), SCALED_SPRING))
 
 
 def test_a_clamp_that_turns_moves_the_tip_and_no_strain(slender: Yielding) -> None:
@@ -181,7 +187,7 @@ def test_both_ends_of_the_range_are_those_of_the_full_model(
     """In a state with losses, for outputs and frequencies."""
     made: Yielding = request.getfixturevalue(beam)
     motion = made.full.support_motions[number]
-    values = {"z1": 0.5, "z2": 0.3, **PUSH}
+    values = {"z1": 0.5, "z2": 0.3, **PUSH} | ({"k": 1.08} if beam == "flanged" else {})
     compliance = gain / float(made.model.compliance_gains(made.model.vector())[number].max())
     expected, frequency = made.full_answers({number: compliance}, values)
     structure = made.changed(
@@ -196,6 +202,14 @@ def test_both_ends_of_the_range_are_those_of_the_full_model(
 @pytest.mark.parametrize("beam", ["slender", "propped", "flanged"])
 def test_the_stated_errors_are_small(request, beam: str) -> None:
     assert request.getfixturevalue(beam).model.change_errors.max() < 1e-3
+
+
+def test_a_parameter_scales_a_spring(flanged: Yielding, write_beam, tmp_path: Path) -> None:
+    stiffer = {**SCALED_SPRING, CLAMP_AT_ROOT: FLANGE.replace("2000.0", "2160.0")}
+    other = assemble_structure(write_beam(tmp_path, stiffer))
+    squares, _ = lowest_eigenpairs(other.stiffness(), other.mass(other.masses), 4)
+    scaled = flanged.changed(values={"k": 1.08})
+    assert scaled.modes.frequency[:4] == pytest.approx(np.sqrt(squares) / (2.0 * np.pi), rel=1e-4)
 
 
 def test_two_supports_may_yield_at_once(propped: Yielding) -> None:
@@ -316,6 +330,25 @@ def test_an_added_mass_has_the_frequencies_of_the_full_model(propped: Yielding) 
     assert structure.modes.frequency[:4] == pytest.approx(
         np.sqrt(squares) / (2.0 * np.pi), rel=1e-3
     )
+
+
+def test_a_mass_beside_a_point_has_the_frequencies_of_one_there(propped: Yielding) -> None:
+    """On a coarse mesh, where the point itself would be wrong by five times as much."""
+    model = propped.model
+    number = int(np.argmin(np.abs(model.mass_points[:, 0] - 0.05)))
+    along, across = model.mass_axes[number] @ np.array([0.006, 0.0, 0.0])
+    beside = PlaceMass(model.mass_places[number], 0.01, along=along, across=across)
+    frequencies = propped.changed(beside).modes.frequency[:2]
+    point = 1e3 * (model.mass_points[number] + np.array([0.006, 0.0, 0.0]))
+    full = propped.full.with_held_supports()
+    weights = point_weights(full.mesh, tuple(point.tolist()), "the mass")
+    rows = sparse.kron(weights[np.newaxis], sparse.eye_array(3)) @ full.expansion
+    mass = (full.mass(full.masses) + 0.01 * (rows.T @ rows)).tocsr()
+    squares, _ = lowest_eigenpairs(full.stiffness(), mass, 2)
+    expected = np.sqrt(squares) / (2.0 * np.pi)
+    at_point = propped.changed(PlaceMass(model.mass_places[number], 0.01)).modes.frequency[:2]
+    assert np.abs(at_point / expected - 1.0).max() > 3e-3
+    assert frequencies == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_mass_that_is_added_and_lost_changes_nothing(propped: Yielding) -> None:

@@ -11,9 +11,10 @@ from fe.reduction.change_basis import with_changes
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangedStructure
-from fe.runtime.errors import InvalidPatchError
+from fe.runtime.errors import InvalidDesignError, InvalidPatchError
 from fe.runtime.patch import (
     GaugeOffset,
+    LoadGain,
     LoadTilt,
     ModelPatch,
     PlaceMass,
@@ -22,7 +23,7 @@ from fe.runtime.patch import (
 )
 from fe.structure.changed_file import changed_tables
 from fe.structure.operators import assemble_structure
-from reporting.formats.toml_file import toml_text
+from reporting.formats.toml_file import read_toml, toml_text
 
 WriteBeam = Callable[..., Path]
 
@@ -68,6 +69,35 @@ def test_a_file_states_a_support_that_yields_a_mass_and_a_load_that_leans(
     assert frequencies[:3] == pytest.approx(structure.modes.frequency[:3], rel=2e-3)
 
 
+def test_a_file_states_a_patch_that_lost_stiffness_and_a_mass_beside_a_point(
+    write_beam: WriteBeam, tmp_path: Path
+) -> None:
+    """The mass lies 3 mm beside a named point at the tip."""
+    file = write_beam(tmp_path, cells=4)
+    yielding = assemble_structure(file, yielding=True)
+    model = with_changes(yielding, reduce_structure(yielding.with_held_supports()))
+    place = int(np.argmax(model.mass_points[:, 0] * (model.mass_reaches > 0.0)))
+    along = -3e-3 * float(np.sign(model.mass_axes[place, 0, 0]))
+    patch = ModelPatch(
+        (
+            RegionStiffnessLoss(model.loss_places[-1], 0.4),
+            PlaceMass(model.mass_places[place], 0.005, along=along),
+        )
+    )
+    of_region = ModelPatch((RegionStiffnessLoss("z1", 0.2),))
+    changed = written(file, tmp_path / "changed", patch + of_region)
+    (*_, mass) = read_toml(changed, InvalidDesignError, what="structure file")["mass"]
+    expected_point = model.mass_points[place] + along * model.mass_axes[place, 0]
+    assert mass["point"] == pytest.approx(1e3 * expected_point, abs=0.5)
+    outputs, frequencies = full_answers(changed)
+    structure = ChangedStructure(model, model.vector({"z1": 0.2}), patch)
+    of_push = model.load_factors[:, 0] == 1 + model.controls.index("push")
+    load = 50.0 * structure.basis.T @ model.whole_load[of_push].sum(axis=0)
+    expected = model.whole_output[: len(outputs)] @ structure.basis @ structure.static(load)
+    assert outputs == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected[:1]).max())
+    assert frequencies[:2] == pytest.approx(structure.modes.frequency[:2], rel=2e-3)
+
+
 def test_a_file_states_a_gauge_beside_its_place(write_beam: WriteBeam, tmp_path: Path) -> None:
     file = write_beam(tmp_path, cells=2)
     patch = ModelPatch((GaugeOffset("g1", "along", 2e-3),))
@@ -79,7 +109,8 @@ def test_a_file_states_a_gauge_beside_its_place(write_beam: WriteBeam, tmp_path:
     ("primitive", "sentence"),
     [
         (PlaceMass("root", -0.1), "a mass must be positive"),
-        (RegionStiffnessLoss("around", 0.3), "it has no table for this"),
+        (RegionStiffnessLoss("around", 0.3), "the mesh has no cells 'around'"),
+        (LoadGain(0.1, 0.0), "it has no table for this"),
     ],
 )
 def test_what_a_file_cannot_state_is_refused(

@@ -228,6 +228,25 @@ def test_terms_make_the_stiffness_that_a_changed_file_makes(cantilever, two_mate
     assert difference < 1e-12 * abs(stiffness).max()
 
 
+def test_a_material_may_have_several_sets(cantilever, make_structure):
+    outer = (
+        '[[set]]\nname = "outer"\nof = "cells"\nbox = [[250, 0, 0], [1000, 60, 10]]\n[[support]]'
+    )
+    both = make_structure(
+        "cantilever",
+        ('scaled_by = "e"\n', 'set = ["inner", "outer"]\nscaled_by = "e"\n'),
+        ("[[support]]", outer),
+    )
+    assert abs(both.stiffness() - cantilever.stiffness()).max() == 0.0
+
+
+def test_a_stiffness_loss_is_that_of_a_damage_region(cantilever, make_structure):
+    loss = '[[stiffness_loss]]\nset = "inner"\nfraction = 0.3\n[[support]]'
+    softer = make_structure("cantilever", ("[[support]]", loss))
+    expected = cantilever.stiffness(None, {"z1": 0.3})
+    assert abs(softer.stiffness() - expected).max() < 1e-12 * abs(expected).max()
+
+
 def test_a_free_mass_makes_the_mass_that_a_fixed_one_makes(cantilever, two_materials):
     mass = cantilever.mass()
 
