@@ -178,7 +178,6 @@ def _no_strain_across(effect: EffectInSetting) -> str | None:
 
 NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
     "trial": _no_trial,
-    "motion or weight": _no_motion_or_weight,
     "event": _no_event,
     "law": _no_law,
     "place": _no_place,
@@ -191,6 +190,7 @@ NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
     "second clock": _no_second_clock,
     "input": _no_input,
     "strain across": _no_strain_across,
+    "motion or weight": _no_motion_or_weight,
 }
 """Functions that return why a need is not met, or None, by the word in the file."""
 

@@ -14,6 +14,7 @@ from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.interface import NO_PATCH, MassPoint
 from discrepancy.system.linear_system import LinearSystem, SolvedStructure
 from discrepancy.system.load_change import choose_load_place
+from discrepancy.system.mesh_errors import WithMeshErrors, mesh_errors_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.response import ACROSS, Conditions, Outputs, Place, Response
 from discrepancy.system.scales import Scales
@@ -24,7 +25,6 @@ from fe.runtime import patch as changes
 from fe.runtime.changeable import (
     KEPT_SUBSPACES,
     ChangeableModel,
-    ChangedModes,
     ChangedStructure,
 )
 from fe.runtime.patch import (
@@ -45,14 +45,6 @@ ROUNDING = 1e-9
 """Differences of two rows below this fraction of the largest entry are rounding errors."""
 LARGEST_LOSS = 0.7
 """Largest loss of stiffness of a patch that is compared."""
-MESH_DEVIATION = 0.01
-"""Standard deviation of the relative error of a frequency by the mesh. A ring-down shows a
-frequency to a few parts in 10^5, while a mesh of ordinary fineness has errors of 0.1 to 1.5 percent
-that differ from mode to mode: without an allowance they would be named a soft support."""
-LARGEST_MESH_ERROR = 0.05
-"""Largest relative error of a frequency by the mesh that is fitted."""
-MODES_OF_MESH_ERRORS = 4
-"""Number of modes whose frequencies may differ by the mesh; readings hardly show higher ones."""
 
 
 class StructureWithMatrices(SolvedStructure, Protocol):
@@ -106,7 +98,7 @@ class StructureModel(SystemModel):
         self.largest_losses = {region: model.validity[region][1] for region in model.regions}
         self.parameters = _parameter_priors(model)
         if isinstance(model, ChangeableModel):
-            mesh_errors = _mesh_errors(model)
+            mesh_errors = mesh_errors_of(model)
             self.parameters += mesh_errors
             self.nuisance_parameters = frozenset(error.name for error in mesh_errors)
         # loads
@@ -127,25 +119,7 @@ class StructureModel(SystemModel):
         # outputs
         names = (*model.gauges, *model.displacements, *model.accelerations)
         if isinstance(model, ChangeableModel):
-            self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
-            self.mass_places = model.mass_places
-            reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
-            self.shows_weight = bool(model.load_accelerations.any())
-            self.mass_reaches = {place: reach for place, reach in reaches if reach > 0.0}
-            self.loss_places = model.loss_places
-            with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
-            self.places_with_gauges = frozenset(model.loss_places[number] for number in with_gauges)
-            self.largest_losses |= dict.fromkeys(model.loss_places, LARGEST_LOSS)
-            self.length = model.size
-            self.load_changes = tuple(
-                zip(
-                    model.load_controls,
-                    model.load_change_kinds,
-                    model.load_change_axes,
-                    strict=True,
-                )
-            )
-            self.gauge_shifts = tuple(zip(model.shifted_gauges, model.shift_axes, strict=True))
+            self._name_changes(model)
             rows, self._unit_loads = model.whole_output, model.whole_load.T
         else:
             rows = np.concatenate((model.output_rows, model.acceleration_rows))
@@ -165,6 +139,29 @@ class StructureModel(SystemModel):
             self._check_direction_is_new(port, row)
             self.port_rows[port] = row
         self.ports = tuple(self.port_rows)
+
+    def _name_changes(self, model: ChangeableModel) -> None:
+        """Set the attributes that say which changes the structure may have."""
+        self.support_motions = tuple(zip(model.supports, model.motions, strict=True))
+        self.mass_places = model.mass_places
+        reaches = zip(model.mass_places, model.mass_reaches.tolist(), strict=True)
+        self.shows_weight = bool(model.load_accelerations.any())
+        self.mass_reaches = {place: reach for place, reach in reaches if reach > 0.0}
+        self.loss_places = model.loss_places
+        with_gauges = np.unique(model.patch_of_gauge[model.patch_of_gauge >= 0]).tolist()
+        self.places_with_gauges = frozenset(model.loss_places[number] for number in with_gauges)
+        losses_of_patches = dict.fromkeys(model.loss_places, LARGEST_LOSS)
+        self.largest_losses = {**self.largest_losses, **losses_of_patches}
+        self.length = model.size
+        self.load_changes = tuple(
+            zip(
+                model.load_controls,
+                model.load_change_kinds,
+                model.load_change_axes,
+                strict=True,
+            )
+        )
+        self.gauge_shifts = tuple(zip(model.shifted_gauges, model.shift_axes, strict=True))
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
         """Return the rows (n,) of the displacement outputs along which a force acts, by name.
@@ -405,7 +402,7 @@ class StructureModel(SystemModel):
         ports = {name: rows[PORT_PREFIX + name] for name in self.port_rows}
         # the parameters after the inputs of the reduced model are the errors of the mesh
         errors = np.array(state.parameters[len(self._inputs_of(state)) :])
-        solved = _WithMeshErrors(structure, errors) if errors.any() else None
+        solved = WithMeshErrors(structure, errors) if errors.any() else None
         return linear_system(structure, self.model.damping, ports, solved)
 
     @cached_property
@@ -462,22 +459,6 @@ def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     return tuple(priors)
 
 
-def _mesh_errors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
-    """Return the priors of the relative errors of the lowest frequencies by the mesh."""
-    return tuple(
-        ParameterPrior(
-            f"mesh_mode_{number}",
-            "1",
-            0.0,
-            MESH_DEVIATION,
-            -LARGEST_MESH_ERROR,
-            LARGEST_MESH_ERROR,
-            title=f"frequency error of the mesh in mode {number}",
-        )
-        for number in range(1, 1 + min(model.mode_count, MODES_OF_MESH_ERRORS))
-    )
-
-
 def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
     """Return the rows of strains near gauges, by output.
 
@@ -491,24 +472,6 @@ def _strains_near_gauges(model: ChangeableModel) -> dict[str, FloatArray]:
     shifts = zip(model.shifted_gauges, model.shift_axes, model.shift_output, strict=True)
     rows |= {f"{gauge}.{axis}": derivatives for gauge, axis, derivatives in shifts}
     return rows
-
-
-class _WithMeshErrors:
-    """A solved structure whose lowest frequencies differ by relative errors of its mesh.
-
-    Shapes and flexibility are those of the structure.
-    """
-
-    def __init__(self, structure: StructureWithMatrices, errors: FloatArray) -> None:
-        self._structure = structure
-        frequency = structure.modes.frequency.copy()
-        frequency[: len(errors)] *= 1.0 + errors
-        self.modes = ChangedModes(frequency, structure.mode_shapes)
-        self.mode_shapes = structure.mode_shapes
-
-    def static(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, for loads (k,) or (k, m)."""
-        return self._structure.static(loads)
 
 
 def _is_at_port(name: str) -> bool:

@@ -39,15 +39,7 @@ from discrepancy.system.system_state import (
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    LOADS,
-    STRUCTURE,
-    LoadOffset,
-    LoadTilt,
-    ModelPatch,
-    PortLoad,
-)
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.port_laws import NO_LAWS, PortLaws, port_laws
 
 
@@ -216,7 +208,7 @@ class SystemModel(Model):
                     'time can act on; set kind = "driven" and begins = "unknown".'
                 )
             row = self.force_row(trial.load_place, case.state)
-            changes_of_load = case.patch.of(LoadOffset, LoadTilt)
+            changes_of_load = case.patch.of(changes.LoadOffset, changes.LoadTilt)
             pull = row
             if len(changes_of_load):
                 pull = self.force_row(trial.load_place, case.state, changes_of_load)

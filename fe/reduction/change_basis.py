@@ -19,22 +19,19 @@ from scipy import sparse
 from scipy.linalg import eigh
 
 from fe.full.subspace import OrthonormalBasis, affine_product, solve_near
-from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangeableModel, ChangedStructure
 from fe.runtime.patch import ModelPatch, PlaceMass, RegionStiffnessLoss, SupportCompliance
-from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, SupportMotion
 from fe.structure.candidates import (
     LossCandidate,
     MassCandidate,
-    gauge_shifts,
     load_changes,
     loss_places,
     mass_places,
-    strains_across,
 )
-from fe.structure.operators import Structure
 
+from .change_model import PossibleChanges, WholeColumns, model_on_columns
 from .changed_case import ChangedCase, case_error
 from .reduced_basis import Reduction
 from .terms import ReductionTerms, cube_corners
@@ -59,8 +56,8 @@ LARGE_LOSSES = (0.45, 0.7)
 """Losses of patches for which solutions are computed."""
 LEAST_LOSS_REMAINDER = 1e-3
 """The same as `LEAST_REMAINDER` for changes of solutions by a loss, relative to the solutions."""
-MASS_RANGE = (0.01, 0.5)
-"""Range of masses in which the errors are measured: the largest relative gain of a modal mass."""
+LARGEST_MASS_GAIN = 0.5
+"""Mass with which the errors are measured: the largest relative gain of a modal mass."""
 DIAGONAL = 0.7
 """Distance along and across a location at which the errors are measured, too, over its reach."""
 LOSS_RANGE = (0.05, 0.7)
@@ -247,100 +244,16 @@ class _Columns:
 
     def model(self) -> ChangeableModel:
         """Return the model on all columns; its errors are not measured yet."""
-        columns = np.concatenate(self.blocks, axis=1)
-        terms = self.terms
-        # a load that acts on held nodes alone is none of the reduced model
-        factors = terms.load_factors.tolist()
-        loads = [
-            terms.loads[:, factors.index(row)] for row in self.held_terms.load_factors.tolist()
-        ]
-        outputs = np.concatenate(
-            (terms.outputs.T, self.structure.acceleration_output.toarray()), axis=0
+        whole = WholeColumns(np.concatenate(self.blocks, axis=1), np.concatenate(self.owners))
+        changes = PossibleChanges(self.mass_places, self.loss_places, self.load_changes)
+        return model_on_columns(
+            self.structure,
+            self.reduction.model,
+            self.terms,
+            self.held_terms.load_factors,
+            whole,
+            changes,
         )
-        motions = self.structure.support_motions
-        rows = np.array([columns[motion.unknown] for motion in motions])
-        lower = np.tril_indices(columns.shape[1])
-        parts = []
-        for number, patch in enumerate(self.loss_places):
-            for term, matrix in patch.terms.items():
-                (projected,) = _projected((matrix,), columns)
-                parts.append((number, term, projected))
-        model = self.reduction.model
-        shifts = gauge_shifts(self.structure)
-        return ChangeableModel(
-            **{field.name: getattr(model, field.name) for field in fields(ReducedModel)},
-            whole_stiffness=_projected(terms.stiffness_terms, columns),
-            whole_mass=_projected(self.structure.mass_terms, columns),
-            whole_load=np.array(loads) @ columns,
-            load_accelerations=self._load_accelerations(),
-            whole_output=outputs @ columns,
-            column_owner=np.concatenate(self.owners),
-            supports=tuple(motion.support for motion in motions),
-            motions=tuple(motion.motion for motion in motions),
-            support_rows=rows.reshape(len(motions), columns.shape[1]),
-            support_springs=np.array([motion.spring for motion in motions], dtype=np.float64),
-            spring_parameters=np.array(
-                [_parameter_number(self.structure, motion.scaled_by) for motion in motions],
-                dtype=np.int64,
-            ),
-            mass_places=tuple(place.name for place in self.mass_places),
-            mass_rows=np.array([place.rows @ columns for place in self.mass_places]).reshape(
-                len(self.mass_places), 3, columns.shape[1]
-            ),
-            mass_slopes=np.array([place.slopes @ columns for place in self.mass_places]).reshape(
-                len(self.mass_places), 15, columns.shape[1]
-            ),
-            mass_points=np.array([place.point for place in self.mass_places]).reshape(-1, 3),
-            mass_axes=np.array([place.axes for place in self.mass_places]).reshape(-1, 2, 3),
-            mass_reaches=np.array([place.reach for place in self.mass_places], dtype=np.float64),
-            loss_places=tuple(patch.name for patch in self.loss_places),
-            loss_patch=np.array([patch for patch, _, _ in parts], dtype=np.int64),
-            loss_term=np.array([term for _, term, _ in parts], dtype=np.int64),
-            loss_stiffness=np.array([matrix[lower] for _, _, matrix in parts]).reshape(
-                len(parts), len(lower[0])
-            ),
-            patch_of_gauge=self._patch_of_gauges(),
-            size=self.structure.mesh.size if isinstance(self.structure, Structure) else 1.0,
-            load_controls=tuple(change.control for change in self.load_changes),
-            load_change_kinds=tuple(change.change for change in self.load_changes),
-            load_change_axes=tuple(change.axis for change in self.load_changes),
-            load_changes=np.array(
-                [change.vector @ columns for change in self.load_changes]
-            ).reshape(len(self.load_changes), columns.shape[1]),
-            load_curvatures=np.array(
-                [change.curvature @ columns for change in self.load_changes]
-            ).reshape(len(self.load_changes), columns.shape[1]),
-            shifted_gauges=tuple(shift.gauge for shift in shifts),
-            shift_axes=tuple(shift.axis for shift in shifts),
-            shift_output=np.array([shift.rows @ columns for shift in shifts]).reshape(
-                len(shifts), 2, columns.shape[1]
-            ),
-            across_output=np.array([rows @ columns for rows in strains_across(self.structure)]),
-            change_errors=np.zeros(len(motions) + len(self.mass_places) + len(self.loss_places)),
-        )
-
-    def _patch_of_gauges(self) -> IntArray:
-        """Return the index (G,) of the patch on which each gauge sits, -1 for none."""
-        patch_of_gauge = np.full(len(self.structure.gauges), -1, dtype=np.int64)
-        for number, patch in enumerate(self.loss_places):
-            patch_of_gauge[list(patch.gauges)] = number
-        return patch_of_gauge
-
-    def _load_accelerations(self) -> FloatArray:
-        """Return the acceleration (L, 3) by each load of the model, per unit of its control."""
-        structure = self.structure
-        of_control: dict[int, FloatArray] = {}
-        controls = [None, *structure.controls]
-        for load in structure.design.load:
-            if load.acceleration is not None:
-                number = controls.index(structure.loads[load.name])
-                earlier = of_control.get(number, np.zeros(3))
-                of_control[number] = earlier + np.asarray(load.acceleration)
-        rows = [
-            of_control.get(control, np.zeros(3)) if mass == 0 else np.zeros(3)
-            for control, mass in self.held_terms.load_factors.tolist()
-        ]
-        return np.array(rows).reshape(-1, 3)
 
     def add_mass(self, place: MassCandidate) -> None:
         """Add the columns of a point mass: the static responses to forces at its location.
@@ -348,16 +261,18 @@ class _Columns:
         Those to forces beside the location are added as far as they differ from these.
         """
         number = 1 + len(self.structure.support_motions) + self._number_of(place)
-        rows = [place.rows]
+        self._add_remainders(number, self._unit_responses_to(place.rows))
         if place.reach > 0.0:
-            rows += [place.rows_beside(*ends) for ends in place.reach * np.array(BESIDE)]
-        forces = sparse.vstack(rows)[:, : self.free].toarray().T
-        block = self.factors.whitened(forces)
+            rows = [place.rows_beside(*ends) for ends in place.reach * np.array(BESIDE)]
+            responses = self._unit_responses_to(sparse.vstack(rows).tocsr())
+            self._add_remainders(number, responses, LEAST_REMAINDER_BESIDE)
+
+    def _unit_responses_to(self, rows: sparse.csr_array) -> FloatArray:
+        """Return the static responses (n, k) to forces along rows, whitened and of unit length."""
+        block = self.factors.whitened(rows[:, : self.free].toarray().T)
         lengths = np.linalg.norm(block, axis=0)
-        block = block[:, lengths > SAME_DIRECTION * lengths.max()]
-        block = block / np.linalg.norm(block, axis=0)
-        self._add_remainders(number, block[:, :3])
-        self._add_remainders(number, block[:, 3:], LEAST_REMAINDER_BESIDE)
+        is_moved = lengths > SAME_DIRECTION * lengths.max()
+        return np.asarray(block[:, is_moved] / lengths[is_moved])
 
     def _number_of(self, place: MassCandidate) -> int:
         """Return the index of a location where a mass may be."""
@@ -475,20 +390,16 @@ class _Columns:
         return solution
 
     def _case_with_mass(
-        self, model: ChangeableModel, number: int, gain: float, distance: float
+        self, model: ChangeableModel, number: int, distance: float
     ) -> "ChangedCase":
-        """Return the case of a point mass.
-
-        `gain` is the largest relative gain of a modal mass, `distance` that along and across its
-        location over the reach.
-        """
+        """Return the case of a point mass, at a distance along and across over the reach."""
         place = self.mass_places[number]
         beside = distance * place.reach
         vector = self._middle_vector(model)
         unchanged = ChangedStructure(model, vector, ModelPatch())
         shapes = unchanged.basis @ unchanged.mode_shapes
         largest = float(np.sum((model.mass_rows[number] @ shapes) ** 2, axis=0).max())
-        primitive = PlaceMass(place.name, gain / largest, beside, beside)
+        primitive = PlaceMass(place.name, LARGEST_MASS_GAIN / largest, beside, beside)
         structure = ChangedStructure(model, vector, ModelPatch((primitive,)))
         rows = place.rows_beside(beside, beside)
         mass = (self.mass + primitive.mass * (rows.T @ rows)).tocsr()
@@ -536,21 +447,7 @@ class _Columns:
             return [self._yielding_case(model, number, gain) for gain in GAIN_RANGE]
         if change < self._first_loss:
             place = change - self._first_mass
-            least, largest = MASS_RANGE
-            cases = [self._case_with_mass(model, place, gain, 0.0) for gain in (least, largest)]
-            if self.mass_places[place].reach > 0.0:
-                cases.append(self._case_with_mass(model, place, largest, DIAGONAL))
-            return cases
+            distances = (0.0, DIAGONAL) if self.mass_places[place].reach > 0.0 else (0.0,)
+            return [self._case_with_mass(model, place, distance) for distance in distances]
         patch = change - self._first_loss
         return [self._case_with_loss(model, patch, loss) for loss in LOSS_RANGE]
-
-
-def _parameter_number(structure: AffineStructure, name: str | None) -> int:
-    """Return the number of a parameter, from one; zero for none."""
-    return 0 if name is None else 1 + [*structure.parameters].index(name)
-
-
-def _projected(terms: tuple[sparse.csr_array, ...], columns: FloatArray) -> FloatArray:
-    """Project symmetric terms on columns (n, k): an array (T, k, k)."""
-    projected = np.array([columns.T @ (term @ columns) for term in terms])
-    return np.asarray(0.5 * (projected + projected.swapaxes(1, 2)))

@@ -220,7 +220,7 @@ def _slopes_about(
     coefficients /= np.array([reach, reach, reach**2, reach**2, reach**2])[:, np.newaxis]
     weights = sparse.lil_array((DERIVATIVES, len(points)))
     weights[:, neighbours] = coefficients
-    weights[:, [node]] -= coefficients.sum(axis=1, keepdims=True)
+    weights[:, node : node + 1] -= coefficients.sum(axis=1, keepdims=True)
     return axes[:2], weights.tocsr()
 
 

@@ -98,6 +98,10 @@ def unchanged_kinds(effect):
     kinds = {TrialKind.DRIVEN}  # there is none
     if effect.identifier == "point_mass":
         kinds |= {TrialKind.FLIGHT}  # the cantilever has no weight
+    if effect.identifier == "added_mass":
+        kinds |= {TrialKind.STATIC, TrialKind.FLIGHT}
+    if effect.identifier in ("load_offset", "load_direction"):
+        kinds |= {TrialKind.RINGDOWN}  # it is released from its one place
     if effect.identifier in WARM:
         kinds |= {TrialKind.FORCED, TrialKind.RINGDOWN, TrialKind.FLIGHT}  # one temperature in these trials
     return kinds

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fmpy import simulate_fmu
+from fmpy.validation import validate_fmu
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.reduction.change_basis import with_changes
+from fe.reduction.model_cache import reduced_model
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.arrays import FloatArray
 from fe.runtime.changeable import ChangedStructure
@@ -23,6 +26,7 @@ from fe.runtime.patch import (
 )
 from fe.structure.changed_file import changed_tables
 from fe.structure.operators import assemble_structure
+from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.formats.toml_file import read_toml, toml_text
 
 WriteBeam = Callable[..., Path]
@@ -96,6 +100,33 @@ def test_a_file_states_a_patch_that_lost_stiffness_and_a_mass_beside_a_point(
     expected = model.whole_output[: len(outputs)] @ structure.basis @ structure.static(load)
     assert outputs == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected[:1]).max())
     assert frequencies[:2] == pytest.approx(structure.modes.frequency[:2], rel=2e-3)
+
+
+def test_an_fmu_of_the_written_file_carries_a_loss_and_a_mass(
+    write_beam: WriteBeam, tmp_path: Path
+) -> None:
+    """Its displacement at rest and its frequencies are those of the full model of the file."""
+    file = write_beam(tmp_path, cells=4)
+    patch = ModelPatch(
+        (
+            RegionStiffnessLoss("around (37.5, 10, 5) mm", 0.4),
+            PlaceMass("the point (75, 20, 0) mm", 0.03),
+        )
+    )
+    changed = written(file, tmp_path / "changed", patch)
+    fmu = tmp_path / "changed.fmu"
+    build_fmu(reduced_model(changed), fmu)
+    assert validate_fmu(str(fmu)) == []
+    names = ["displacement.tip", "frequency[1]", "frequency[2]"]
+    values = {"push": 50.0, "load_factor": 0.0}
+    result = simulate_fmu(str(fmu), stop_time=0.01, start_values=values, output=names)
+    tip, *fmu_frequencies = [float(result[name][-1]) for name in names]
+    (*_, expected_tip), frequencies = full_answers(changed)
+    assert tip == pytest.approx(expected_tip, rel=2e-3)
+    assert fmu_frequencies == pytest.approx(frequencies[:2], rel=1e-3)
+    (*_, plain_tip), plain_frequencies = full_answers(file)
+    assert tip > 1.05 * plain_tip
+    assert frequencies[0] < 0.97 * plain_frequencies[0]
 
 
 def test_a_file_states_a_gauge_beside_its_place(write_beam: WriteBeam, tmp_path: Path) -> None:
