@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,11 +13,12 @@ from discrepancy.estimation.force_search import ForceSearch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit, try_fit
 from discrepancy.missing_force.gap_share import GapShare
-from discrepancy.missing_force.port_force import missing_force
+from discrepancy.missing_force.port_force import RELAXED_DISPLACEMENT, MissingForce, missing_force
 from discrepancy.missing_force.shares import ForceShares
 from discrepancy.search.fitted_candidates import ComparedHypothesis
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
+from fe.runtime.laws.interface import PortForce
 
 from .comparison import Comparison
 
@@ -87,8 +89,31 @@ class ForceComparison(Comparison[Estimate]):
         return self.search.exact_fits[candidate.key]
 
     def failed_check_reason(self, hypothesis: Estimate) -> str:
-        """Return an empty reason, as there are no further tests with a missing force."""
-        return ""
+        """Return why laws without memory are no name for a force with memory; empty if they may be.
+
+        A force that follows a relaxed displacement depends on the history of the motion. A law of
+        the present motion, above all one with a free exponent, takes the largest part of it, and
+        would be a false name.
+        """
+        if hypothesis.leaves_no_force or self._missing_force is None:
+            return ""
+        force = self._missing_force.at_port
+        relaxed = [name for name in force.ordered_by if name.startswith(RELAXED_DISPLACEMENT)]
+        patch = hypothesis.candidate.patch(self.problem.setting, hypothesis.effect)
+        laws_at_port = [
+            law for law in patch if isinstance(law, PortForce) and law.port == force.port
+        ]
+        if not relaxed or not laws_at_port or any(law.hysteretic for law in laws_at_port):
+            return ""
+        return (
+            f"the force follows {relaxed[0]}: it depends on the past motion, and its law on the "
+            "present one alone"
+        )
+
+    @cached_property
+    def _missing_force(self) -> MissingForce | None:
+        """The missing force without any effect, where it is most probable; None without one."""
+        return missing_force(self.force_search, self.force_search.best_port_estimate)
 
     def _compute_simulation(self, hypothesis: Estimate) -> CandidateFit:
         """Return the simulation with the parameters of a hypothesis, and their covariance.
@@ -136,10 +161,9 @@ class ForceComparison(Comparison[Estimate]):
 
     def gap_sentence(self) -> str:
         """Return a sentence on the size and port of the missing force, and on what it depends."""
-        force_of_best_port = missing_force(self.force_search, self.force_search.best_port_estimate)
-        if force_of_best_port is None:
+        if self._missing_force is None:
             return ""
-        force = force_of_best_port.at_port
+        force = self._missing_force.at_port
         return (
             f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}; "
             f"{force.dependence}."

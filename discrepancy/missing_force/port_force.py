@@ -39,6 +39,8 @@ follows the two together. On simulated rigs it is at most 0.5 for impacts with l
 NEIGHBOURS, CANDIDATE_NEIGHBOURS = 3, 100
 """Number of neighbours whose mean force predicts that of a sample, and of samples among which they
 are looked for."""
+RELAXED_DISPLACEMENT = "the displacement relaxed"
+"""How the names of variables begin that remember the motion."""
 RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
 """Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
@@ -440,7 +442,7 @@ def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialFor
     )
     if share_of_relaxation[best_time] < max(shares.values()) + TIED_SHARE:
         return list(trial_forces)
-    name = f"the displacement relaxed within {best_time:.2g} s"
+    name = f"{RELAXED_DISPLACEMENT} within {best_time:.2g} s"
     trials_with_history = []
     for trial in trial_forces:
         relaxed_in_trial = relaxed_displacement(trial.time, trial.speed, best_time)
