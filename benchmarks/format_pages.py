@@ -16,7 +16,7 @@ from pathlib import Path
 from reporting.files import atomic_write_text
 from reporting.formats import known_keys
 from reporting.formats.schema import JsonSchema, format_schema
-from reporting.formats.tables import PrintedTable, format_page, printed_tables
+from reporting.formats.tables import PrintedTable, markdown_of_format, printed_tables
 from uav_twin.formats import FORMATS, SCHEMA_FOLDER, FileFormat
 
 ROOT = Path(__file__).parents[1]
@@ -97,7 +97,7 @@ def _page_of(file_format: FileFormat, schema: JsonSchema, printed: list[PrintedT
         f"{file_format.name}` prints the JSON Schema. There is a [list of all "
         "formats](index.md).\n\n"
     )
-    return head + format_page(schema, file_format.notation, printed)
+    return head + markdown_of_format(schema, file_format.notation, printed)
 
 
 def outdated_files(files: dict[Path, str]) -> list[Path]:

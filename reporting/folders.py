@@ -158,30 +158,41 @@ def restore_folder(folder: Path) -> bool:
 
 
 def _restore_from(parking: Path, folder: Path) -> bool:
-    """Move the content that `replace_folder` had parked back, if its folder is missing.
+    """Move the content that `replace_folder` had parked back, if `folder` is missing.
 
-    If the folder is there and is the one that replaced this content, the content is removed. The
-    result says whether the content was moved back.
+    Returns whether the content was moved back. The parked content is
+
+    - left alone while another process has it locked;
+    - moved back if there is no folder;
+    - removed if the folder there is the one that replaced it;
+    - kept if the folder there is any other, which somebody else has made.
     """
     old_content = parking / folder.name
     if not old_content.is_dir():
         return False
+    # A process that replaces a folder holds the lock of the old content until it has finished. If
+    # the lock can be had, that process has ended.
     lock = lock_folder(old_content)
-    if lock is None:  # another process is replacing the folder at this moment
+    if lock is None:
         return False
     was_restored = False
     with closing_lock(lock), explained_write_errors(folder):
         if not folder.exists():
             old_content.rename(folder)
             was_restored = True
-        elif parking.name.startswith(_prefix(folder, _old_label(folder))):
-            # By its inode, the present folder is the one that replaced this content, so the old
-            # content is no longer needed. Any other folder was made by somebody else, and the old
-            # content is kept.
+        elif _was_replaced_by(parking, folder):
             shutil.rmtree(parking, ignore_errors=True)
-    with suppress(OSError):
+    with suppress(OSError):  # a parking folder that is not empty stays
         parking.rmdir()
     return was_restored
+
+
+def _was_replaced_by(parking: Path, folder: Path) -> bool:
+    """Return whether parked content was replaced by the folder that is there now.
+
+    The name of the parking folder contains the inode of the folder that was to replace the content.
+    """
+    return parking.name.startswith(_prefix(folder, _old_label(folder)))
 
 
 def _old_label(fresh: Path) -> str:

@@ -125,16 +125,23 @@ def _null(_: float) -> None:
 
 
 def plain(value: object, not_finite: Callable[[float], object] = _null) -> JsonDocument:
-    """Return a value as plain data of JSON.
+    """Return a value as plain data of JSON, with all values inside it.
 
-    A dataclass becomes an object with the fields that its constructor takes, an enum its value, an
-    array or a tuple a list, and an object with a method `to_list` what that returns. Keys become
-    texts. Any other value is returned as it is.
+    The first of these cases that holds decides:
+
+    - An object with a method `to_list` becomes the result of that method.
+    - An enum becomes its value.
+    - A dataclass becomes an object with the fields that its constructor takes.
+    - A mapping becomes an object, whose keys are texts.
+    - An array, tuple or list becomes a list, and a scalar of NumPy a number.
+    - A NaN or an infinity, which JSON lacks, is replaced by `not_finite`.
+    - Any other value is returned as it is.
 
     Parameters
     ----------
     not_finite : callable
-        Returns what replaces a NaN or an infinity, which JSON lacks; null by default.
+        Is called with a NaN or an infinity, and returns the value to write in its place; null by
+        default.
     """
     if hasattr(value, "to_list"):
         return value.to_list()

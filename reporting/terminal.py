@@ -146,16 +146,22 @@ LONGEST_NAME = 20
 LONGEST_WORD = 14
 """Longest part of a word on one line in a narrower terminal, in the other columns."""
 
+_GAP = 2
+"""Columns of characters that a column of a table needs beside its text."""
+
 _UNBROKEN = re.compile(r"\S+(?: (?:±|to) \S+)*")
 """What stays on one line of a cell: a word, a value with its deviation, or an interval."""
 
 
 def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
-    """Return a table without empty columns, for a terminal of a given width.
+    """Return a table for a terminal of a given width, without columns in which all cells are empty.
 
-    In a terminal narrower than `WIDE` long words may break at underscores and hyphens. If values
-    would still not fit on one line, the table is folded: all columns after the first one become
-    one, whose cells say "heading: value; heading: value".
+    The narrower the terminal, the more the table is changed, until each value has room on one line:
+
+    1. From `WIDE` columns of characters on, no word is broken.
+    2. Below that, long words may break after underscores and hyphens.
+    3. If values still do not fit, the table is folded: all columns after the first one become one,
+       whose cells say "heading: value; heading: value".
 
     Parameters
     ----------
@@ -169,26 +175,30 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     from rich import box
     from rich.table import Table
 
-    cells = [[*row, *[""] * (len(headings) - len(row))] for row in rows]
-    shown_columns = [
-        column for column in range(len(headings)) if not cells or any(row[column] for row in cells)
+    padded_rows = [[*row, *[""] * (len(headings) - len(row))] for row in rows]
+    filled_columns = [
+        column
+        for column in range(len(headings))
+        if not padded_rows or any(row[column] for row in padded_rows)
     ]
-    shown_headings = [headings[column] for column in shown_columns]
-    shown_cells = [[row[column] for column in shown_columns] for row in cells]
-    printed_cells = shown_cells
-    if width < WIDE and shown_columns:
-        printed_cells = []
-        for name, *other_cells in shown_cells:
-            broken = [break_words(cell, LONGEST_WORD) for cell in other_cells]
-            printed_cells.append([break_words(name, LONGEST_NAME), *broken])
-    widths = _column_widths(shown_headings, printed_cells, width)
-    if widths is None and len(shown_columns) > 2:
-        shown_headings, printed_cells, widths = _folded(shown_headings, shown_cells, width)
+    table_headings = [headings[column] for column in filled_columns]
+    whole_rows = [[row[column] for column in filled_columns] for row in padded_rows]
+    table_rows = whole_rows
+    if width < WIDE and filled_columns:
+        table_rows = []
+        for name, *values in whole_rows:
+            broken_values = [break_words(value, LONGEST_WORD) for value in values]
+            table_rows.append([break_words(name, LONGEST_NAME), *broken_values])
+    widths = _column_widths(table_headings, table_rows, width)
+    if widths is None and len(filled_columns) > 2:
+        # a folded cell has more room, so it begins from the words as they were before breaking
+        table_headings, table_rows, widths = _folded(table_headings, whole_rows, width)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column, heading in enumerate(shown_headings):
+    for column, heading in enumerate(table_headings):
+        # A table of two columns is not folded; without widths, rich breaks its values.
         fixed_width = None if widths is None else widths[column]
         table.add_column(heading, overflow="fold", width=fixed_width)
-    for row in printed_cells:
+    for row in table_rows:
         table.add_row(*row)
     return table
 
@@ -198,49 +208,62 @@ def _column_widths(
 ) -> list[int] | None:
     """Return widths of columns with which no value breaks; None if the terminal is too narrow.
 
-    The first column, which holds the names of the rows, is narrowed first, but only if its names
-    take more than half of the terminal, and then to two fifths of it. Then the widest is narrowed.
+    Each column begins as wide as its longest line. While the columns do not fit into the terminal,
+    one is made narrower by one character: the first, which holds the names of the rows, as long as
+    it is above its least width, then the widest of those that are above theirs.
+
+    The least width of a column is that of its longest piece that must stay on one line (see
+    `_UNBROKEN`). In a terminal of at least `NARROWEST` columns the first column also keeps
+
+    - the width of its longest name, if that is at most half of the terminal;
+    - two fifths of the terminal otherwise.
     """
     widths = []
     least_widths = []
     for column, heading in enumerate(headings):
         texts = [heading, *(row[column] for row in rows)]
         widths.append(_longest(texts))
-        least_widths.append(_longest(match for text in texts for match in _UNBROKEN.findall(text)))
-    room = width - 2 * len(headings)
+        least_widths.append(_longest(value for text in texts for value in _UNBROKEN.findall(text)))
+    room = width - _GAP * len(headings)
     if width >= NARROWEST and headings:
         longest_name = widths[0]
-        name_width = longest_name if longest_name <= width // 2 else 2 * width // 5
-        least_widths[0] = max(least_widths[0], name_width)
+        kept_width = longest_name if longest_name <= width // 2 else 2 * width // 5
+        least_widths[0] = max(least_widths[0], kept_width)
     while sum(widths) > room:
         narrowable = [column for column, least in enumerate(least_widths) if widths[column] > least]
         if not narrowable:
             return None
-        has_long_names = 0 in narrowable
-        widest = 0 if has_long_names else max(narrowable, key=lambda column: widths[column])
-        widths[widest] -= 1
+        if 0 in narrowable:
+            narrowed_column = 0
+        else:
+            narrowed_column = max(narrowable, key=lambda column: widths[column])
+        widths[narrowed_column] -= 1
     return widths
 
 
 def _folded(
     headings: Sequence[str], rows: Sequence[Sequence[str]], width: int
 ) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return headings, cells and column widths of a table whose columns are folded into two."""
+    """Return headings, rows and column widths of a table whose columns are folded into two.
+
+    The second column has the values of all further columns, each with its heading. A line of it is
+    filled with values until the next one would no longer fit.
+    """
     name_width = min(width // 3, _longest([headings[0], *(row[0] for row in rows)]))
-    room = width - 4 - name_width
+    room = width - 2 * _GAP - name_width
     folded_rows = []
-    for name, *cells in rows:
+    for name, *values in rows:
         lines = [""]
-        for heading, cell in zip(headings[1:], cells, strict=True):
-            if not cell:
+        for heading, value in zip(headings[1:], values, strict=True):
+            if not value:
                 continue
-            value = f"{heading}: {cell}"
+            entry = f"{heading}: {value}"
             separator = "; " if lines[-1] else ""
-            if lines[-1] and len(lines[-1] + separator + value) >= room:
+            if lines[-1] and len(lines[-1] + separator + entry) >= room:
                 lines[-1] += ";"
-                lines.append(value)
+                lines.append(entry)
             else:
-                lines[-1] += f"{separator}{value}"
+                lines[-1] += f"{separator}{entry}"
         folded_rows.append([break_words(name, LONGEST_NAME), "\n".join(lines)])
     return [headings[0], ""], folded_rows, [name_width, room]
 

@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 """Base units of SI and the radian, in the order of `SiConversion.exponents`."""
-_PINT_BASE_UNITS = ("gram", "meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
-"""The same units in pint, whose unit of mass is the gram."""
+_PINT_MASS_UNIT = "gram"
+"""Pint's base unit of mass, in place of the kilogram."""
+_OTHER_PINT_BASE_UNITS = ("meter", "second", "ampere", "kelvin", "mole", "candela", "radian")
+"""Pint's names of the base units after the kilogram, in the order of `BASE_UNITS`."""
 _PINT_NAMES = {
     "kp": "kgf",
     "rev": "turn",
@@ -127,6 +129,11 @@ def _known_units() -> "UnitRegistry[float]":
 def _pint_expression(unit: str, *, gravity: bool) -> str:
     """Return a unit in the notation of pint.
 
+    Names with SI prefixes are joined by `.`, `*`, `/` or a blank. A power follows its name (`m2`,
+    `m^2`, `s-1`, `m**2`). A power of 0 is refused, and a power of 1 is accepted as `^1` only,
+    because `A0` and `N1` are usually names of pins and gauges. A `/` divides by the next name or
+    parenthesis only, as in Modelica.
+
     Parameters
     ----------
     unit : str
@@ -207,13 +214,10 @@ def _pint_factor(factor: re.Match[str], *, gravity: bool) -> str:
 
 @cache
 def exact_conversion(unit: str, *, gravity: bool = False) -> ExactSiConversion:
-    """Return the conversion of a unit to SI, in fractions.
+    """Return the conversion of a unit to SI, with exact fractions.
 
-    Names with SI prefixes are joined by `.`, `*`, `/` or a blank. A power follows its name (`m2`,
-    `m^2`, `s-1`, `m**2`). A power of 0 is refused, and a power of 1 is accepted as `^1` only,
-    because `A0` and `N1` are usually names of pins and gauges. A `/` divides by the next name or
-    parenthesis only, as in Modelica. The angle has a base unit of its own, rad, and a hertz is not
-    taken for 1 rad/s.
+    `_pint_expression` describes how a unit may be written. The angle has a base unit of its own,
+    rad, and a hertz is not taken for 1 rad/s.
 
     Parameters
     ----------
@@ -234,18 +238,20 @@ def exact_conversion(unit: str, *, gravity: bool = False) -> ExactSiConversion:
     known_units = _known_units()
     try:
         parsed = known_units.parse_units(text)
-        # pint's root units have the gram as their unit of mass
+        # pint's root units are the base units of SI, but for the gram in place of the kilogram
         factor_to_root_units, root_units = known_units.get_root_units(parsed)
         offset = known_units.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
         raise ValueError(f"{unit!r} is not a unit") from cause
-    power_of_unit: dict[str, Any] = dict(root_units._units)
-    exponents = [power_of_unit.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]
-    has_other_units = bool(power_of_unit)
+    exponent_of_unit: dict[str, Any] = dict(root_units._units)
+    mass_exponent = exponent_of_unit.pop(_PINT_MASS_UNIT, 0)
+    other_exponents = [exponent_of_unit.pop(name, 0) for name in _OTHER_PINT_BASE_UNITS]
+    exponents = (mass_exponent, *other_exponents)
+    has_other_units = bool(exponent_of_unit)  # such as bit or currency
     if has_other_units or any(exponent != int(exponent) for exponent in exponents):
         raise ValueError(f"{unit!r} is not an SI unit")
-    exponent_of_mass = int(exponents[0])
-    factor = Fraction(str(factor_to_root_units)) / Fraction(1000) ** exponent_of_mass
+    kilograms_per_root_unit = 1 / Fraction(1000) ** int(mass_exponent)
+    factor = Fraction(str(factor_to_root_units)) * kilograms_per_root_unit
     if not _SMALLEST_FACTOR < abs(factor) < _LARGEST_FACTOR:
         raise ValueError(f"{unit!r} is beyond the numbers of a computer")
     return ExactSiConversion(

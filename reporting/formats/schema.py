@@ -86,52 +86,57 @@ class _DescribedSchema(GenerateJsonSchema):
 
     def model_schema(self, schema: core_schema.ModelSchema) -> JsonSchemaValue:
         """Return the schema of a model of pydantic."""
-        return _described(super().model_schema(schema), schema["cls"])
+        return _edit_schema(super().model_schema(schema), schema["cls"])
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> JsonSchemaValue:
         """Return the schema of a dataclass."""
-        return _described(super().dataclass_schema(schema), schema["cls"])
+        return _edit_schema(super().dataclass_schema(schema), schema["cls"])
 
     def typed_dict_schema(self, schema: core_schema.TypedDictSchema) -> JsonSchemaValue:
         """Return the schema of a `TypedDict`."""
-        return _described(super().typed_dict_schema(schema), schema["cls"])
+        return _edit_schema(super().typed_dict_schema(schema), schema["cls"])
 
     def is_instance_schema(self, schema: core_schema.IsInstanceSchema) -> JsonSchemaValue:
         """Return the schema of an object of Python, such as an array, which no file contains."""
         return {"not": {}}
 
 
-def _described(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
-    """Return the schema that pydantic made of a class, with units, and without keys no file has.
+def _edit_schema(schema: JsonSchemaValue, cls: type) -> JsonSchemaValue:
+    """Return the schema that pydantic made of a class, edited for readers of the format.
 
-    A key without a text below its field has the text of the base class. A key with
-    `MUST_BE_STATED` loses its default and is required.
+    - The description of the table is the summary of the docstring of `cls`.
+    - A key that no file contains is left out: `NeverInFile` and objects of Python have the schema
+      `{"not": {}}`.
+    - A key with `MUST_BE_STATED` loses its default and is required.
+    - A default that is infinite or NaN is dropped, because JSON has no such number.
+    - The unit in brackets moves from the description of a key to the entry `unit`.
+    - A key without a text below its field gets the description and the unit from a base class.
     """
     if "properties" not in schema:
         return schema
     required = list(schema.get("required", []))
-    properties: JsonSchema = {}
-    for key, key_schema in schema["properties"].items():
-        if "not" in key_schema:
+    edited_keys: JsonSchema = {}
+    for key, pydantic_schema in schema["properties"].items():
+        if "not" in pydantic_schema:
             continue
-        described = {**key_schema}
-        if described.pop(MUST_BE_STATED, False):
-            described.pop("default", None)
+        key_schema = {**pydantic_schema}
+        if key_schema.pop(MUST_BE_STATED, False):
+            key_schema.pop("default", None)
             required.append(key)
-        default = described.get("default")
-        if isinstance(default, float) and not isfinite(default):  # JSON has no such number
-            del described["default"]
-        text = described.pop("description", None)
+        default = key_schema.get("default")
+        if isinstance(default, float) and not isfinite(default):
+            del key_schema["default"]
+        text = key_schema.pop("description", None)
         if text is None:
-            described |= _descriptions_of_bases(cls).get(key, {})
+            key_schema |= _descriptions_of_bases(cls).get(key, {})
         else:
-            described |= _description_and_unit(text)
-        properties[key] = described
-    described_schema = {**schema, "properties": properties}
-    described_schema["description"] = _summary_of_class(cls)
+            key_schema |= _description_and_unit(text)
+        edited_keys[key] = key_schema
+    edited_schema = {**schema, "properties": edited_keys}
+    edited_schema["description"] = _summary_of_class(cls)
     if required:
-        described_schema["required"] = [key for key in properties if key in required]
-    return described_schema
+        edited_schema["required"] = [key for key in edited_keys if key in required]
+    return edited_schema
 
 
 @cache

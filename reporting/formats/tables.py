@@ -86,7 +86,7 @@ class PrintedTable:
 def printed_tables(
     schema: JsonSchema, notation: Notation, page: str, printed: Sequence[PrintedTable] = ()
 ) -> list[PrintedTable]:
-    """Return the tables that `format_page` prints, with their addresses on the page."""
+    """Return the tables that `markdown_of_format` prints, with their addresses on the page."""
     return _with_addresses(_own_tables(schema, notation, printed), page)
 
 
@@ -114,10 +114,22 @@ def _with_addresses(tables: Sequence[KeyTable], page: str) -> list[PrintedTable]
     return printed
 
 
-def format_page(
+def markdown_of_format(
     schema: JsonSchema, notation: Notation, printed: Sequence[PrintedTable] = ()
 ) -> str:
-    """Return the tables of the keys of a format as text of Markdown.
+    """Return Markdown that documents the keys of a file format, one section for each table of it.
+
+    A section looks like this::
+
+        ## `[noise]`
+
+        The noise of a channel.
+
+        | key | meaning | type | unit | default |
+        | --- | --- | --- | --- | --- |
+        | `standard_deviation` | Standard deviation. | number | m | needed |
+
+    Tables that differ only in their `kind` share a section.
 
     Parameters
     ----------
@@ -139,7 +151,7 @@ def format_page(
     sections = []
     for group in _groups(tables):
         if len(group) > 1:
-            sections.append(_section_of_kinds(group, schema, link))
+            sections.append(_section_of_variants(group, schema, link))
             continue
         table = group[0]
         paragraphs = [
@@ -152,9 +164,10 @@ def format_page(
 
 
 def _groups(tables: Sequence[KeyTable]) -> list[list[KeyTable]]:
-    """Return the tables in groups; tables that differ only in their `kind` are one group.
+    """Return the tables in groups: one group for the variants of a table, else one for each table.
 
-    They follow one another and have the same locations in a file.
+    Variants are tables that follow one another, each with a `kind`, at the same locations in a
+    file.
     """
     groups: list[list[KeyTable]] = []
     for table in tables:
@@ -172,36 +185,50 @@ def _groups(tables: Sequence[KeyTable]) -> list[list[KeyTable]]:
     return groups
 
 
-def _section_of_kinds(
-    group: Sequence[KeyTable], root: JsonSchema, link: Callable[[JsonSchema], str]
+def _section_of_variants(
+    variants: Sequence[KeyTable], root: JsonSchema, link: Callable[[JsonSchema], str]
 ) -> str:
-    """Return the section of tables that differ in their `kind`.
+    """Return the section on variants of one table: each value of the key `kind` has its own keys.
 
-    It has a table of the kinds with the names and units of their keys, and a table of all keys. A
-    key that means the same in several kinds has one row.
+    The section holds two Markdown tables: the kinds with the names and units of their keys, and all
+    keys with their meanings. A key that has the same meaning in several kinds stands there once.
+
+    Parameters
+    ----------
+    variants : sequence of KeyTable
+        The variants, one for each kind.
+    root : dict
+        The JSON Schema of the format, in which references are looked up.
+    link : callable
+        Returns the link to the table with a given schema.
     """
-    kinds = []
-    kinds_of_row: dict[KeyRow, list[str]] = {}
-    for table in group:
-        rows = [row for row in _rows(table.schema, root, link) if row.key != "`kind`"]
-        keys = [f"{row.key} [{row.unit}]" if row.unit else row.key for row in rows]
-        meaning = _markdown(table.schema.get("description", ""))
-        kinds.append([f"`{table.kind}`", meaning, ", ".join(keys)])
+    kind_lines = []
+    kinds_by_row: dict[KeyRow, list[str]] = {}
+    for variant in variants:
+        kind = f"`{variant.kind}`"
+        rows = [row for row in _rows(variant.schema, root, link) if row.key != "`kind`"]
+        keys_with_units = [f"{row.key} [{row.unit}]" if row.unit else row.key for row in rows]
+        meaning = _markdown(variant.schema.get("description", ""))
+        kind_lines.append([kind, meaning, ", ".join(keys_with_units)])
         for row in rows:
-            kinds_of_row.setdefault(row._replace(unit=""), []).append(f"`{table.kind}`")
-    counts = Counter(row.key for row in kinds_of_row)
-    rows_of_keys = []
-    for row, names in kinds_of_row.items():
-        is_ambiguous = counts[row.key] > 1
-        rows_of_keys.append(
-            row._replace(key=f"{row.key} of {listing(names)}") if is_ambiguous else row
-        )
+            # The unit stands in the table of kinds already. Without it, the rows of a key that
+            # differs in its unit only, such as a stiffness in N/m or N m, are one.
+            row_without_unit = row._replace(unit="")
+            kinds_by_row.setdefault(row_without_unit, []).append(kind)
+    # a key that remains in several rows says which kinds each of them is for
+    rows_per_key = Counter(row.key for row in kinds_by_row)
+    key_rows = []
+    for row, kinds in kinds_by_row.items():
+        if rows_per_key[row.key] > 1:
+            key_rows.append(row._replace(key=f"{row.key} of {listing(kinds)}"))
+        else:
+            key_rows.append(row)
     return "\n\n".join(
         [
-            f"## {_heading_of_locations(group[0])}",
+            f"## {_heading_of_locations(variants[0])}",
             "The key `kind` decides the other keys.",
-            _lines_of_table([["kind", "meaning", "keys [unit]"], *kinds]),
-            _markdown_table(sorted(rows_of_keys, key=lambda row: row.key)),
+            _lines_of_table([["kind", "meaning", "keys [unit]"], *kind_lines]),
+            _markdown_table(sorted(key_rows, key=lambda row: row.key)),
         ]
     )
 

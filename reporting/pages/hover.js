@@ -27,8 +27,8 @@
     return panel;
   };
 
-  const value = ({ limits: [low, high], log, texts, unsaid }, part) => {
-    if (unsaid) return "";
+  const value = ({ limits: [low, high], log, texts, unlabelled }, part) => {
+    if (unlabelled) return "";
     if (log) return String(+(low * (high / low) ** part).toPrecision(3));
     const found = low + part * (high - low);
     if (texts) return texts.reduce((best, one) => (Math.abs(one[0] - found) < Math.abs(best[0] - found) ? one : best))[1];

@@ -37,9 +37,9 @@ JsonObject = dict[str, object]
 
 
 class _LineLook(NamedTuple):
-    """The appearance of a line: colour, line style and marker.
+    """The colour, line style and marker of a line.
 
-    Lines of equal appearance in several panels are taken to show the same quantity.
+    Lines that agree in all three are taken to show the same quantity, also in several panels.
     """
 
     colour: str
@@ -97,20 +97,25 @@ def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
 
 
 def _annotations(figure: Figure) -> list[_Annotation]:
-    """Return the annotations of all panels that show lines, points or heat maps.
+    """Return the attributes from which the script of the page shows values in a figure.
 
-    Panels with other than linear or logarithmic axes have none, nor have artists that already have
-    a group id.
+    Each panel that shows lines, points or heat maps gets an attribute, and so does each line,
+    scatter, band and error bar in it. Left out are
+
+    - panels with an axis that is neither linear nor logarithmic: the script cannot convert a
+      position of the pointer into a value there;
+    - artists that have a group id already, because `annotated` would overwrite it.
     """
     line_names = _line_names(figure)
     annotations: list[_Annotation] = []
-    for axes in figure.axes:
-        if not {axes.get_xscale(), axes.get_yscale()} <= {"linear", "log"}:
+    for panel in figure.axes:
+        axis_scales = {panel.get_xscale(), panel.get_yscale()}
+        if not axis_scales <= {"linear", "log"}:
             continue
-        panel_annotations = [*_error_bar_annotations(axes), *_data_annotations(axes, line_names)]
-        has_series = any(annotation.attribute == "data-series" for annotation in panel_annotations)
-        if has_series or _map_records(axes):
-            annotations += [*panel_annotations, _Annotation(axes, "data-axes")]
+        inner_annotations = [*_error_bar_annotations(panel), *_data_annotations(panel, line_names)]
+        has_series = any(annotation.attribute == "data-series" for annotation in inner_annotations)
+        if has_series or _map_records(panel):
+            annotations += [*inner_annotations, _Annotation(panel, "data-axes")]
     return [annotation for annotation in annotations if annotation.artist.get_gid() is None]
 
 
@@ -123,32 +128,33 @@ def _error_bar_annotations(axes: Axes) -> Iterator[_Annotation]:
                 yield _Annotation(bar, "data-spread", to_hex(np.asarray(bar.get_colors())[0]))
 
 
-def _data_annotations(axes: Axes, line_names: dict[_LineLook, str]) -> Iterator[_Annotation]:
+def _data_annotations(panel: Axes, line_names: dict[_LineLook, str]) -> Iterator[_Annotation]:
     """Yield the annotations of the bands, lines and scatters of a panel.
 
-    Lines whose coordinates are not both data, such as limits across a panel, are left out.
+    Left out are the caps of error bars, and lines such as a limit across the panel, of which only
+    one coordinate is data.
 
     Parameters
     ----------
-    axes : Axes
-        The panel to draw in.
+    panel : Axes
+        The panel whose artists are annotated.
     line_names : dict of _LineLook to str
-        The names of lines without a label of their own, by their appearance.
+        The names of lines without a label of their own, by colour, line style and marker.
     """
-    error_bar_caps: list[Artist] = []  # of error bars
+    error_bar_caps: list[Artist] = []
     error_bar_names: dict[Artist, str] = {}
-    for container in axes.containers:
+    for container in panel.containers:
         if isinstance(container, ErrorbarContainer):
             data_line, cap_lines, _ = container.lines
             error_bar_caps += cap_lines
             if data_line is not None:
                 error_bar_names[data_line] = str(container.get_label())
-    for artist in (*axes.lines, *axes.collections):
+    for artist in (*panel.lines, *panel.collections):
         if isinstance(artist, FillBetweenPolyCollection):
             colour = to_hex(np.asarray(artist.get_facecolor())[0])
             yield _Annotation(artist, "data-spread", colour)
         elif isinstance(artist, Line2D | PathCollection) and artist not in error_bar_caps:
-            if not _is_in_data_coordinates(artist, axes):
+            if not _is_in_data_coordinates(artist, panel):
                 continue
             look = _look_of(artist)
             label = error_bar_names.get(artist, str(artist.get_label()))
@@ -168,20 +174,21 @@ def _is_in_data_coordinates(artist: Line2D | PathCollection, axes: Axes) -> bool
 
 
 def _line_names(figure: Figure) -> dict[_LineLook, str]:
-    """Return a name for each appearance of lines in a figure.
+    """Return a name for each combination of colour, line style and marker in a figure.
 
-    The name is that of the first entry of a legend with this appearance, else the label of the
-    first such line.
+    All lines of one combination show the same quantity, also those in panels without a legend. The
+    name is taken from the first legend entry with this combination. If no legend has it, the name
+    is the label of the first such line.
     """
     names: dict[_LineLook, str] = {}
-    for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
+    for legend in (*figure.legends, *(panel.get_legend() for panel in figure.axes)):
         if legend is None:
             continue
         for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
             if isinstance(handle, Line2D):
                 names.setdefault(_look_of(handle), text.get_text())
-    for axes in figure.axes:
-        for line in axes.lines:
+    for panel in figure.axes:
+        for line in panel.lines:
             label = str(line.get_label())
             if _public_label(label):
                 names.setdefault(_look_of(line), label)
@@ -194,9 +201,9 @@ def _public_label(label: str) -> str:
 
 
 def _look_of(artist: Line2D | PathCollection) -> _LineLook:
-    """Return the appearance of a line.
+    """Return colour, line style and marker of a line.
 
-    All scatters have the same empty appearance, so none of them gets the name of a line.
+    All scatters have the same empty combination, so none of them gets the name of a line.
     """
     if isinstance(artist, PathCollection):
         return _LineLook("", "", "")
@@ -250,41 +257,57 @@ def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
     return ""
 
 
-def _map_records(axes: Axes) -> list[JsonObject]:
+def _map_records(panel: Axes) -> list[JsonObject]:
     """Return the heat maps of a panel as JSON, for the script that shows values under the mouse.
+
+    A map is left out if
+
+    - it stands in a colour bar, or in a panel with a logarithmic axis;
+    - its colour map has fewer than `_FEW_COLOURS` colours: such a map shows categories, not values;
+    - it has more than `_MOST_CELLS` cells, or is an image of colours, such as a photograph.
 
     Returns
     -------
     list of dict
-        For each map the edges of its columns ("x") and of its rows ("y"), its values row by row
-        ("values", null if a cell has no finite value), and the quantity ("name"). A map is left out
-        if it has too many cells, or fewer than `_FEW_COLOURS` colours: these then stand for names,
-        not for values. A colour bar and a panel with a logarithmic axis have no maps.
+        For each map:
+
+        - "x": the edges of its columns,
+        - "y": the edges of its rows,
+        - "values": its values row by row, null where a value is not finite,
+        - "name": the quantity that it shows.
     """
-    figure = axes.get_figure(root=True)
-    if figure is None or _is_colour_bar(axes):
+    figure = panel.get_figure(root=True)
+    if figure is None or _is_colour_bar(panel):
         return []
-    has_linear_axes = axes.get_xscale() == "linear" and axes.get_yscale() == "linear"
+    has_linear_axes = panel.get_xscale() == "linear" and panel.get_yscale() == "linear"
     if not has_linear_axes:
         return []
     # The project's figures show one quantity in all their heat maps: that of the first colour bar.
-    colour_bar_labels = [panel.get_ylabel() for panel in figure.axes if _is_colour_bar(panel)]
+    colour_bar_labels = [axes.get_ylabel() for axes in figure.axes if _is_colour_bar(axes)]
     quantity = colour_bar_labels[0] if colour_bar_labels else ""
     records: list[JsonObject] = []
-    for artist in (*axes.collections, *axes.images):
-        if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
+    for artist in (*panel.collections, *panel.images):
+        if not isinstance(artist, QuadMesh | AxesImage):
+            continue
+        shows_categories = artist.get_cmap().N < _FEW_COLOURS
+        if shows_categories:
             continue
         values: np.ma.MaskedArray[tuple[int, int], np.dtype[np.float64]] = np.ma.masked_invalid(
             np.ma.asarray(artist.get_array())
         )
         if values.ndim != 2 or values.size > _MOST_CELLS:
             continue
-        x, y = _cell_edges(artist, values.shape)
+        column_edges, row_edges = _cell_edges(artist, values.shape)
         value_rows = []
         for row in values.tolist():  # three significant digits keep the page small
             value_rows.append([None if cell is None else float(f"{cell:.3g}") for cell in row])
         records.append(
-            {"x": x.tolist(), "y": y.tolist(), "values": value_rows, "name": quantity or "value"}
+            {
+                "x": column_edges.tolist(),
+                "y": row_edges.tolist(),
+                "values": value_rows,
+                "name": quantity or "value",
+            }
         )
     return records
 
@@ -292,15 +315,10 @@ def _map_records(axes: Axes) -> list[JsonObject]:
 def _cell_edges(artist: QuadMesh | AxesImage, shape: tuple[int, int]) -> tuple[Float, Float]:
     """Return the edges of the columns (C + 1,) and of the rows (R + 1,) of a heat map.
 
-    Parameters
-    ----------
-    artist : QuadMesh or AxesImage
-        The map.
-    shape : (int, int)
-        The numbers of rows R and columns C.
+    `shape` is the number of rows R and of columns C.
     """
     if isinstance(artist, QuadMesh):
-        corners = np.asarray(artist.get_coordinates())
+        corners = np.asarray(artist.get_coordinates())  # (R + 1, C + 1, 2): x and y
         return corners[0, :, 0], corners[:, 0, 1]
     rows, columns = shape
     left, right, bottom, top = artist.get_extent()
@@ -314,10 +332,12 @@ def _is_colour_bar(axes: Axes) -> bool:
 
 
 def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str) -> JsonObject:
-    """Return the name, limits and scale of an axis.
+    """Return the name, limits and scale of an axis as JSON.
 
-    If ticks have words instead of numbers, their texts are included. An axis without a name and
-    without tick texts is marked as "unsaid": the page shows no value along it.
+    A logarithmic axis has "log". A linear axis has, besides its name and limits,
+
+    - "texts", its ticks with their texts, if these are words instead of numbers;
+    - "unlabelled", if it has neither a name nor tick texts: the page shows no value along it.
 
     Parameters
     ----------
@@ -340,9 +360,10 @@ def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str)
     ticks = [float(tick) for tick in axis.get_majorticklocs()]
     texts = axis.get_major_formatter().format_ticks(ticks)
     if not name and not any(texts):
-        record["unsaid"] = True
-    # Ticks of numbers may have the minus sign of typography.
-    if any(text and not is_number(text.replace("\N{MINUS SIGN}", "-")) for text in texts):
+        record["unlabelled"] = True
+    # matplotlib writes negative ticks with the Unicode minus sign, which no number in Python has
+    ascii_texts = [text.replace("\N{MINUS SIGN}", "-") for text in texts]
+    if any(text and not is_number(text) for text in ascii_texts):
         pairs = zip(ticks, texts, strict=True)
         record["texts"] = [[tick, " ".join(text.split())] for tick, text in pairs]
     return record

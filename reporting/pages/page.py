@@ -135,9 +135,6 @@ class Page:
     style: str = ""
 
 
-_WITH_VALUES = "figures with values under the pointer"
-
-
 class _NumberedBlock(NamedTuple):
     """A block as `page.html` takes it.
 
@@ -172,40 +169,59 @@ def render_page(page: Page) -> str:
     InvalidFigureError
         If the drawing of a figure is not an SVG that can be scaled.
     """
-    counts: Counter[str] = Counter()
-    opening = _number_blocks((page.picture, *page.outcome), counts)
+    last_numbers: Counter[str] = Counter()
+    opening = _number_blocks((page.picture, *page.outcome), last_numbers)
     sections: list[tuple[str, list[_NumberedBlock], str]] = []
     for section in page.sections:
-        blocks = _number_blocks(section.blocks, counts)
+        blocks = _number_blocks(section.blocks, last_numbers)
         if blocks:
             identifier = section.identifier or f"section-{len(sections) + 1}"
             sections.append((section.title, blocks, identifier))
+    all_blocks = [*opening, *(block for _, blocks, _ in sections for block in blocks)]
+    needs_hover_script = any(_shows_values(block) for block in all_blocks)
     template = html_environment().from_string(_read_resource("page.html"))
     return template.render(
         page=page,
         opening=opening,
         sections=sections,
         style=Markup(_read_resource("page.css")),
-        hover_script=Markup(_read_resource("hover.js")) if counts[_WITH_VALUES] else "",
+        hover_script=Markup(_read_resource("hover.js")) if needs_hover_script else "",
     )
 
 
-def _number_blocks(blocks: Iterable[Block], counts: Counter[str]) -> list[_NumberedBlock]:
-    """Return the blocks that are not empty with their numbers; `counts` goes on by kind."""
+def _number_blocks(blocks: Iterable[Block], last_numbers: Counter[str]) -> list[_NumberedBlock]:
+    """Return the blocks that are not empty, each with its number.
+
+    Blocks of each kind (figures, tables, ...) are numbered on their own, those inside a fold too.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+        Consecutive blocks of the page.
+    last_numbers : Counter
+        The number of the last block of each kind so far. It is updated, so that the next call goes
+        on counting.
+    """
     numbered = []
     for block in blocks:
         if _is_empty(block):
             continue
         kind = type(block).__name__
-        counts[kind] += 1
-        number = counts[kind]
+        last_numbers[kind] += 1
+        number = last_numbers[kind]
         drawing = None
         if isinstance(block, PageFigure):
             drawing = inline_svg(block.svg, prefix=f"f{number}", description=block.title)
-            counts[_WITH_VALUES] += " data-axes=" in drawing.full
-        inner = _number_blocks(block.blocks, counts) if isinstance(block, Fold) else ()
+        inner = _number_blocks(block.blocks, last_numbers) if isinstance(block, Fold) else ()
         numbered.append(_NumberedBlock(kind, block, number, drawing, inner))
     return numbered
+
+
+def _shows_values(block: _NumberedBlock) -> bool:
+    """Return whether a block is, or contains, a figure with values for the script of the page."""
+    if block.drawing is not None and " data-axes=" in block.drawing.full:
+        return True
+    return any(_shows_values(inner) for inner in block.blocks)
 
 
 def _is_empty(block: Block) -> bool:

@@ -107,44 +107,44 @@ def _boxes_of_entries(legend: Legend, renderer: RendererAgg) -> list[Bbox]:
 
 
 def _boxes_of_panels(figure: Figure, renderer: RendererAgg) -> list[Bbox]:
-    """Return the box of each panel with its titles, labels and colour bars, in pixels."""
-    panel_of_bar: dict[Axes, Axes] = {}
-    for axes in figure.axes:
-        for artist in (*axes.collections, *axes.images):
+    """Return the box of each panel in pixels, which includes its titles, labels and colour bars."""
+    panel_of_colour_bar: dict[Axes, Axes] = {}
+    for panel in figure.axes:
+        for artist in (*panel.collections, *panel.images):
             if artist.colorbar is not None:
-                panel_of_bar[artist.colorbar.ax] = axes
+                panel_of_colour_bar[artist.colorbar.ax] = panel
+    # matplotlib counts colour bars among the axes, beside the panels
     boxes: dict[Axes, Bbox] = {}
     for axes in figure.axes:
         box = axes.get_tightbbox(renderer)
         if box is not None and axes.get_visible():
             boxes[axes] = box
     panels = [axes for axes in boxes if not hasattr(axes, "_colorbar")]
-    for axes in [axes for axes in boxes if axes not in panels]:
-        # The bar of a map that no panel holds belongs to the nearest panel.
-        panel = panel_of_bar.get(axes) or _nearest_panel(boxes, panels, axes)
-        if panel in boxes:
-            boxes[panel] = Bbox.union([boxes[panel], boxes.pop(axes)])
+    colour_bars = [axes for axes in boxes if hasattr(axes, "_colorbar")]
+    for colour_bar in colour_bars:
+        # A colour bar may be made for a colour scale alone, without a map in any panel. It then
+        # belongs to the nearest panel.
+        panel_beside = panel_of_colour_bar.get(colour_bar)
+        if panel_beside is None:
+            panel_beside = _nearest_panel(boxes, panels, colour_bar)
+        if panel_beside in boxes:
+            boxes[panel_beside] = Bbox.union([boxes[panel_beside], boxes.pop(colour_bar)])
     return list(boxes.values())
 
 
-def _nearest_panel(boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], axes: Axes) -> Axes | None:
-    """Return the panel with the smallest gap between its box and that of a given panel, or None.
+def _nearest_panel(
+    boxes: Mapping[Axes, Bbox], panels: Sequence[Axes], colour_bar: Axes
+) -> Axes | None:
+    """Return the panel whose box has the smallest gap to that of a colour bar; None if no panel.
 
-    Parameters
-    ----------
-    boxes : mapping of Axes to Bbox
-        The boxes of all panels.
-    panels : sequence of Axes
-        The panels that are compared.
-    axes : Axes
-        The given panel.
+    The gap is the sum of the horizontal and the vertical distance between the two boxes.
     """
-    box = boxes[axes]
+    bar_box = boxes[colour_bar]
 
     def gap(panel: Axes) -> float:
-        box_of_panel = boxes[panel]
-        horizontal_gap = max(box_of_panel.x0 - box.x1, box.x0 - box_of_panel.x1, 0.0)
-        vertical_gap = max(box_of_panel.y0 - box.y1, box.y0 - box_of_panel.y1, 0.0)
+        panel_box = boxes[panel]
+        horizontal_gap = max(panel_box.x0 - bar_box.x1, bar_box.x0 - panel_box.x1, 0.0)
+        vertical_gap = max(panel_box.y0 - bar_box.y1, bar_box.y0 - panel_box.y1, 0.0)
         return float(horizontal_gap + vertical_gap)
 
     return min(panels, key=gap, default=None)

@@ -288,10 +288,11 @@ def call_on_end_signal(request_end: Callable[[], None]) -> Iterator[None]:
 
 
 def polled_pieces(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
-    """Yield the pieces of a stream as they come, until it ends, without ever waiting.
+    """Yield the pieces of a stream as they arrive, until it ends, without ever waiting.
 
-    While nothing has come, None is yielded. Windows can tell of sockets only whether something has
-    come, so a thread reads the stream there.
+    None is yielded whenever no piece has arrived, so that the caller can do something else before
+    it asks again. Where the system cannot tell whether bytes have arrived (on Windows it can for
+    sockets only), a thread reads the stream.
 
     Parameters
     ----------
@@ -324,34 +325,36 @@ def _can_poll(stream: ReadableStream) -> bool:
 
 
 def pieces_read_by_thread(stream: ReadableStream, size: int) -> Iterator[bytes | None]:
-    """Yield what `polled_pieces` yields of a stream that a thread reads.
+    """Yield the pieces of a stream as they arrive, as `polled_pieces` does, by means of a thread.
 
-    An error of the thread is raised here.
+    The thread waits for the stream and puts each piece into a queue; the caller, who takes pieces
+    from the queue, never waits. An error in the thread is raised in the caller.
     """
-    pieces: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
+    end_of_stream = b""
+    arrivals: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
 
-    def read() -> None:
+    def read_until_end() -> None:
         try:
             piece = stream.read1(size)
             while piece:
-                pieces.put(piece)
+                arrivals.put(piece)
                 piece = stream.read1(size)
-            pieces.put(b"")
+            arrivals.put(end_of_stream)
         except BaseException as error:  # noqa: BLE001 - raised again where the stream is read
-            pieces.put(error)
+            arrivals.put(error)
 
-    threading.Thread(target=read, daemon=True).start()
+    threading.Thread(target=read_until_end, daemon=True).start()
     while True:
         try:
-            piece = pieces.get_nowait()
+            arrival = arrivals.get_nowait()
         except queue.Empty:
             yield None
             continue
-        if isinstance(piece, BaseException):
-            raise piece
-        if not piece:
+        if isinstance(arrival, BaseException):
+            raise arrival
+        if arrival == end_of_stream:
             return
-        yield piece
+        yield arrival
 
 
 def is_same_beginning(file: BinaryIO, beginning: bytes) -> bool:

@@ -19,7 +19,7 @@ from fe.structure.design import parse_structure
 from fe.wing.design import parse_design
 from fmu_asset.client.binding import parse_binding
 from fmu_asset.errors import BindingError
-from reporting.formats.tables import format_page, undocumented_keys
+from reporting.formats.tables import markdown_of_format, undocumented_keys
 from scenarios import binding_files, scenario_files, structure_files
 from tests import command_line
 from tests.refusals import refused
@@ -66,7 +66,7 @@ def test_a_table_of_keys_has_no_column_that_is_empty():
             "mass": {"type": "number", "unit": "kg", "description": "Its mass."},
         }
     }
-    header, _, name, mass = format_page(schema, "toml").strip().splitlines()[-4:]
+    header, _, name, mass = markdown_of_format(schema, "toml").strip().splitlines()[-4:]
     assert header == "| key | meaning | type | unit |"
     assert name == "| `name` | Name of the part. | text |   |"
     assert mass == "| `mass` | Its mass. | number | kg |"
@@ -83,7 +83,7 @@ def test_a_key_that_means_the_same_in_several_kinds_of_a_table_is_printed_once()
         for name, keys in kinds.items()
     ]
     schema = {"properties": {"law": {"oneOf": tables, "description": "The law."}}}
-    lines = format_page(schema, "toml").splitlines()
+    lines = markdown_of_format(schema, "toml").splitlines()
     assert lines[4] == "| `law` | The law. | [table](#law) |"
     assert [line for line in lines if "spring" in line] == [
         "| `spring` | A spring. | `port`, `size` [N/m] |",
