@@ -150,22 +150,38 @@ def _is_stated_by_file(choice: ModelChoice, patch: ModelPatch) -> bool:
     )
 
 
-def _structure_text(choice: ModelChoice, patch: files.StoredPatch, path: Path) -> str:
-    """Return the text of a structure's file with the changes and parameters of a patch.
+def _structure_text(choice: ModelChoice, patch: files.StoredPatch, output: Path) -> str:
+    """Return the text of a structure's file, changed as a patch says.
 
-    Calibrated parameters become nominal values, or the mass of a section `[[mass]]`. Raises
-    `ModelError` if the file cannot state a change.
+    The name of the structure gets the ending `_patched`. A calibrated parameter replaces the key
+    `nominal` of its `[[parameter]]` by its posterior mean, or the key `mass` of a `[[mass]]` of the
+    same name.
+
+    Parameters
+    ----------
+    choice : ModelChoice
+        The model, whose file is read.
+    patch : StoredPatch
+        The changes of the structure and the calibrated parameters.
+    output : Path
+        The file that will be written; relative names in the text begin at its folder.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot state a change.
     """
-    assert choice.path is not None
-    with ModelError.instead_of(FiniteElementError, before=f"{path}: "):
-        tables = changed_tables(choice.path, patch.patch, path.parent)
-    calibrated = {parameter.name: parameter for parameter in patch.parameters}
+    structure_file = choice.path
+    assert structure_file is not None
+    with ModelError.instead_of(FiniteElementError, before=f"{output}: "):
+        tables = changed_tables(structure_file, patch.patch, output.parent)
+    calibrated_means = {parameter.name: float(parameter.mean) for parameter in patch.parameters}
     for row in tables.get("parameter", ()):
-        if row["name"] in calibrated:
-            row["nominal"] = float(calibrated[row["name"]].mean)
+        if row["name"] in calibrated_means:
+            row["nominal"] = calibrated_means[row["name"]]
     for row in tables.get("mass", ()):
-        if row["name"] in calibrated:
-            row["mass"] = float(calibrated[row["name"]].mean)
+        if row["name"] in calibrated_means:
+            row["mass"] = calibrated_means[row["name"]]
     tables["name"] = f"{tables['name']}_patched"
     return (
         f"# {patch.sentence}\n# Changes and parameters: {patch.origin.short_command}\n\n"

@@ -36,36 +36,42 @@ def remarks_on_missing_columns(
 ) -> list[str]:
     """Return a remark on each channel and input that the tables of some trials, not all, lack.
 
-    Trials that state their `channels` do not count for channels, and only driven trials count for
-    inputs: a static trial may have a column `force` instead. The remarks name no files, so that
-    they stay the same when a campaign is written again.
+    - Channels: a trial that states its `channels` lacks others on purpose and is not mentioned. It
+      counts among all trials nevertheless: if all others lack a channel, that is remarked.
+    - Inputs: only driven trials are compared with one another, because others need no input: a
+      static trial may have a column `force` instead.
+
+    The remarks name no files, so that they stay the same when a campaign is written again.
     """
-    open_trials = [trial for trial in section.trial if trial.channels is None]
+    trials_without_list = [trial for trial in section.trial if trial.channels is None]
     driven_trials = [trial for trial in section.trial if trial.kind is TrialKind.DRIVEN]
     remarks = []
     for channel in section.channel:
-        lacking = _trials_without(channel, open_trials, tables)
-        if lacking and len(lacking) < len(section.trial):
+        lacking_trials = _trials_without(channel, trials_without_list, tables)
+        if lacking_trials and len(lacking_trials) < len(section.trial):
             remarks.append(
-                f"{_trials_have(lacking)} no column of the channel {channel.name!r}, which is not "
-                "compared there; if that is not meant, correct the table, or else state the "
+                f"{_trials_have(lacking_trials)} no column of the channel {channel.name!r}, which "
+                "is not compared there; if that is not meant, correct the table, or else state the "
                 "`channels` of the trial."
             )
     for recorded_input in section.input:
-        lacking = _trials_without(recorded_input, driven_trials, tables)
-        if lacking and len(lacking) < len(driven_trials):
+        lacking_trials = _trials_without(recorded_input, driven_trials, tables)
+        if lacking_trials and len(lacking_trials) < len(driven_trials):
             remarks.append(
-                f"{_trials_have(lacking)} no column of the input {recorded_input.name!r}, which is "
-                "taken not to act there; if that is not meant, correct the table."
+                f"{_trials_have(lacking_trials)} no column of the input {recorded_input.name!r}, "
+                "which is taken not to act there; if that is not meant, correct the table."
             )
     return remarks
 
 
 def _trials_without(
-    record: InTables, trials: Iterable[schema.TrialSection], tables: Mapping[str, TextTable]
+    channel_or_input: InTables,
+    trials: Iterable[schema.TrialSection],
+    tables: Mapping[str, TextTable],
 ) -> list[schema.TrialSection]:
     """Return the trials whose table has no column of a channel or an input."""
-    return [trial for trial in trials if record.table_column not in tables[trial.file].columns]
+    column = channel_or_input.table_column
+    return [trial for trial in trials if column not in tables[trial.file].columns]
 
 
 def _trials_have(trials: Sequence[schema.TrialSection]) -> str:

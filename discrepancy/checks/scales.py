@@ -17,6 +17,13 @@ _LEAST_RELATIVE_AMPLITUDE = 0.01
 """Least predicted amplitude of a channel, as a fraction of the largest of its quantity.
 
 Below it the load has hardly any effect on the channel."""
+_CLEAR_ZERO_DEVIATIONS = 2.0
+"""Size of a reading above which its sign is clear, in standard deviations of the zero."""
+_MOST_ROWS = 400
+"""Number of rows, evenly spread over the trial, of which all pairs are compared."""
+_LEAST_CLEAR_STEP = 0.2
+"""Least difference of the prediction between two rows with clearly different loads, as a fraction
+of its largest magnitude."""
 _LEAST_AGREEING_SHARE = 0.9
 """Least fraction of the pairs of rows whose slopes must have one sign."""
 _LARGEST_RATIO = 1e9
@@ -103,13 +110,21 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
 def _static_scale(
     readings: FloatArray, predicted_readings: FloatArray, noise: float, zero_deviation: float
 ) -> float:
-    """Return the ratio of readings at rest to their prediction; 0 if it is not determined.
+    """Return the ratio of readings at rest to their prediction; 0 if the data do not determine it.
 
-    The ratio is the median of the slopes over all pairs of rows (Theil-Sen). If all rows have
-    nearly the same load, it is the median reading over the median prediction. The ratio is not
-    determined if the readings are within the noise or the uncertainty of the zero, if the pairs of
-    rows disagree in the sign of the slope, or if the slope is negative while the readings have the
-    sign of the prediction: another cause, such as temperature, then dominates.
+    If the prediction differs clearly within some pairs of rows, the ratio is the median of the
+    slopes over these pairs (Theil-Sen). It is not determined if
+
+    - the usual step between the rows of a pair is within the noise;
+    - too few slopes (`_LEAST_AGREEING_SHARE`) have the sign of the median slope;
+    - the slope is negative, but the median reading clearly has the sign of the prediction: another
+      cause, such as temperature, then dominates.
+
+    If all rows have nearly the same load, the ratio is the median reading over the median
+    prediction. It is not determined if
+
+    - the median prediction is zero;
+    - the median reading is within the noise or the uncertainty of the zero.
 
     Parameters
     ----------
@@ -118,17 +133,18 @@ def _static_scale(
     noise, zero_deviation : float
         The standard deviations of the noise and of the channel's zero [channel's unit].
     """
-    # all P pairs of at most 400 rows
-    row_count = min(len(readings), 400)
+    # steps (P,) of readings and predictions in all P pairs of at most `_MOST_ROWS` rows
+    row_count = min(len(readings), _MOST_ROWS)
     rows = np.linspace(0, len(readings) - 1, row_count).round().astype(int)
     first_of_pair, second_of_pair = np.triu_indices(row_count, 1)
     first_rows = rows[first_of_pair]
     second_rows = rows[second_of_pair]
-    data_steps = readings[first_rows] - readings[second_rows]  # (P,)
-    model_steps = predicted_readings[first_rows] - predicted_readings[second_rows]  # (P,)
+    data_steps = readings[first_rows] - readings[second_rows]
+    model_steps = predicted_readings[first_rows] - predicted_readings[second_rows]
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
-    is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(predicted_readings))
+    largest_prediction = np.max(np.abs(predicted_readings))
+    is_clear_step = np.abs(model_steps) > _LEAST_CLEAR_STEP * largest_prediction
     median_reading = float(np.median(readings))
     median_prediction = float(np.median(predicted_readings))
     if not is_clear_step.any():
@@ -136,12 +152,16 @@ def _static_scale(
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
     slopes = data_steps[is_clear_step] / model_steps[is_clear_step]
     slope = float(np.median(slopes))  # Theil-Sen estimate
+    # The usual step is that of the readings or of the prediction, whichever is larger. A channel
+    # that hardly responds has a slope near zero, and this slope is well determined if the predicted
+    # step alone is above the noise.
     usual_model_step = np.median(np.abs(model_steps[is_clear_step]))
     usual_step = max(abs(slope), 1.0) * usual_model_step
     is_above_noise = usual_step > CLEAR_NOISE_DEVIATIONS * noise
     pairs_agree = np.mean(slopes * slope > 0.0) > _LEAST_AGREEING_SHARE
-    has_sign_of_model = median_reading * np.sign(median_prediction) > 2.0 * zero_deviation
-    has_another_cause = slope < 0.0 and has_sign_of_model
+    reading_along_prediction = median_reading * np.sign(median_prediction)
+    has_sign_of_prediction = reading_along_prediction > _CLEAR_ZERO_DEVIATIONS * zero_deviation
+    has_another_cause = slope < 0.0 and has_sign_of_prediction
     is_determined = is_above_noise and pairs_agree and not has_another_cause
     return slope if is_determined else 0.0
 

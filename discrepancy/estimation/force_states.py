@@ -16,6 +16,9 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.trials_in_motion.trial import PortedTrial
 from reporting.arrays import LEAST_DIVISOR
 
+LEAST_NATURAL_FREQUENCY = 1e-9
+"""Frequency that stands for the highest one of a structure that no spring holds [rad/s]."""
+
 
 @dataclass(frozen=True)
 class Process:
@@ -100,14 +103,21 @@ class ForceStates:
     def state_units(self) -> FloatArray:
         """The typical size (n,) of each state of the structure; the filter divides the state by it.
 
-        Let the missing force, which the model lacks, vary at the highest natural frequency omega
-        with an amplitude of one standard deviation, and let it cause the acceleration a. The size
-        of a speed is then a / omega, and the size of a position is a / omega^2.
+        Let the missing force vary at the highest natural frequency omega with an amplitude of one
+        standard deviation, and let it cause the acceleration a. The size of a speed is then
+        a / omega, and the size of a position is a / omega^2.
+
+        The system does not say which of its states are positions. An even number of states is taken
+        for positions and then as many speeds, as of a structure; an odd number, as of a system of
+        first order, for speeds alone. If that is wrong, the states are scaled less well, but the
+        estimates stay the same up to rounding.
         """
         system = self.trial.system
         state_count = len(system.generator)
+        # the natural frequencies are the moduli of the eigenvalues
+        eigenvalues = np.linalg.eigvals(system.generator)
         highest_frequency = max(
-            float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9
+            float(np.max(np.abs(eigenvalues), initial=0.0)), LEAST_NATURAL_FREQUENCY
         )
         # a row of `actions` holds the rates (n,) of the states that a unit force at a port causes
         accelerations = [
@@ -115,12 +125,11 @@ class ForceStates:
             for port, process in self.processes
         ]
         largest_acceleration = max([*accelerations, LEAST_DIVISOR])
-        units = np.full(state_count, largest_acceleration / highest_frequency)
-        # The system does not say which states are positions. An even number of states is taken for
-        # positions and then as many speeds, an odd number for speeds alone.
+        speed = largest_acceleration / highest_frequency
+        units = np.full(state_count, speed)
         has_positions = state_count % 2 == 0
         if has_positions:
-            units[: state_count // 2] /= highest_frequency
+            units[: state_count // 2] = speed / highest_frequency
         return units
 
     @cached_property

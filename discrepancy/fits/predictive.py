@@ -194,43 +194,44 @@ class _TrialPredictions:
     def fitted_trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
         """Return each trial with its prediction, residuals and their expected variance.
 
-        Parameters
-        ----------
-        sensitivities : bool
-            Whether the factor of the exact covariance of the residuals is computed too.
+        If `sensitivities` is true, each trial also gets `FittedTrial.sensitivity`, a factor of the
+        exact covariance of its prediction. It has a column for each unknown of the whole fit, so it
+        is computed only where a test needs it.
         """
         fitted_trials = []
-        shared_count = len(self.covariance_root)
-        local_counts = [data.unknowns.unknown_count for data in self.problem.trials]
-        first_local = shared_count
         for trial_index, data in enumerate(self.problem.trials):
             rows = trial_jacobian(
                 self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
             factors = self._covariance_factors(rows, data.unknowns.unknown_count)
-            # columns: shared unknowns and effects, then the unknowns of one trial after another
-            sensitivity = None
-            if sensitivities:
-                shape = self.local_fit.residuals[trial_index].shape
-                sensitivity = np.zeros((*shape, shared_count + sum(local_counts)))
-                by_shared = factors.by_shared.reshape(*shape, shared_count)
-                sensitivity[..., :shared_count] = by_shared
-                local_count = len(factors.by_local)
-                by_local = factors.by_local.T.reshape(*shape, local_count)
-                sensitivity[..., first_local : first_local + local_count] = by_local
-                first_local += local_count
+            sensitivity = self._sensitivity(trial_index, factors) if sensitivities else None
             fitted_trials.append(self._fitted_trial(trial_index, data, factors, sensitivity))
         return fitted_trials
+
+    def _sensitivity(self, trial_index: int, factors: _CovarianceFactors) -> FloatArray:
+        """Return the factor S (N, C, P) of the covariance of a trial's prediction.
+
+        The P columns are the Q + E shared unknowns and effect parameters, then the own unknowns of
+        the first trial, of the second, and so on; those of all other trials are zero. With its
+        first two axes joined to N C rows, S S^T is the covariance of the prediction in noise
+        variances, and S S'^T its covariance with the prediction of another trial, whose factor is
+        S'.
+        """
+        shared_count = factors.by_shared.shape[1]
+        local_counts = [data.unknowns.unknown_count for data in self.problem.trials]
+        begin = shared_count + sum(local_counts[:trial_index])
+        end = begin + local_counts[trial_index]
+        sample_count, channel_count = self.local_fit.residuals[trial_index].shape
+        matrix = np.zeros((sample_count * channel_count, shared_count + sum(local_counts)))
+        matrix[:, :shared_count] = factors.by_shared
+        matrix[:, begin:end] = factors.by_local.T  # by_local has a row for each unknown
+        return matrix.reshape(sample_count, channel_count, -1)
 
     def _covariance_factors(self, rows: TrialJacobian, local_count: int) -> _CovarianceFactors:
         """Return the factors of the covariance of a trial's prediction.
 
-        Parameters
-        ----------
-        rows : TrialJacobian
-            The derivatives of the trial, by its own L unknowns first.
-        local_count : int
-            The number L of the trial's own unknowns.
+        `rows` holds the derivatives (L + Q + E, N C) of the prediction by the unknowns: first by
+        the L = `local_count` unknowns of the trial itself, then by the shared ones.
         """
         local_rows, shared_rows = np.split(rows.jacobian, [local_count])
         factor, local_per_shared = rows.eliminate_local()

@@ -224,26 +224,29 @@ class Screen:
         return np.concatenate((*trial_changes, projections)), overlap, squared_size
 
     def shrink_change(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
-        """Return a change with so small a magnitude that it is linear in it, and the factor.
+        """Return the change at a magnitude so small that the readings respond linearly to it.
 
-        At the median of its prior an effect that moves a frequency may shift phases by many
-        radians. That change has another direction than the change at a small magnitude.
+        This matters because an effect that moves a frequency may shift phases by many radians at
+        the median of its prior. Such a change of the readings points in another direction than that
+        of a small effect, so a scale or an overlap computed from it would be wrong for a small one.
 
         Returns
         -------
         change : ScreenedChange
-            The change at the smaller magnitude; the given one if it is small already.
+            The change at the smaller magnitude, at which the squared change of all readings is
+            about `SEARCH.first_order_change`; the given one if it is no larger than that.
         factor : float
-            The factor on the magnitude, at most 1.
+            The factor, at most 1, by which the magnitude was multiplied.
         """
+        # the first entries of the vector, with a positive sign, are the readings; the projections
+        # on the nuisances follow with a negative sign, and do not count here
         is_reading = self.inner_product_signs > 0.0
-        squared_size = float((change.vector[is_reading] ** 2).sum())
-        factor = sqrt(SEARCH.first_order_change / squared_size) if squared_size > 0.0 else 1.0
+        squared_change = float((change.vector[is_reading] ** 2).sum())
+        factor = sqrt(SEARCH.first_order_change / squared_change) if squared_change > 0.0 else 1.0
         if factor >= 1.0:
             return change, 1.0
-        return self.change_by_effect(
-            change.term, change.term.multiply_magnitudes(change.effect_values, factor)
-        ), factor
+        small_values = change.term.multiply_magnitudes(change.effect_values, factor)
+        return self.change_by_effect(change.term, small_values), factor
 
     def changes_on_grid(
         self, term: EffectTerm, *, with_small_magnitude: bool = True
@@ -377,24 +380,25 @@ def parameter_grid(
 def _magnitude_levels(
     parameter: EffectParameter | ShapeParameter, *, is_first: bool, with_small_magnitude: bool
 ) -> tuple[float, ...]:
-    """Return the scaled values at which a magnitude is tried in the grid.
+    """Return the scaled values at which a magnitude of an effect is tried in the grid.
 
-    Parameters
-    ----------
-    parameter : EffectParameter or ShapeParameter
-        The parameter that is the magnitude of the effect.
-    is_first : bool
-        Whether it is the first magnitude of its effect. The screen finds the best factor on that
-        one, of either sign, so that it needs fewer values than others.
-    with_small_magnitude : bool
-        Whether a first magnitude that may be negative is tried at a small value too.
+    Scaled values have a standard normal prior: 0 is the prior median, and 1 and -1 are one prior
+    deviation above and below it. The first case that holds decides:
+
+    1. The first magnitude, whose entry in the catalogue gives a number of `levels`: that many
+       quantiles of its prior.
+    2. A magnitude of one sign, such as a mass: its prior median.
+    3. A further magnitude of either sign: its median, zero, and one deviation to both sides.
+    4. The first magnitude of either sign: one deviation, and if `with_small_magnitude` also
+       `SEARCH.small_magnitude`. That is enough, because the screen computes the best factor on the
+       first magnitude, of either sign, from the change at any value but zero.
     """
     has_own_levels = parameter.levels > 0
     if has_own_levels and is_first:
         return _prior_quantiles(parameter)
-    # the prior of a magnitude that may have both signs has the median zero
-    may_be_negative = parameter.prior.value(0.0) == 0.0
-    if not may_be_negative:
+    prior_median = parameter.prior.value(0.0)
+    has_either_sign = prior_median == 0.0
+    if not has_either_sign:
         return (0.0,)
     if not is_first:
         return (-1.0, 0.0, 1.0)
@@ -404,7 +408,7 @@ def _magnitude_levels(
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:
-    """Return scaled values of a parameter, one for each of its levels.
+    """Return the scaled values at which a parameter with `levels` is tried, as many as it says.
 
     They are the medians of intervals of equal prior probability.
     """

@@ -93,7 +93,7 @@ class FmuModel(DescribedModel):
         self._force_inputs = {
             place: self.variables.variable(name) for place, name in inputs.force.items()
         }
-        self._held_inputs = {
+        self._variable_of_input = {
             section.name: self.variables.variable(section.variable) for section in description.input
         }
         self.load_places = tuple(self._force_inputs)
@@ -118,7 +118,19 @@ class FmuModel(DescribedModel):
         self.fmu.close()
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the model can carry a primitive."""
+        """Return whether the model can carry a primitive.
+
+        A primitive needs inputs of the FMU that the description names:
+
+        ========================  ==========================================
+        sensors                   nothing, as they act on readings
+        kinds under `[effects]`   nothing else
+        `LoadGain`                a force
+        `RegionStiffnessLoss`     a region
+        `LoadPlace`               a force and a bending moment
+        forces of laws            a port
+        ========================  ==========================================
+        """
         inputs = self.description.inputs
         if primitive in SENSORS or primitive.kind in self.description.effects:
             return True
@@ -326,29 +338,34 @@ class FmuModel(DescribedModel):
     def _loads_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
     ) -> dict[str, FloatArray]:
-        """Return the FMU inputs in the N rows of a trial at rest: values (N,) by variable name.
+        """Return the values (N,) of the FMU's inputs in the N rows of a trial at rest, by variable.
 
-        A flight sets only the load factor. Other trials set their recorded inputs with the offsets,
-        and the force at the load place if there is one, or if nothing else is recorded.
+        - A flight sets only the load factor.
+        - Other trials set the inputs that they hold, with the fitted offsets, and the recorded
+          force at their load place. If they hold inputs, a force that is zero in all rows is not
+          set.
+
+        Raises `ModelError` if a trial of either kind holds an input that the FMU lacks.
         """
         offsets = conditions.offset or (0.0,) * len(trial.inputs)
         loads: dict[str, FloatArray] = {}
         for recorded, offset in zip(trial.inputs, offsets, strict=True):
-            if recorded.name not in self._held_inputs:
+            if recorded.name not in self._variable_of_input:
                 raise ModelError(
                     f"The trial {trial.name!r} holds the input {recorded.name!r}, which the FMU "
-                    f"model {self.name!r} does not have; it has {comma_list(self._held_inputs)}: "
-                    "name it in [[input]]."
+                    f"model {self.name!r} does not have; it has "
+                    f"{comma_list(self._variable_of_input)}: name it in [[input]]."
                 )
-            variable = self._held_inputs[recorded.name]
+            variable = self._variable_of_input[recorded.name]
             loads[variable] = self.variables.input_factors[variable] * (recorded.values + offset)
         if trial.kind is TrialKind.FLIGHT:
             load_factor = str(self.description.inputs.load_factor)
             return {self.variables.variable(load_factor): trial.load_factor}
         if not loads or np.any(trial.force):
-            force = self._load_change(patch).apply_to(trial.force, trial.force)
-            for name, factor in self._force_factors(trial, patch).items():
-                loads[name] = force * factor
+            # no offset of the recorder is fitted to the force of a trial at rest
+            force = self._load_change(patch).apply_to(trial.force, recorded_values=trial.force)
+            for variable, factor in self._force_factors(trial, patch).items():
+                loads[variable] = force * factor
         return loads
 
     # ------------------------------------------------------------ ports

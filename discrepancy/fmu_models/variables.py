@@ -8,7 +8,11 @@ from typing import NamedTuple
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
+from discrepancy.fmu_models.description import (
+    FmuInputSection,
+    FmuModelDescription,
+    FmuOutputSection,
+)
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.binding import Binding, BindingHeader, load_binding
 from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding, expand
@@ -16,6 +20,7 @@ from reporting.words import counted
 
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
 """Units of FMUs in which an angular velocity is revolutions per minute."""
+RPM_PER_RADIAN_PER_SECOND = 30.0 / pi
 
 
 class ObservedVariable(NamedTuple):
@@ -75,7 +80,7 @@ class FmuVariables:
         self._parameter_keys = {variable.variable: key for key, variable in base.parameter.items()}
         self._parameter_keys |= {key: key for key in base.parameter}
         # what the model needs
-        self.input_factors: dict[str, float] = {}
+        self.input_factors = self._factors_of_inputs()
         self.quantities: dict[str, Quantity] = {}
         loads = self._bound_inputs()
         parameters = self._bound_parameters(base.parameter)
@@ -103,10 +108,7 @@ class FmuVariables:
         return self._parameter_keys.get(name, name)
 
     def _bound_inputs(self) -> dict[str, InputBinding]:
-        """Return the inputs that trials set, by the FMU's names.
-
-        `input_factors` gets the factor from the SI value to the FMU's unit of each `[[input]]`.
-        """
+        """Return the inputs that trials set, each with its unit, by the FMU's names."""
         description = self._description
         inputs = description.inputs
         units: dict[str | None, str] = dict.fromkeys(inputs.force.values(), "N")
@@ -121,20 +123,32 @@ class FmuVariables:
         for port in description.port:
             units[port.force] = "N.m" if port.rotation else "N"
         for section in description.input:
-            unit = self._unit_of_variable(section.variable)
-            is_angular_velocity = section.quantity is Quantity.ANGULAR_VELOCITY
-            is_in_revolutions = is_angular_velocity and unit in REVOLUTIONS
-            variable = self.variable(section.variable)
-            self.input_factors[variable] = 30.0 / pi if is_in_revolutions else 1.0
-            if not is_in_revolutions:
-                unit = self._unit_of_quantity(section.quantity, section.variable)
-            units[section.variable] = unit
+            if self._is_in_revolutions(section):  # `input_factors` converts instead of the binding
+                units[section.variable] = self._unit_of_variable(section.variable)
+            else:
+                units[section.variable] = self._unit_of_quantity(section.quantity, section.variable)
         bound: dict[str, InputBinding] = {}
         for name, unit in units.items():
-            if name is not None:
+            if name is not None:  # an optional input that the description does not name
                 variable = self.variable(name)
                 bound[variable] = InputBinding(variable=variable, unit=unit)
         return bound
+
+    def _factors_of_inputs(self) -> dict[str, float]:
+        """Return the factor from the SI value of each `[[input]]` to the value that the FMU takes.
+
+        It is one, as the binding converts units, but for an angular velocity in revolutions.
+        """
+        factors = {}
+        for section in self._description.input:
+            factor = RPM_PER_RADIAN_PER_SECOND if self._is_in_revolutions(section) else 1.0
+            factors[self.variable(section.variable)] = factor
+        return factors
+
+    def _is_in_revolutions(self, section: FmuInputSection) -> bool:
+        """Return whether an input is an angular velocity in revolutions per minute."""
+        unit = self._unit_of_variable(section.variable)
+        return section.quantity is Quantity.ANGULAR_VELOCITY and unit in REVOLUTIONS
 
     def _bound_parameters(
         self, known_bindings: Mapping[str, ParameterBinding]

@@ -1,4 +1,7 @@
-"""Errors of instruments that are no name: too small, or no other than a moved parameter."""
+"""Errors of instruments that a verdict does not name.
+
+They are too small, or cannot be told from a change of the model's parameters.
+"""
 
 from dataclasses import replace
 
@@ -159,19 +162,24 @@ def _implausible_parameters_clause(search: Search) -> str:
 
 
 def notable_terms(comparison: Comparison[HypothesisT], fit: CandidateFit) -> set[tuple[str, str]]:
-    """Return the pairs (label, place) of the effects of a fit that are worth a name of their own.
+    """Return the effects of a fit that deserve a name of their own, as pairs (label, place).
 
-    Errors of instruments that are too small to be named are left out. So are all errors of readings
-    if the campaign has only one channel, under a recorded drive: such an error could not be told
-    from a change of the model's parameters.
+    Two kinds of effects are left out:
+
+    - Errors of instruments that are too small to be named.
+    - All errors of readings, if the campaign has a single channel under a recorded drive. A gain of
+      that channel scales the whole response, as a change of the model's parameters would, so the
+      readings cannot show which of the two it is.
     """
     problem = comparison.problem
-    one_channel = has_one_driven_channel(problem)
+    has_one_channel = has_one_driven_channel(problem)
     patches = fit.candidate.patches(problem.setting, fit.effect)
-    notable_key = set()
+    notable_keys = set()
     for term, patch in zip(fit.candidate.terms, patches, strict=True):
         if is_negligible_instrument_error(problem, patch, least_unstated_gain=LEAST_UNSTATED_GAIN):
             continue
-        if comparison.acts_on_structure(term) or not one_channel:
-            notable_key.add((term.label, term.place))
-    return notable_key
+        is_error_of_readings = not comparison.acts_on_structure(term)
+        if is_error_of_readings and has_one_channel:
+            continue
+        notable_keys.add((term.label, term.place))
+    return notable_keys

@@ -24,7 +24,7 @@ MOVED_DEVIATIONS = 2.0
 """Distance from the stated value, in stated deviations, above which an unknown is reported."""
 GAIN_OF = "gain of "
 ZERO_OF = "zero of "
-"""With what the name of a gain, or of a zero, begins."""
+"""Beginnings of the names of gains and zeros."""
 LEAST_MOVE_WITHIN_PRIOR = 1.0
 """Distance from the stated value, in stated deviations, above which a move may use up a prior."""
 LEAST_RELATIVE_MOVE = 0.02
@@ -259,14 +259,18 @@ def hiding_sentences(
     moved_within_prior: Sequence[MovedUnknown],
     sensors: Sequence[SensorEstimate],
 ) -> str:
-    """Return sentences on where an error of the model may hide if the model leaves noise alone.
+    """Return sentences on the unknowns in which an error of the model may hide.
+
+    They are meant for a fit without an effect whose residuals are only noise: the fit may have
+    absorbed an error of the model by moving these unknowns away from their true values.
 
     Parameters
     ----------
     moved : sequence of MovedUnknown
         The unknowns that the fit moves far from what is stated.
     moved_within_prior : sequence of MovedUnknown
-        The unknowns that the fit moves far within wide stated deviations.
+        The unknowns that the fit moves far, but not improbably far, as their stated deviations are
+        wide.
     sensors : sequence of SensorEstimate
         The gains and zeros in the same fit, with their posterior deviations.
 

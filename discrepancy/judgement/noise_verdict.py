@@ -88,7 +88,7 @@ def nothing_missing_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
 
 
 def named_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
-    """Return the verdict that names the leading set."""
+    """Return the verdict that the effects of the leading set are missing, each by its name."""
     fit = with_draws(case.problem, case.leading_fit)
     checked_fit = case.tested_set
     effects = named_effects(case.problem, fit)
@@ -107,19 +107,24 @@ def named_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
 
 
 def family_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -> VerdictOutcome:
-    """Return the verdict that names the family of a law that was fitted with a free shape.
+    """Return the verdict that a force of a certain family is missing, with a fitted shape.
+
+    Laws of one family, such as all dampings, differ only in their shape, for example the exponent
+    of the velocity. If no law of the catalogue has the right shape, it is fitted too (it is free),
+    and the family is all that can be named.
 
     Parameters
     ----------
     case : NoiseCase
-        The hypotheses.
+        The set of effects that is considered for a name, its leading set, with its probability.
     checked_fit : CheckedFit
-        The leading set with a free shape.
+        The fit of this set with the free shape, and its tests.
     """
-    fit = with_draws(case.problem, checked_fit.fit)
+    fit = with_draws(case.problem, checked_fit.fit)  # intervals of a posterior that is not Gaussian
     effects = named_effects(case.problem, fit)
-    free_terms = [term for term in fit.candidate.terms if term.free_shape]
-    family = ", ".join(sorted({term.effect.family for term in free_terms}))
+    terms_of_free_shape = [term for term in fit.candidate.terms if term.free_shape]
+    family = ", ".join(sorted({term.effect.family for term in terms_of_free_shape}))
+    # a force that is the only effect, given point by point as a curve, is described by that curve
     sentence = curve_sentence(case.problem, effects, case.probability)
     if not sentence:
         other_names = ", ".join(effect.name for effect in effects if not effect.shape)

@@ -155,46 +155,54 @@ class Search(FittedCandidates):
         )
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
-        """Fit effects by few steps from the best points of a screen, the most promising first.
+        """Fit each promising effect in a few steps, and return the best fit of each.
+
+        A screen predicts to first order by how much an effect would decrease the misfit, its gain,
+        at each place and point of a grid of its parameters. Effects whose gain is too small are not
+        fitted. The fits of the others start from the points of the largest gain, and the effect of
+        the largest gain is fitted first.
 
         Parameters
         ----------
         base : CandidateFit
             The fit that effects are added to.
         effects : sequence of Effect
-            The effects to add, one at a time. Those of too small a gain are not fitted.
-
-        Returns
-        -------
-        list of CandidateFit
-            The best fit of each effect that was fitted.
+            The effects to add, one at a time.
         """
         has_effects = bool(base.candidate.terms)
         least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
-        # screen all effects
+        starts_by_effect = []
+        for changes in self._promising_changes(base, effects, least_gain):
+            starts = [
+                start_with_added_effect(base, change.term, change.best_values) for change in changes
+            ]
+            starts_by_effect.append(starts)
+        return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
+
+    def _promising_changes(
+        self, base: CandidateFit, effects: Sequence[Effect], least_gain: float
+    ) -> list[list[ScreenedChange]]:
+        """Screen effects at a base, and return the best changes of the prediction by each.
+
+        Changes with a gain below `least_gain` [nat] are left out, and so are effects without any
+        other. The effect of the largest gain comes first. If the base has no effect, the largest
+        gain of each effect is kept in `screened_gains`.
+        """
         screen = Screen(self.problem, base)
         changes_by_effect = []
         for effect in report_each(
             self.on_progress, effects, lambda effect: f"screening {effect.identifier}"
         ):
             changes = best_changes_by_effect(screen, effect)
-            if not has_effects:
+            if not base.candidate.terms:
                 gains = [change.gain for change in changes]
                 self.screened_gains[effect.identifier] = max(gains, default=0.0)
-            changes_by_effect.append([change for change in changes if change.gain >= least_gain])
-        changes_by_effect.sort(
-            key=lambda changes: -max((change.gain for change in changes), default=0.0)
+            promising_changes = [change for change in changes if change.gain >= least_gain]
+            if promising_changes:
+                changes_by_effect.append(promising_changes)
+        return sorted(
+            changes_by_effect, key=lambda changes: -max(change.gain for change in changes)
         )
-        # fit the promising ones
-        starts_by_effect = []
-        for changes in changes_by_effect:
-            if changes:
-                starts = [
-                    start_with_added_effect(base, change.term, change.best_values)
-                    for change in changes
-                ]
-                starts_by_effect.append(starts)
-        return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
 
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
         """Return a base whose nuisances are not distorted by the errors of the model.

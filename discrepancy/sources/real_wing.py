@@ -43,7 +43,8 @@ The plots show the same motion on the same grid, so that the error is common to 
 averaging does not reduce it.
 """
 TREND_COLUMNS = 67
-"""Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
+"""Columns of the moving average that is the drifting zero: 0.54 s, three periods of the first
+mode."""
 WINDOW_BEGIN = 0.8
 """Start of the window after the release [s].
 
@@ -54,6 +55,8 @@ AVERAGED_COLUMNS = 4
 
 Four columns (32 ms) have a zero of their frequency response at 30.8 Hz, where the second bending
 mode rings."""
+LEAST_SAMPLES = 60
+"""Least number of samples of a ring-down."""
 RELEASE = {"displacement": 0.05, "deviation": 1.0, "at_rest": False, "mode_count": 2}
 """Release of the ring-downs: nominal displacement of the tip at the start of the window [m].
 
@@ -238,23 +241,40 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 
 
 def _plot_window(
-    record: RingDownRecord, zero: FloatArray, begin: float, columns: int
+    record: RingDownRecord, zero: FloatArray, begin: float, columns_per_sample: int
 ) -> PlotWindow:
-    """Return a record minus its slow zero from `begin` [s] on, averaged over groups of columns.
+    """Return the samples of a ring-down from `begin` [s] on, without the drift of its zero.
 
-    The record has a value for each column of the plot. Where the zero (N,) [V] is nan, the record
-    is left out, as is an incomplete group of columns at the end. The times of the result are even
-    and start at zero. Raises `CampaignDataError` if fewer than 60 samples are left.
+    The record was digitised from a published plot, with one value for each column of pixels. Each
+    sample is the mean of `columns_per_sample` such values. Left out are columns where the zero is
+    not known, and columns at the end that do not fill a sample. The sampling interval of the result
+    is constant, and its time starts at zero.
+
+    Parameters
+    ----------
+    record : RingDownRecord
+        The record, with N columns.
+    zero : (N,) ndarray
+        The slowly drifting zero of the signal [V], nan where it is not known.
+    begin : float
+        Start of the window after the release [s].
+    columns_per_sample : int
+        The number of columns that are averaged.
+
+    Raises
+    ------
+    CampaignDataError
+        If fewer than `LEAST_SAMPLES` samples are left.
     """
     inside = np.flatnonzero(np.isfinite(zero) & (record.time >= begin))
-    count = len(inside) // columns
-    if count < 60:
+    count = len(inside) // columns_per_sample
+    if count < LEAST_SAMPLES:
         raise CampaignDataError(
             f"{record.source}: {counted(count, 'sample')} {is_or_are(count)} left after {begin:g} "
-            "s; 60 are needed."
+            f"s; {LEAST_SAMPLES} are needed."
         )
-    groups = inside[: count * columns].reshape(count, columns)  # indices of the averaged values
-    time = record.time[groups].mean(axis=1)
+    columns_of_sample = inside[: count * columns_per_sample].reshape(count, columns_per_sample)
+    time = record.time[columns_of_sample].mean(axis=1)
+    signal = np.asarray((record.signal - zero)[columns_of_sample].mean(axis=1))
     interval = float(time[-1] - time[0]) / (count - 1)
-    signal = np.asarray((record.signal - zero)[groups].mean(axis=1))
     return PlotWindow(interval * np.arange(float(count)), signal)

@@ -82,9 +82,23 @@ class LumpedModel(DescribedModel, SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether a patch of this model may hold a primitive.
 
-        A law needs ports. A law of the displacement needs ports that are displaced: where a port is
-        a state, such as the level of a tank, only its rate and its value act, and its position
-        means nothing. Errors of sensors are possible with any model.
+        It needs that on which the primitive acts:
+
+        ======================  ======================================================
+        laws of the velocity    a port
+        other laws              ports, all of which are displaced
+        `StiffnessDrift`        a displacement
+        `ModulusTemperature`    nothing
+        `PointMass`             a place
+        `SupportCompliance`     a support that may yield
+        `LoadGain`              nothing
+        `LoadPlace`             an input with a derivative by its station
+        `PortLoad`              a port
+        sensors                 nothing, as they act on readings
+        ======================  ======================================================
+
+        A port that is a state, such as the level of a tank, is not displaced: only its value and
+        its rate act, and its position means nothing.
         """
         description = self.description
         if primitive in LAWS:
@@ -94,7 +108,7 @@ class LumpedModel(DescribedModel, SystemModel):
             )
             return bool(self.port_rows) and (primitive.depends_on_speed or all_ports_are_displaced)
         can_move_load = any(section.station_derivative is not None for section in description.input)
-        carried: dict[type[Primitive], bool] = {
+        is_carried: dict[type[Primitive], bool] = {
             changes.StiffnessDrift: description.displacement_count > 0,
             changes.ModulusTemperature: True,
             changes.PointMass: bool(self._places),
@@ -103,7 +117,7 @@ class LumpedModel(DescribedModel, SystemModel):
             changes.LoadPlace: can_move_load,
             PortLoad: bool(self.port_rows),
         }
-        return carried.get(primitive, primitive in SENSORS)
+        return is_carried.get(primitive, primitive in SENSORS)
 
     def region_losses(
         self, trial: Trial, health: FloatArray, patch: ModelPatch = NO_PATCH

@@ -320,31 +320,32 @@ def _integrate_from(
     excitation: Excitation,
     laws: PortLaws,
     first_time: float,
-    stamps: FloatArray,
-    begin: InitialMotion,
+    sample_times: FloatArray,
+    first_state: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
-    """Return the motion at times `stamps` (N,) [s], from the state `begin` at `first_time` [s].
+    """Return the motion at the sample times (N,) [s], given the state at `first_time` [s].
 
-    If the first stamp is not later than `first_time`, beyond rounding, the state is taken as that
-    at the first stamp.
+    If the first sample is not later than `first_time`, beyond rounding, the state is taken as that
+    at the first sample.
     """
-    tolerance = LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
-    is_late = stamps[0] - first_time > tolerance
+    duration = sample_times[-1] - sample_times[0]
+    tolerance = LEAST_LEAD * duration / max(len(sample_times) - 1, 1)
+    is_late = sample_times[0] - first_time > tolerance
     is_excited = excitation.loads or excitation.prescribed_motions
     # a free linear motion has a closed form, without steps
     if not is_excited and laws.linear:
-        since_begin = stamps - (first_time if is_late else stamps[0])
-        free_motion = system.modal_system.free_motion(begin.q, begin.v, since_begin)
+        since_begin = sample_times - (first_time if is_late else sample_times[0])
+        free_motion = system.modal_system.free_motion(first_state.q, first_state.v, since_begin)
         if free_motion is not None:
             q, v = free_motion
-            no_forces = np.zeros((len(stamps), 0))
+            no_forces = np.zeros((len(sample_times), 0))
             return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
-        return _integrate_in_steps(system, excitation, laws, stamps, begin, refinement)
+        return _integrate_in_steps(system, excitation, laws, sample_times, first_state, refinement)
     # integrate from the earlier begin, and leave out the start itself
-    from_begin = np.append(first_time, stamps)
-    motion = _integrate_in_steps(system, excitation, laws, from_begin, begin, refinement)
+    from_begin = np.append(first_time, sample_times)
+    motion = _integrate_in_steps(system, excitation, laws, from_begin, first_state, refinement)
     return motion._replace(
         q=motion.q[1:],
         v=motion.v[1:],
@@ -357,44 +358,59 @@ def _integrate_in_steps(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
-    stamps: FloatArray,
-    begin: InitialMotion,
+    sample_times: FloatArray,
+    first_state: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
-    """Return the motion at times (N,) [s] from a state at the first of them, step by step."""
-    modal = system.modal_system
+    """Return the motion at the sample times, integrated in time steps from the state at the first.
+
+    Parameters
+    ----------
+    laws : PortLaws
+        The laws of the J internal forces at ports.
+    sample_times : (N,) array
+        The times of the N samples [s].
+    first_state : InitialMotion
+        Modal coordinates and their rates at the first sample.
+    refinement : int
+        Factor on the number of steps in each sampling interval.
+    """
+    # Divide the sampling intervals into K steps. A load that follows a curve needs several straight
+    # lines in an interval, and a step must end wherever a law switches or a load jumps.
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
-    least_parts = SMOOTH_PARTS if follows_curve else 1
-    edges = np.concatenate((laws.switching_times, excitation.jump_times))
-    boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
-    # displacements (K + 1, J) of the laws' ports under loads, in the modes without inertia
-    port_displacements = np.zeros((len(boundaries.time), len(laws)))
+    least_steps_per_interval = SMOOTH_PARTS if follows_curve else 1
+    jump_times = np.concatenate((laws.switching_times, excitation.jump_times))
+    modal = system.modal_system
+    step_ends = step_boundaries(
+        modal, laws, sample_times, refinement, least_steps_per_interval, jump_times
+    )
+    # The modes that are not integrated have no inertia, so they follow the loads at once. The
+    # displacements (K + 1, J) that this causes at the ports act on the laws, too.
+    port_displacements = np.zeros((len(step_ends.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
-        residual = system.residual_displacements(system.rows_of_laws(laws).T)
-        port_displacements = excitation.loads_at(boundaries.time, residual)
-    steps = _linear_steps(system, excitation, boundaries, port_displacements)
-    return integrate_motion(modal, laws, steps, begin, compiled_kernel())
+        residual_flexibility = system.residual_displacements(system.rows_of_laws(laws).T)  # (n, J)
+        port_displacements = excitation.loads_at(step_ends.time, residual_flexibility)
+    steps = _linear_steps(system, excitation, step_ends, port_displacements)
+    return integrate_motion(modal, laws, steps, first_state, compiled_kernel())
 
 
 def _linear_steps(
     system: LinearSystem,
     excitation: Excitation,
-    boundaries: Boundaries,
+    step_ends: Boundaries,
     port_displacements: FloatArray,
 ) -> StepArrays:
-    """Return the linear steps of all coordinates between time boundaries.
+    """Return the linear part of the motion in K time steps, for all coordinates.
 
-    Modal coordinates are integrated under their forces; the coordinate of a drive takes the values
-    of its prescribed motion. `port_displacements` (K + 1, J) are those of the laws' ports under the
-    loads, in the modes without inertia, at the K + 1 boundaries of the steps [m].
+    Modal coordinates respond to their forces; the coordinate of a drive takes the values of its
+    prescribed motion. `port_displacements` (K + 1, J) [m] are those that the loads cause at the
+    ports of the J laws in the modes without inertia, at the K + 1 ends of the steps.
     """
-    time = boundaries.time
+    time = step_ends.time
     begin_force, end_force = equivalent_ramps(
         lambda times: system.modal_forces(excitation, times), time
     )
-    steps = loaded_steps(
-        system.modal_system, boundaries, begin_force, end_force, port_displacements
-    )
+    steps = loaded_steps(system.modal_system, step_ends, begin_force, end_force, port_displacements)
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps

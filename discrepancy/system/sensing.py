@@ -1,7 +1,7 @@
 """Readings of the channels of a trial: a model's response, changed by the sensors of a patch."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,21 +31,20 @@ class LoggerRates(NamedTuple):
     channels: FloatArray
 
 
-@dataclass(frozen=True)
-class TurnedGauges:
-    """Strain channels of a trial, if a patch turns gauges, and the outputs that readings need.
+class OutputsForSensors(NamedTuple):
+    """The outputs that a model has to compute so that the sensors of a patch can act on them.
 
     Attributes
     ----------
-    columns : list of int
-        Columns of all strain channels; empty if the patch turns no gauge.
     outputs : tuple of (str, Quantity)
-        All outputs that the model has to give: those of the channels, then the transverse strain
-        of each such channel, then the shear strain of each.
+        The outputs of the C channels, then the transverse strain of each of the G strain channels
+        below, then the shear strain of each.
+    strain_columns : list of int
+        The columns of all G strain channels among the channels; empty if the patch turns no gauge.
     """
 
-    columns: list[int]
     outputs: Outputs
+    strain_columns: list[int]
 
 
 def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
@@ -115,16 +114,16 @@ def observe(
     trial, patch = shift_clock_to_first_sample(trial, patch)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, campaign.outputs(trial), patch, conditions)
-    gauges = _find_turned_gauges(model, campaign, trial, patch)
-    response = _response_in_clocks(model, campaign, trial, patch, conditions, gauges)
-    # columns: the C channels, transverse strains of the G gauges, their shear strains
+    needed = _outputs_for_sensors(model, campaign, trial, patch)
+    response = _response_in_clocks(model, campaign, trial, patch, conditions, needed)
+    # columns: the C channels, transverse strains of the G strain channels, their shear strains
     channel_count = len(trial.channels)
-    gauge_count = len(gauges.columns)
+    gauge_count = len(needed.strain_columns)
     values = response.values  # (N, C + 2 G)
     transverse = np.zeros((len(values), channel_count))
     shear = np.zeros((len(values), channel_count))
-    transverse[:, gauges.columns] = values[:, channel_count : channel_count + gauge_count]
-    shear[:, gauges.columns] = values[:, channel_count + gauge_count :]
+    transverse[:, needed.strain_columns] = values[:, channel_count : channel_count + gauge_count]
+    shear[:, needed.strain_columns] = values[:, channel_count + gauge_count :]
     rates = response.rates[:, :channel_count] if response.rates is not None else None
     channel_response = Response(values[:, :channel_count], rates)
     return observe_response(
@@ -132,34 +131,39 @@ def observe(
     )
 
 
-def _find_turned_gauges(
+def _outputs_for_sensors(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch
-) -> TurnedGauges:
-    """Return the strain channels of a trial and all outputs that the model has to compute.
+) -> OutputsForSensors:
+    """Return the outputs that a model has to compute for a trial, and the columns of its strains.
 
-    If no primitive of the patch turns gauges, there are no strain channels in the result, and the
-    outputs are those of the channels. Otherwise the transverse and shear strains are added.
+    - If the patch turns no gauge, the outputs are those of the channels, and no columns are
+      returned, because no strain is needed beside them.
+    - If it turns a gauge, the transverse and the shear strain are added for every strain channel,
+      also for one that is not turned: `observe_response` decides which channels turn.
 
     Raises
     ------
     ModelError
-        If the model gives no strain across a turned gauge.
+        If gauges are turned, but the model does not compute these strains.
     """
-    outputs = campaign.outputs(trial)
+    channel_outputs = campaign.outputs(trial)
     if not len(patch.of(SensorRotation)):
-        return TurnedGauges([], outputs)
-    columns = [
-        column for column, (_, quantity) in enumerate(outputs) if quantity is Quantity.STRAIN
-    ]
-    across = []
-    for ending in ACROSS:
-        across += [(outputs[column][0] + ending, Quantity.STRAIN) for column in columns]
-    if not all(model.output_quantity(output) for output, _ in across):
+        return OutputsForSensors(channel_outputs, [])
+    strain_columns = []
+    strain_names = []
+    for column, (name, quantity) in enumerate(channel_outputs):
+        if quantity is Quantity.STRAIN:
+            strain_columns.append(column)
+            strain_names.append(name)
+    transverse_and_shear = []
+    for ending in ACROSS:  # all transverse strains come before the first shear strain
+        transverse_and_shear += [(name + ending, Quantity.STRAIN) for name in strain_names]
+    if not all(model.output_quantity(name) for name, _ in transverse_and_shear):
         raise ModelError(
             f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be "
             "computed: leave gauge misalignment out for this model."
         )
-    return TurnedGauges(columns, (*outputs, *across))
+    return OutputsForSensors((*channel_outputs, *transverse_and_shear), strain_columns)
 
 
 def _response_in_clocks(
@@ -168,9 +172,9 @@ def _response_in_clocks(
     trial: Trial,
     patch: ModelPatch,
     conditions: Conditions,
-    gauges: TurnedGauges,
+    needed: OutputsForSensors,
 ) -> Response:
-    """Return the response of all outputs of `gauges` at the sample times of their own loggers.
+    """Return the response of all needed outputs at the sample times of their own loggers.
 
     The recorded inputs are first brought to their true times. All loggers agree at the first
     sample; the model is run once for each distinct rate of their clocks.
@@ -186,10 +190,10 @@ def _response_in_clocks(
         trial_in_true_time = replace(
             trial, time=trial.time + rates.inputs * (trial.time - first_stamp)
         )
-    # of each output: the channels, then the transverse strains and the shear strains of the turned
-    # gauges, which have the clock of their gauge
-    output_rates = np.append(rates.channels, np.tile(rates.channels[gauges.columns], 2))
-    values = np.zeros((len(trial.time), len(gauges.outputs)))
+    # of each output: the channels, then the transverse and the shear strains, which have the clock
+    # of their gauge
+    output_rates = np.append(rates.channels, np.tile(rates.channels[needed.strain_columns], 2))
+    values = np.zeros((len(trial.time), len(needed.outputs)))
     output_slopes = np.zeros_like(values)
     for rate in np.unique(rates.channels).tolist():
         # relative to the time of the inputs: (1 + rate) / (1 + input rate) (1 + clock rate) - 1
@@ -200,7 +204,7 @@ def _response_in_clocks(
         logger_clock = relative_rate, clock_zero - relative_rate * first_stamp
         clock_conditions = replace(conditions, clock=logger_clock)
         response = model.respond(
-            trial_in_true_time, gauges.outputs, without_sensors, clock_conditions
+            trial_in_true_time, needed.outputs, without_sensors, clock_conditions
         )
         is_sampled = output_rates == rate
         values[:, is_sampled] = response.values[:, is_sampled]

@@ -289,8 +289,18 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Return whether the structure can carry a primitive.
 
-        It carries sensors, laws at its ports, losses of its damage regions and patches, masses at
-        places, supports that yield, gauges beside their places, and errors of its forces.
+        It needs that on which the primitive acts:
+
+        ==========================  ==========================================
+        internal forces             a port
+        `RegionStiffnessLoss`       a damage region or a patch of the surface
+        `PlaceMass`                 a place for a mass
+        `LoadGain`                  a force
+        `LoadOffset`, `LoadTilt`    a force that may be moved or turned
+        `SupportCompliance`         a support that may yield
+        `GaugeOffset`               a gauge that may lie beside its place
+        sensors                     nothing, as they act on readings
+        ==========================  ==========================================
         """
         if primitive in INTERNAL_FORCES:
             return bool(self.ports)

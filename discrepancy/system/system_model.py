@@ -516,21 +516,27 @@ class SystemModel(Model):
         return motion
 
     def _static_displacements(self, case: PatchedTrial) -> FloatArray:
-        """Return the displacements (L, N) of all unknowns in the L rows of a static trial.
+        """Return the displacements (L, N) of all N unknowns of a structure at rest.
 
-        For a ring-down there is one row: the displacements from which the structure is released.
+        The L rows are those of a static trial. A ring-down has a single row: the shape in which the
+        structure is held before its release.
         """
         system = self.system_in_state(case.state)
         excitation = self.excitation(case)
-        if excitation.release is None:
-            directions, levels = excitation.load_levels
+        release_point = excitation.release
+        if release_point is None:
+            directions, levels = excitation.load_levels  # (D, N) and (L, D) for D loads
             return np.asarray(levels @ system.equilibrium_under(directions))
-        # The structure is held at the release point, so that it has the shape under a force there.
-        # The same row gives the direction of that force and the displacement of the point.
-        release_row = excitation.release.row
-        shape = system.equilibrium_under(release_row[None])
-        release_displacement = excitation.release.release.displacement
-        return np.asarray(release_displacement / float(release_row @ shape[0]) * shape)
+        # Compute the shape under a unit force at the release point, and scale it so that this point
+        # has its stated displacement. The row is both the direction of the force and, times the
+        # displacements, the displacement of the point.
+        row = release_point.row  # (N,)
+        shape_under_unit_force = system.equilibrium_under(row[None])  # (1, N)
+        displacement_under_unit_force = float(row @ shape_under_unit_force[0])
+        stated_displacement = release_point.release.displacement
+        return np.asarray(
+            stated_displacement / displacement_under_unit_force * shape_under_unit_force
+        )
 
 
 def _output_rows_at_rest(

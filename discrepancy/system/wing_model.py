@@ -170,9 +170,10 @@ class WingModel(SystemModel):
         )
 
     def supports(self, primitive: type[Primitive]) -> bool:
-        """Return whether the wing can carry a primitive.
+        """Return whether the wing can carry a primitive: any but those that need what it lacks.
 
-        It can carry all but forces by a formula in time and masses at named places.
+        It has no forces by a formula in time, no named places for masses, and neither loads nor
+        gauges that may be moved from their places.
         """
         not_carried = (
             changes.PortLoad,
