@@ -19,12 +19,12 @@ class TableClock(NamedTuple):
 
 
 def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
-    """Assign the columns of a table to its several columns of times.
+    """Decide at the times of which time column each reading column of a table was read.
 
-    Either the names show it, as in `acc2` and `time2`, or the positions: every column of times
-    comes before the columns read at its times, or every one comes after them. If both show it, they
-    must agree. Columns that are left out count for the order, but are not returned, and neither is
-    a column of times without columns.
+    The names of the columns show it, as in `acc2` and `time2`, or their order: every time column
+    stands before its reading columns, or every one stands after them. If names and order both show
+    it, they must agree. Reading columns that are left out count for the order, but are not
+    returned, and neither is a time column to which no reading column belongs.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def find_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
     Raises
     ------
     CampaignFileError
-        If neither names nor positions say which times a column has, or they contradict each other.
+        If neither names nor order show it, or if they contradict each other.
     """
     times = [column.head for column in columns if column.role == TIME]
     readings = [column.head for column in columns if column.role != TIME]

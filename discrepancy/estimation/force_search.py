@@ -147,10 +147,17 @@ class ForceSearch:
 
     @cached_property
     def estimate_without_effects(self) -> Estimate:
-        """The missing forces at several ports, estimated together.
+        """The missing forces at several ports together, if no effect of the catalogue acts.
 
         These are all ports of the model, or the `MOST_PORTS` ports with the largest evidence if
-        there are more. With a single port the result is the estimate at that port.
+        there are more. With a single port the result is the estimate at that port. Otherwise:
+
+        1. The search begins at the forces that were estimated at each port alone.
+        2. The most probable forces are found along the motion of the best of these estimates.
+        3. They are found again along the motion of that result, from its forces.
+
+        If the records are long, the forces in thinned records take the place of the first two
+        steps.
         """
         best_alone = self.best_port_estimate
         estimates_alone = sorted(
@@ -413,16 +420,19 @@ class ForceSearch:
     ) -> Estimate | None:
         """Return a set of effects near its most probable values, for a first comparison.
 
+        Two searches begin at the motion of `base`: one with its missing forces, which are lowered
+        step by step, the other with `processes`, which are small. The more probable result counts.
+
         Parameters
         ----------
         base : Estimate
-            The estimate whose motion is that to begin with. Its missing forces are one beginning.
+            The estimate without the last of the effects.
         candidate : Candidate
             The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters to begin with.
         processes : mapping of int to Process
-            The missing forces that may remain beside the effects, which are another beginning.
+            The missing forces that may remain beside the effects.
 
         Returns
         -------

@@ -213,9 +213,11 @@ class LinearisedTrial:
 
     @cached_property
     def known_states(self) -> FloatArray:
-        """The state (F, n, W) of the structure for a unit of each weight, without missing forces.
+        """The n states (F, n, W) at the fine stamps, by the weights, without missing forces.
 
-        It is the response to the laws and to parameters that change the linear system.
+        The states are linear in the W weights, which are one and the unknowns: entry w is what a
+        unit of weight w adds. It is the response to the forces of the laws, and to the parameters
+        that change the linear system.
         """
         trial = self.trial
         matrices = trial.substep_matrices

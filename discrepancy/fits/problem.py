@@ -442,10 +442,11 @@ class Problem:
         return float(misfits[self.sample_counts > 0].sum())
 
     def noise_precisions(self, squares: FloatArray) -> FloatArray:
-        """Return the expected noise precision of each channel over the recorded 1 / s0^2.
+        """Return the expected noise precision of each channel, as a ratio to the recorded 1 / s0^2.
 
         It is (n0 + n) / (n0 + RSS), the mean of its gamma posterior (see the module docstring), and
-        1 if the noise is known or the channel has no samples.
+        1 if the noise is known (n0 is infinite) or the channel has no samples. Without a noise
+        record n0 is zero, and RSS is kept away from zero.
 
         Parameters
         ----------
@@ -459,7 +460,7 @@ class Problem:
         return np.where(n > 0, precisions, 1.0)
 
     def recorded_or_estimated_precisions(self, squares: FloatArray) -> FloatArray:
-        """Return the noise precision of each channel over the recorded one.
+        """Return the noise precision of each channel, as a ratio to the recorded one.
 
         It is 1 for a channel with a noise record. The noise of other channels is estimated from
         their residuals, see `noise_precisions`.

@@ -218,7 +218,13 @@ class _NoiseFreedom(NamedTuple):
 def _noise_freedom(
     problem: Problem, fit: CandidateFit, directions: Iterable[Direction]
 ) -> _NoiseFreedom:
-    """Return the degrees of freedom of the noise of the channels that directions change."""
+    """Return how well the noise is known in the channels that some directions change.
+
+    The variance of the noise of such a channel is known from its record and from its residuals,
+    together with `record_freedom + sample_counts` degrees of freedom. The fit has absorbed some of
+    them; the result has those that are left, and their ratio to all. The freedom of a noise that is
+    stated exactly is infinite, and the ratio is then 1.
+    """
     channels: set[int] = set()
     for direction in directions:
         for trial_index, change in direction.items():

@@ -395,10 +395,16 @@ def _force_at_port(
 def _explanatory_variables_of_trials(
     trial_forces: Sequence[TrialForce],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return what `explanatory_variables` returns for the force in all trials together.
+    """Return the variables that explain the force in all trials together.
 
-    If displacement and velocity together explain clearly more than any variable alone, as for an
-    impact with loss, `STATE` is the only variable that the force depends on.
+    Returns
+    -------
+    shares : dict of str to float
+        The share of the force's variance that each variable explains, 0 to 1.
+    ordered_by : tuple of str
+        The variables that the force depends on, see `explanatory_variables`. If displacement and
+        velocity together explain clearly more than any variable alone, as for an impact with loss,
+        it is `STATE` alone.
     """
     # an input that was not recorded in a trial did not act there
     names = dict.fromkeys(name for trial in trial_forces for name in trial.variables)

@@ -297,7 +297,8 @@ class LumpedDescription(ModelDescription):
         """Yield the checks on the size, symmetry and definiteness of the matrices of a kind.
 
         Size and symmetry concern each matrix, definiteness the sum of a base matrix and its parts.
-        The first check of a file that fails is the last, so that later ones may rely on the size.
+        Each check says whether it has failed, and with which message. The caller stops at the first
+        that has, so the checks after that of the size may rely on it.
         """
         matrices = self.matrices_of(kind)
         for name, matrix in matrices.items():

@@ -314,10 +314,13 @@ class EffectLaws:
     ) -> FloatArray:
         """Return the change (N, C) of a trial's readings by an effect that is no force at a port.
 
+        Such an effect is an error of a sensor or of a clock, for example. The change is divided by
+        the noise. It is zero if the effect does not act in trials of this kind.
+
         Parameters
         ----------
         trial_index : int
-            The index of the trial.
+            The index of the trial in `trials`.
         trajectory : Trajectory
             The motion that the sensors measure.
         term : EffectTerm
