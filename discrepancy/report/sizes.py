@@ -218,16 +218,23 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
     Returns
     -------
     str
-        The unit; empty for a plain number, or if it is not determined.
+        The unit:
+
+        - the unit of the channel for "channel's unit"; empty for one that is relative to it
+        - a unit without "or" as it is, and empty for a plain number
+        - of "N/m or N m/rad", the first for what moves and the second for what turns, a port or a
+          support; both for a port that may do either
+        - the units of the port's own force and state, if these are neither
     """
     if unit.startswith(CHANNEL_UNIT):
         return _channel_unit(primitive, campaign) if unit == CHANNEL_UNIT else ""
     if " or " not in unit:
         return unit_text(unit)
-    if isinstance(primitive, SupportCompliance):
-        return unit.split(" or ")[primitive.motion.startswith("r")]
-    port = str(getattr(primitive, "port", ""))
     unit_if_moving, unit_if_turning = unit.split(" or ")
+    if isinstance(primitive, SupportCompliance):
+        is_turn = primitive.motion.startswith("r")  # such as "rx"; "x" is a displacement
+        return unit_if_turning if is_turn else unit_if_moving
+    port = str(getattr(primitive, "port", ""))
     force_unit, state_unit = model.port_units(port)
     if force_unit == MOVES[0]:
         return unit_if_moving

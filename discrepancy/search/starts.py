@@ -306,9 +306,10 @@ def _best_places(
 ) -> tuple[str, ...]:
     """Return the places at which an effect lowers the objective most in the first periods.
 
-    At each place, few of the levels (L,) are tried first, then those about the best of these: the
-    same first frequency belongs to another size at each place. Places that hardly differ stay in
-    their order, in which named sets come first.
+    Each place is searched on its own, since the size that gives the measured first frequency
+    differs between places: first with few of the levels (L,), then with those about the best of
+    these. Objectives are compared to two digits; places that are then equal stay in their order, in
+    which named sets come first.
     """
     early_problem = _problem_of_first_periods(problem)
     half_step = SEARCH.coarse_level_step // 2

@@ -199,6 +199,8 @@ def weight_moved_to_end(
     tangent_at_begin, tangent_at_end : (P, n) ndarray
         The derivative of the laws' force at a port by the state, at both ends.
     """
+    # -s of a port: its tangent times the changes of the state by a unit force at both ends, since
+    # the force acts at both. The tangents at both ends are tried, and the stiffest port decides.
     largest_stiffness = 0.0
     for p in range(len(tangent_at_begin)):
         stiffness_at_begin, stiffness_at_end = 0.0, 0.0

@@ -121,12 +121,19 @@ def _working_basis(full_model: PatchOperators) -> FloatArray:
 
 
 def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
-    """Return solutions (n, S) of the full model with the same loss in all damage regions."""
+    """Return solutions (n, S) of the full model with the same loss in all damage regions.
+
+    The columns are:
+
+    1. the solutions under the loads of `_snapshot_loads`, each of unit energy norm;
+    2. the lowest modes, also of unit energy norm: that of a mode is its angular frequency;
+    3. the solutions under the elastic forces of each part of the skin in all of these, as large as
+       they are.
+    """
     operators = full_model.operators
     health = dict.fromkeys(operators.regions, loss)
     factors = Factorisation(operators.stiffness(None, health))
     frequency, modes = natural_frequencies(operators, MODES, health, factors)
-    # solutions under loads, and modes, all of the same energy norm
     loads = _snapshot_loads(full_model, modes).T
     whitened_loads = factors.whitened(loads)
     dual_norm = np.linalg.norm(whitened_loads, axis=0)
@@ -134,7 +141,6 @@ def _snapshots(full_model: PatchOperators, loss: float) -> FloatArray:
     angular_frequency = 2.0 * np.pi * frequency
     unit_modes = modes / angular_frequency
     solutions = np.concatenate((responses, unit_modes), axis=1)
-    # solutions under the forces that each part of the skin takes in these solutions
     skin_forces = np.concatenate(_skin_forces(full_model, solutions), axis=1)
     skin_responses = factors.riesz(skin_forces)
     return np.concatenate((solutions, skin_responses), axis=1)

@@ -375,7 +375,9 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     body = operators.body
     grading = None
     if skin.stations:
-        # The temperature of a node is its station, on which the elasticity of the skin depends.
+        # CalculiX varies the elasticity within a cell by temperature alone, so the station of a
+        # node is given as its temperature, and the modulus there is a factor on the elasticity.
+        # That of the body has the modulus at the centre of each cell already: it is divided out.
         course = [(place.station, place.young_modulus) for place in skin.stations]
         _, y, _ = mesh.points.T
         grading = Grading(course, y / design.planform.semi_span, mesh.is_skin)
