@@ -171,7 +171,7 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, psutil.Process]]:
 
 def address_with_worker(port_file: Path) -> str:
     """Wait until a scheduler has a worker, and return its address."""
-    wait_until(port_file.is_file)
+    wait_until(lambda: port_file.is_file() and port_file.stat().st_size > 0)  # created, then written
     address: str = json.loads(port_file.read_text(encoding="utf-8"))["address"]
     with Client(address, timeout=HANGS) as client:
         client.wait_for_workers(1, timeout=HANGS)
