@@ -542,7 +542,8 @@ def _verdict_text(verdict: Verdict) -> str:
     return f"{verdict.kind.value}: {'; '.join(phrases)} {', '.join(verdict.group)}"
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run the campaigns that the command line asks for, and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=1)
@@ -551,3 +552,7 @@ if __name__ == "__main__":
     options = parser.parse_args()
     for line in results(options.folder, options.seed, options.parts, options.cases):
         print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
