@@ -56,10 +56,9 @@ class ForceSearch:
 
     Parameters
     ----------
-    problem : Problem
-        A problem with trials in motion, whose model has ports.
-    sample_limit : int, optional
-        The number of samples of all trials together to which trials are thinned, if they can be.
+    problem, sample_limit
+        The problem and the number of samples to which it is thinned, see `PortedProblem`; if there
+        is no such number, all samples count.
 
     Attributes
     ----------

@@ -162,6 +162,7 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
         else:
             for index, parameter in enumerate(term.parameters):
                 number = first_parameter + index
+                # such as the distance of a mass from a set of nodes, beside which none can lie
                 if parameter.levels == 1 and not term.depends_on(problem.setting, values, index):
                     continue
                 if index < len(term.effect.parameters):

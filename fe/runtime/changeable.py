@@ -32,6 +32,9 @@ LEAST_DIRECTION = 1e-11
 """Eigenvalue, relative to the largest, below which a direction of the columns is left out."""
 KEPT_SUBSPACES = 32
 """Number of sets of changes whose matrices are kept."""
+FITTED_REACH = 1.5
+"""Largest distance of a mass from its place along each axis, over the reach of the place. The
+displacements of the nodes within it give the derivatives of the displacement."""
 
 
 class AddedMass(NamedTuple):
@@ -252,13 +255,20 @@ class ChangeableModel(ReducedModel):
                 compliances[number] = compliances.get(number, 0.0) + primitive.compliance
             elif isinstance(primitive, PlaceMass):
                 first = 1 + len(self.supports)
-                number = first + self._place_number(self.mass_places, primitive.place, "a mass")
+                place = self._place_number(self.mass_places, primitive.place, "a mass")
+                self._check_distances(primitive, float(self.mass_reaches[place]))
+                number = first + place
                 masses.append(AddedMass(number, primitive.mass, primitive.along, primitive.across))
             elif isinstance(primitive, RegionStiffnessLoss):
                 if not 0.0 <= primitive.loss < 1.0:
                     raise InvalidPatchError(
                         f"The loss of the patch {primitive.region!r} must be at least 0 and below "
                         f"1, but is {primitive.loss:g}."
+                    )
+                if not primitive.extent > 0.0:
+                    raise InvalidPatchError(
+                        f"The extent of the loss of {primitive.region!r} must be positive, but is "
+                        f"{primitive.extent:g}."
                     )
                 first = 1 + len(self.supports) + len(self.mass_places)
                 number = first + self._place_number(self.loss_places, primitive.region, "a loss")
@@ -332,6 +342,19 @@ class ChangeableModel(ReducedModel):
                 across = self.load_changes[number]
                 load = np.cos(primitive.angle) * load + np.sin(primitive.angle) * across
         return load
+
+    def _check_distances(self, mass: PlaceMass, reach: float) -> None:
+        """Raise `InvalidPatchError` if a mass lies too far from its place, whose reach is in m.
+
+        The displacement is a Taylor series about the place, which does not hold further away.
+        """
+        largest = FITTED_REACH * reach
+        if max(abs(mass.along), abs(mass.across)) > largest:
+            raise InvalidPatchError(
+                f"A mass lies {mass.along:g} m along and {mass.across:g} m across of "
+                f"{mass.place!r}, where both distances must be {largest:.3g} m at most: take a "
+                "nearer place."
+            )
 
     def _place_number(self, places: tuple[str, ...], place: str, what: str) -> int:
         """Return the index of a location; raise `InvalidPatchError` if there is none."""

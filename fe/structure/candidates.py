@@ -13,7 +13,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.runtime.changeable import taylor_factors
+from fe.runtime.changeable import FITTED_REACH, taylor_factors
 from fe.runtime.errors import InvalidDesignError
 
 from .affine import AffineStructure
@@ -37,8 +37,6 @@ LARGEST_RADIUS = 0.12
 """Largest radius of a named set of cells that is a patch, relative to the size of the mesh."""
 LARGEST_NODE_SHARE = 0.5
 """A named set with this share of all nodes or more is no candidate: it is the structure itself."""
-FITTED_REACH = 1.5
-"""Radius of the nodes that give the derivatives of the displacement, over the reach of a point."""
 LEAST_SINGULAR_VALUE = 1e-3
 """Relative singular value below which nodes do not determine a derivative of the displacement."""
 DERIVATIVES = 5

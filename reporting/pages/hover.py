@@ -24,6 +24,7 @@ from matplotlib.lines import Line2D
 
 from reporting.arrays import Float
 from reporting.formats.table_file import is_number
+from reporting.json_file import JsonObject
 
 _POINTS_PER_INCH = 72.0
 _MOST_CELLS = 5000
@@ -32,8 +33,6 @@ _FEW_COLOURS = 20
 """Number of colours below which a colour map is taken to stand for names, such as those of
 controls, and not for values."""
 _SAME_POSITION = 1e-6  # of two panels, as a fraction of the figure
-
-JsonObject = dict[str, object]
 
 
 class _LineLook(NamedTuple):
@@ -220,8 +219,8 @@ def _panel_record(axes: Axes) -> JsonObject:
     box = axes.get_position()
     # Left, right, bottom, top; the vertical axis of an SVG points down.
     box_ends = [box.x0 * width, box.x1 * width, (1.0 - box.y0) * height, (1.0 - box.y1) * height]
-    x_name = _shared_x_label(axes, figure.axes)
-    y_name = _shared_y_label(axes, figure.axes)
+    x_name = _shared_label(axes, figure.axes, 0)
+    y_name = _shared_label(axes, figure.axes, 1)
     return {
         "title": axes.get_title(loc="left") or axes.get_title(),
         "maps": _map_records(axes),
@@ -231,29 +230,19 @@ def _panel_record(axes: Axes) -> JsonObject:
     }
 
 
-def _shared_x_label(axes: Axes, panels: Iterable[Axes]) -> str:
-    """Return the label of the horizontal axis of a panel.
+def _shared_label(axes: Axes, panels: Iterable[Axes], direction: int) -> str:
+    """Return the label of an axis of a panel: 0 is the horizontal one, 1 the vertical one.
 
-    If the panel has none, it is the label of another panel in the same column with equal limits.
+    If the panel has none, it is the label of another panel with equal limits: in the same column
+    for the horizontal axis, in the same row for the vertical one.
     """
+    own_axis = (axes.xaxis, axes.yaxis)[direction]
     for panel in (axes, *panels):
-        has_same_limits = panel.get_xlim() == axes.get_xlim()
-        offset = abs(panel.get_position().x0 - axes.get_position().x0)
-        if has_same_limits and offset < _SAME_POSITION and panel.get_xlabel():
-            return panel.get_xlabel()
-    return ""
-
-
-def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
-    """Return the label of the vertical axis of a panel.
-
-    If the panel has none, it is the label of another panel in the same row with equal limits.
-    """
-    for panel in (axes, *panels):
-        has_same_limits = panel.get_ylim() == axes.get_ylim()
-        offset = abs(panel.get_position().y0 - axes.get_position().y0)
-        if has_same_limits and offset < _SAME_POSITION and panel.get_ylabel():
-            return panel.get_ylabel()
+        axis = (panel.xaxis, panel.yaxis)[direction]
+        has_same_limits = np.array_equal(axis.get_view_interval(), own_axis.get_view_interval())
+        offset = abs(panel.get_position().p0[direction] - axes.get_position().p0[direction])
+        if has_same_limits and offset < _SAME_POSITION and axis.get_label_text():
+            return axis.get_label_text()
     return ""
 
 
