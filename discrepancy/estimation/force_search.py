@@ -36,9 +36,9 @@ MOST_LINEARISATIONS = 3
 SAME_POINT = 0.1
 """Change of all shared unknowns, in prior standard deviations, below which the trials are not
 linearised again."""
-LARGEST_LINEAR_ERROR = 0.1
-"""Share of the missing force that may be there because trials are linear about other parameters.
-What is larger is not removed by another linearisation."""
+LARGEST_SHARE_BESIDE_LAWS = 0.5
+"""Standard deviation of the missing force beside laws, over that without any, above which they do
+not make the motion: an estimate that began along their own motion ends there."""
 MOST_THINNED_SAMPLES = 3000
 """Number of samples of all trials together to which records are thinned at first. It is enough to
 tell laws from each other, and records that are shorter are not thinned."""
@@ -317,18 +317,19 @@ class ForceSearch:
         estimator = self.estimator(trials)
         # without effects, the shared unknowns have taken the place of laws
         first_shared = base.shared if base.candidate.terms else np.zeros_like(base.shared)
-        explained = self._estimate_that_leaves_no_force(
-            estimator, laws, replace(start, shared=first_shared)
-        )
-        if explained is not None:
-            return explained
-        first_estimate = estimator.estimate_from_far(laws, replace(start, processes=processes))
-        return None if first_estimate is None else self.estimate_about_own_values(first_estimate)
+        along_laws = self._estimate_along_laws(estimator, laws, replace(start, shared=first_shared))
+        if along_laws is not None and (along_laws.leaves_no_force or along_laws.converged):
+            return along_laws
+        from_far = estimator.estimate_from_far(laws, replace(start, processes=processes))
+        if from_far is not None:
+            from_far = self.estimate_about_own_values(from_far)
+        estimates = [estimate for estimate in (along_laws, from_far) if estimate is not None]
+        return _best(estimates) if estimates else None
 
-    def _estimate_that_leaves_no_force(
+    def _estimate_along_laws(
         self, estimator: MotionEstimator, laws: EffectLaws, start: EstimatorStart
     ) -> Estimate | None:
-        """Return an estimate along the motion of the laws alone if they leave no force.
+        """Return an estimate that begins along the motion of the laws alone, if they make it.
 
         Parameters
         ----------
@@ -340,10 +341,9 @@ class ForceSearch:
             The values to begin with.
         """
         estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
-        if estimate is None or self._share_of_missing_force(estimate) > LARGEST_LINEAR_ERROR:
+        if estimate is None or self._share_of_missing_force(estimate) > LARGEST_SHARE_BESIDE_LAWS:
             return None
-        estimate = self.estimate_about_own_values(estimate)
-        return estimate if estimate.leaves_no_force else None
+        return self.estimate_about_own_values(estimate)
 
     def _share_of_missing_force(self, estimate: Estimate) -> float:
         """Return the missing force beside a hypothesis over that without effects.

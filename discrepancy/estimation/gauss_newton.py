@@ -90,9 +90,6 @@ class HypothesisLaws(Protocol):
             The forces by the number of the port; None if an effect is not possible at these values.
         """
 
-    def model_forces_along_trajectory(self, arguments: LawArguments) -> Mapping[int, FloatArray]:
-        """Return the forces (F,) of the model's own laws along a trajectory, by port."""
-
     def motion_under_laws(
         self, arguments: LawArguments, local_values: FloatArray
     ) -> Trajectory | None:
@@ -214,7 +211,6 @@ def linearise_trials(
             sensor_errors=sensor_errors,
             effect=start.effect,
             shared=start.shared,
-            model_forces=laws.model_forces_along_trajectory(arguments),
         )
         linear_trials.append(linear_trial)
     # the unknowns of effects have standard normal priors, of precision one

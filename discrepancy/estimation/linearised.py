@@ -14,7 +14,7 @@ add (see `filtered`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -71,8 +71,6 @@ class LinearisedTrial:
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
         The values of the shared unknowns at which they are linearised.
-    model_forces : mapping of int to (F,) ndarray
-        The forces of the model's own laws along the trajectory, which are part of `forces`.
     simulation : Simulation or None
         The trial as simulated with the values about which it is linear, along whose motion it is.
     """
@@ -83,7 +81,6 @@ class LinearisedTrial:
     sensor_errors: LinearisedSensorErrors
     effect: FloatArray
     shared: FloatArray
-    model_forces: Mapping[int, FloatArray] = field(default_factory=dict)
     simulation: Simulation | None = None
 
     # ------------------------------------------------------------ layout
@@ -115,10 +112,7 @@ class LinearisedTrial:
     @property
     def effect_forces(self) -> dict[int, FloatArray]:
         """The forces (F,) of the hypothesis' effects along the trajectory, by port."""
-        return {
-            port: force.law_force.force - self.model_forces.get(port, 0.0)
-            for port, force in self.forces.items()
-        }
+        return {port: force.law_force.force - force.by_model for port, force in self.forces.items()}
 
     @cached_property
     def force_by_state(self) -> FloatArray:

@@ -196,14 +196,23 @@ def values_to_try(term: EffectTerm) -> list[FloatArray]:
 def _terms_to_add(
     search: ForceSearch, base: Estimate, effects: Iterable[Effect]
 ) -> Iterator[EffectTerm]:
-    """Yield the effects at places where an estimate lacks them, also with a free shape."""
+    """Yield the effects at places where an estimate lacks them, also with a free shape.
+
+    With free exponents, dry friction and quadratic damping are the same law: of the effects of a
+    family whose shapes have the same parameters, one stands for all.
+    """
     in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
+    families: set[tuple[str, str, tuple[str, ...]]] = set()
     for effect in effects:
         for place in effect.places(search.ported.problem.setting):
             if (effect.identifier, place) in in_base:
                 continue
             yield EffectTerm(effect, place)
-            if effect.shape:
+            if not effect.shape:
+                continue
+            family = (effect.family, place, tuple(parameter.name for parameter in effect.shape))
+            if family not in families:
+                families.add(family)
                 yield EffectTerm(effect, place, free_shape=True)
 
 

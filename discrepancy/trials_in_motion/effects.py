@@ -1,8 +1,9 @@
 """The effects of a hypothesis along a trajectory: forces at ports and errors of sensors."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point, with_step
 from discrepancy.fits.problem import Problem
+from discrepancy.system.interface import NO_PATCH
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch, Primitive
@@ -76,7 +78,8 @@ class EffectLaws:
         See `HypothesisLaws.linearise_along_trajectory`.
         """
         try:
-            return self._linearised_forces(arguments), self._linearised_sensor_errors(arguments)
+            forces = self._linearised_forces(arguments)
+            return forces, self._linearised_sensor_errors(arguments, forces)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
@@ -86,7 +89,7 @@ class EffectLaws:
         See `HypothesisLaws.forces_along_trajectory`.
         """
         try:
-            return self._checked_forces(arguments)
+            return self._forces_of_patch(arguments, self._patch_of_all_laws(arguments))
         except (DiscrepancyError, InvalidPatchError):
             return None
 
@@ -148,16 +151,6 @@ class EffectLaws:
         patch = self._patch_in_trial(arguments.trial_index, arguments.effect)
         return self._forces_of_patch(arguments, patch)
 
-    def model_forces_along_trajectory(self, arguments: LawArguments) -> dict[int, FloatArray]:
-        """Return the forces (F,) of the model's own laws along a trajectory, by port."""
-        model_laws = self.evaluate_model_laws(arguments.shared)
-        forces = self._forces_of_patch(arguments, model_laws)
-        return {port: force_at_port.force for port, force_at_port in forces.items()}
-
-    def _checked_forces(self, arguments: LawArguments) -> dict[int, LawForce]:
-        """Return the forces of all laws, by port; raise an error if an effect is not possible."""
-        return self._forces_of_patch(arguments, self._patch_of_all_laws(arguments))
-
     def _patch_of_all_laws(self, arguments: LawArguments) -> ModelPatch:
         """Return the laws of the model and of the effects; raise an error if one is impossible."""
         laws_of_model = self.evaluate_model_laws(arguments.shared)
@@ -167,47 +160,88 @@ class EffectLaws:
     def _linearised_forces(self, arguments: LawArguments) -> dict[int, LinearisedForce]:
         """Return the forces of all laws, by port, with their derivatives by unknowns.
 
-        The derivatives are central differences, but for a force of free shape, which is linear in
-        its amplitudes. The K shared unknowns are numbered first, then those of the effects.
+        A derivative by an unknown needs only the laws that the unknown changes: those of the model
+        or those of one effect. The K shared unknowns are numbered first, then those of the effects.
         """
-        forces = self._checked_forces(arguments)
-        derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
+        forces = self._forces_of_patch(arguments, self.evaluate_model_laws(arguments.shared))
+        by_model = {port: force.force for port, force in forces.items()}
+        derivatives: dict[int, dict[int, FloatArray]] = defaultdict(dict)
+        for number in self.unknowns_of_model_laws:
+            slopes = self._slopes(arguments, self.evaluate_model_laws, arguments.shared, number)
+            for port, slope in slopes.items():
+                derivatives[port][number] = slope
 
-        effect_values, shared_values = arguments.effect, arguments.shared
-        is_linear = np.repeat(
-            [term.effect.table is not None for term in self.candidate.terms],
-            [len(term.parameters) for term in self.candidate.terms],
-        )
-        for k in range(self.candidate.parameter_count):
-            above = replace(arguments, effect=with_step(effect_values, k, HALF_DIFFERENCE))
-            forces_below, difference = forces, HALF_DIFFERENCE
-            if not is_linear[k]:
-                below = replace(arguments, effect=with_step(effect_values, k, -HALF_DIFFERENCE))
-                forces_below, difference = self._checked_forces(below), 2.0 * HALF_DIFFERENCE
-            slopes = _slopes(self._checked_forces(above), forces_below, difference)
-            for port, slope in slopes.items():
-                derivatives[port][len(shared_values) + k] = slope
-        for k in self.unknowns_of_model_laws:
-            above = replace(arguments, shared=with_step(shared_values, k, HALF_DIFFERENCE))
-            below = replace(arguments, shared=with_step(shared_values, k, -HALF_DIFFERENCE))
-            slopes = _slopes(
-                self._checked_forces(above), self._checked_forces(below), 2.0 * HALF_DIFFERENCE
-            )
-            for port, slope in slopes.items():
-                derivatives[port][k] = slope
+        first_unknown = len(arguments.shared)
+        for index, (term, values) in enumerate(self.candidate.split_by_term(arguments.effect)):
+            laws_of_term = partial(self._patch_of_term_in_trial, arguments.trial_index, index)
+            forces_of_term = self._forces_of_patch(arguments, laws_of_term(values))
+            for port, force in forces_of_term.items():
+                forces[port] = force.plus(forces[port]) if port in forces else force
+            # a force of free shape is linear in its amplitudes
+            forces_below = forces_of_term if term.effect.table is not None else None
+            # an effect without a force at a port changes readings, see `_linearised_sensor_errors`
+            for number in range(len(values)) if forces_of_term else ():
+                slopes = self._slopes(arguments, laws_of_term, values, number, forces_below)
+                for port, slope in slopes.items():
+                    derivatives[port][first_unknown + number] = slope
+            first_unknown += len(values)
         return {
-            port: LinearisedForce(force_at_port, derivatives[port])
-            for port, force_at_port in forces.items()
+            port: LinearisedForce(force, derivatives[port], by_model.get(port, 0.0))
+            for port, force in forces.items()
         }
+
+    def _slopes(
+        self,
+        arguments: LawArguments,
+        laws_at: Callable[[FloatArray], ModelPatch],
+        values: FloatArray,
+        number: int,
+        forces_below: Mapping[int, LawForce] | None = None,
+    ) -> dict[int, FloatArray]:
+        """Return the derivatives (F,) of forces at ports by an unknown, if they are not zero.
+
+        Parameters
+        ----------
+        arguments : LawArguments
+            The trial and its motion.
+        laws_at : callable
+            The function that takes values of unknowns and returns laws.
+        values : array
+            The present values of these unknowns.
+        number : int
+            The number of the unknown among them.
+        forces_below : mapping of int to LawForce, optional
+            The forces at the present values, for a difference to one side, which is exact if the
+            forces are linear in the unknown; a central difference without them.
+        """
+        difference = HALF_DIFFERENCE
+        if forces_below is None:
+            below = laws_at(with_step(values, number, -HALF_DIFFERENCE))
+            forces_below, difference = self._forces_of_patch(arguments, below), 2.0 * difference
+        above = laws_at(with_step(values, number, HALF_DIFFERENCE))
+        forces_above = self._forces_of_patch(arguments, above)
+        slopes = {}
+        for port in forces_above.keys() & forces_below.keys():
+            rise = forces_above[port].force - forces_below[port].force
+            if np.any(rise):
+                slopes[port] = rise / difference
+        return slopes
 
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
-        trial = self.problem.trials[self.trial_indices[trial_index]].trial
         primitives: list[Primitive] = []
-        for index, (term, term_values) in enumerate(self.candidate.split_by_term(effect)):
-            if trial.kind in term.effect.acts_on:
-                primitives += self._patch_of_term(index, term_values).in_trial(trial.name)
+        for index, (_, values) in enumerate(self.candidate.split_by_term(effect)):
+            primitives += self._patch_of_term_in_trial(trial_index, index, values)
         return ModelPatch(tuple(primitives))
+
+    def _patch_of_term_in_trial(
+        self, trial_index: int, index: int, values: FloatArray
+    ) -> ModelPatch:
+        """Return the change of the model by one effect in a trial, given the indices of both."""
+        trial = self.problem.trials[self.trial_indices[trial_index]].trial
+        if trial.kind not in self.candidate.terms[index].effect.acts_on:
+            return NO_PATCH
+        return self._patch_of_term(index, values).in_trial(trial.name)
 
     def _patch_of_term(self, index: int, values: FloatArray) -> ModelPatch:
         """Return the change of the model by one effect, given its index and its unknowns."""
@@ -236,15 +270,13 @@ class EffectLaws:
         The forces of several laws at one port are added.
         """
         trial = self.trials[arguments.trial_index]
-        trajectory = arguments.trajectory
         forces: dict[int, LawForce] = {}
         for law in self._laws_in_patch(patch):
             port_number = trial.system.ports.index(law.port)
             force = force_and_tangents(
                 law,
                 trial.fine_time,
-                trajectory.positions[:, port_number],
-                trajectory.speeds[:, port_number],
+                arguments.trajectory.port_motions[port_number],
                 arguments.speed_window,
             )
             if port_number in forces:
@@ -259,8 +291,13 @@ class EffectLaws:
 
     # ------------------------------------------------------------ sensors
 
-    def _linearised_sensor_errors(self, arguments: LawArguments) -> LinearisedSensorErrors:
-        """Return the changes of a trial's readings by errors of sensors, with their derivatives."""
+    def _linearised_sensor_errors(
+        self, arguments: LawArguments, linearised_forces: Mapping[int, LinearisedForce]
+    ) -> LinearisedSensorErrors:
+        """Return the changes of a trial's readings by errors of sensors, with their derivatives.
+
+        The forces of all laws are given by the number of the port.
+        """
         trial = self.trials[arguments.trial_index]
         change = np.zeros_like(trial.residual)
         derivatives: dict[int, FloatArray] = {}
@@ -272,7 +309,8 @@ class EffectLaws:
         ]
         if not any(is_error):
             return LinearisedSensorErrors(change, derivatives)
-        explained = self._explained_trajectory(arguments)
+        forces = {port: force.law_force.force for port, force in linearised_forces.items()}
+        explained = self._explained_trajectory(arguments, forces)
 
         def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
             return self.readings_change(arguments.trial_index, explained, term, values)
@@ -291,14 +329,17 @@ class EffectLaws:
             first_unknown += len(values)
         return LinearisedSensorErrors(change, derivatives)
 
-    def _explained_trajectory(self, arguments: LawArguments) -> Trajectory:
-        """Return the motion of a trial by the model and the laws, which errors of sensors act on.
+    def _explained_trajectory(
+        self, arguments: LawArguments, forces: Mapping[int, FloatArray]
+    ) -> Trajectory:
+        """Return the motion of a trial by the model and the forces of all laws, given by port.
+
+        It is the motion that errors of sensors act on.
 
         The motion by missing forces is left out. It is estimated from the readings, so that its
         product with an error would explain them by themselves.
         """
         trial = self.trials[arguments.trial_index]
-        forces = {port: force.force for port, force in self._checked_forces(arguments).items()}
         added_state = np.zeros_like(arguments.trajectory.added_state)
         for port, force in forces.items():
             added_state += trial.state_under_force(port, force)
@@ -334,23 +375,3 @@ class EffectLaws:
             return np.zeros_like(trial.residual)
         patch = term.patch(self.problem.setting, values).in_trial(trial.name)
         return ReadingChanges(self.problem).change(trial, trajectory, index_in_problem, patch)
-
-
-def _slopes(
-    forces_above: Mapping[int, LawForce], forces_below: Mapping[int, LawForce], difference: float
-) -> dict[int, FloatArray]:
-    """Return the slopes (F,) of the forces at ports over a difference of an unknown, if not zero.
-
-    Parameters
-    ----------
-    forces_above, forces_below : mapping of int to LawForce
-        The forces by port at a larger and at a smaller value of the unknown.
-    difference : float
-        The difference of the two values.
-    """
-    slopes = {}
-    for port in forces_above.keys() & forces_below.keys():
-        rise = forces_above[port].force - forces_below[port].force
-        if np.any(rise):
-            slopes[port] = rise / difference
-    return slopes

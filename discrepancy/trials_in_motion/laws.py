@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -28,6 +28,49 @@ LARGEST_HOLDING_EXPONENT = 0.3
 RELATIVE_HALF_DIFFERENCE = 1e-4
 """Half the difference of the position in the tangent of a law of the speed, as a fraction of the
 rms position."""
+
+
+@dataclass(frozen=True, eq=False)
+class PortMotion:
+    """The motion of a port at the fine stamps, with what laws along it need.
+
+    Attributes
+    ----------
+    positions, speeds : (F,) ndarray
+        The position and the speed [m or rad, and per s].
+    """
+
+    positions: FloatArray
+    speeds: FloatArray
+
+    @cached_property
+    def rms_position(self) -> float:
+        """The rms position [m or rad], never zero."""
+        return max(float(np.sqrt(np.mean(self.positions**2))), LEAST_DIVISOR)
+
+    @cached_property
+    def rms_speed(self) -> float:
+        """The rms speed [m/s or rad/s], never zero."""
+        return max(float(np.sqrt(np.mean(self.speeds**2))), LEAST_DIVISOR)
+
+    @cached_property
+    def half_passed_speeds(self) -> FloatArray:
+        """Half of the speeds (F,) that pass from the middle of a substep to that of the next."""
+        return np.asarray(0.5 * np.abs(np.gradient(self.speeds)))
+
+    def half_widths_of_windows(self, speed_window: float) -> FloatArray:
+        """Return the half widths (F,) of the windows over which laws of the speed are averaged.
+
+        A window contains at least the speeds that the port passes from the middle of one substep to
+        that of the next. The mean over them is the mean over this time, so that dry friction whose
+        sign changes within a substep has the right impulse.
+
+        Parameters
+        ----------
+        speed_window : float
+            The least half width, divided by the rms speed.
+        """
+        return np.maximum(self.half_passed_speeds, speed_window * self.rms_speed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +206,7 @@ def _compiled_fill() -> Callable[..., None]:
 
 
 def force_and_tangents(
-    law: PortForce, time: FloatArray, positions: FloatArray, speeds: FloatArray, speed_window: float
+    law: PortForce, time: FloatArray, motion: PortMotion, speed_window: float
 ) -> LawForce:
     """Return the force of a law along a motion of its port, and its tangents.
 
@@ -173,25 +216,25 @@ def force_and_tangents(
     ----------
     law : PortForce
         The law with its parameters.
-    time, positions, speeds : (F,) ndarray
-        The fine stamps [s], and the motion of the port there [m or rad, and per s].
+    time : (F,) ndarray
+        The fine stamps [s].
+    motion : PortMotion
+        The motion of the port at these stamps.
     speed_window : float
         The least half width of the window of speeds over which a law of the speed is averaged,
-        divided by the rms speed; see `half_widths_of_windows`.
+        divided by the rms speed; see `PortMotion.half_widths_of_windows`.
     """
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     force, by_position, by_speed = np.zeros((3, len(time)))
-    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), LEAST_DIVISOR)
-    rms_position = max(float(np.sqrt(np.mean(positions**2))), LEAST_DIVISOR)
     _compiled_fill()(
         LAWS.index(type(law)),
         type(law).depends_on_speed,
         row,
-        np.ascontiguousarray(positions),
-        np.ascontiguousarray(speeds),
-        half_widths_of_windows(speeds, speed_window * rms_speed),
-        RELATIVE_HALF_DIFFERENCE * rms_position,
+        motion.positions,
+        motion.speeds,
+        motion.half_widths_of_windows(speed_window),
+        RELATIVE_HALF_DIFFERENCE * motion.rms_position,
         memory,
         force,
         by_position,
@@ -199,23 +242,6 @@ def force_and_tangents(
     )
     is_acting = law.acts_at(time)
     return LawForce(force * is_acting, by_position * is_acting, by_speed * is_acting)
-
-
-def half_widths_of_windows(speeds: FloatArray, least_half_width: float) -> FloatArray:
-    """Return the half widths (F,) of the windows over which laws of the speed are averaged.
-
-    A window contains at least the speeds that the port passes from the middle of one substep to
-    that of the next. The mean over them is the mean over this time, so that dry friction whose sign
-    changes within a substep has the right impulse.
-
-    Parameters
-    ----------
-    speeds : (F,) array
-        The speeds of the port at the fine stamps [m/s or rad/s].
-    least_half_width : float
-        The least half width [m/s or rad/s].
-    """
-    return np.maximum(0.5 * np.abs(np.gradient(speeds)), least_half_width)
 
 
 def holds_at_rest(law: PortForce) -> bool:

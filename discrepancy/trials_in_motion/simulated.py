@@ -280,7 +280,7 @@ def simulate_laws(
     laws : LawArrays
         The laws; their memories are changed.
     least_half_widths : (P,) array
-        The least half width of the window of speeds at each port, see `half_widths_of_windows`.
+        The least half width of the window of speeds at each port, see `PortMotion`.
     states : (F, n) array
         The state that the laws add, which is filled; the first one is given.
     positions, speeds : (F, P) array

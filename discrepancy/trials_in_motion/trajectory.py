@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 
-from .laws import LawForce
+from .laws import LawForce, PortMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,14 @@ class Trajectory:
     positions: FloatArray
     speeds: FloatArray
     forces: Mapping[int, FloatArray]
+
+    @cached_property
+    def port_motions(self) -> tuple[PortMotion, ...]:
+        """The motion of each of the P ports."""
+        return tuple(
+            PortMotion(np.ascontiguousarray(positions), np.ascontiguousarray(speeds))
+            for positions, speeds in zip(self.positions.T, self.speeds.T, strict=True)
+        )
 
     def interpolate(self, other_trajectory: "Trajectory", fraction: float) -> "Trajectory":
         """Return the trajectory that lies a fraction of the way to another one."""
@@ -82,10 +91,13 @@ class LinearisedForce:
         The force of all laws at the port, and its derivatives by the motion.
     by_unknown : mapping of int to (F,) ndarray
         The derivatives of the force by unknowns, by the number of the unknown.
+    by_model : (F,) ndarray or float
+        The part of the force that the model's own laws have.
     """
 
     law_force: LawForce
     by_unknown: Mapping[int, FloatArray]
+    by_model: FloatArray | float = 0.0
 
     def extrapolate(
         self, position_change: FloatArray, speed_change: FloatArray, unknowns_change: FloatArray

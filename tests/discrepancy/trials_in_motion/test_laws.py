@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from discrepancy.trials_in_motion.laws import force_and_tangents, mean_force
+from discrepancy.trials_in_motion.laws import PortMotion, force_and_tangents, mean_force
 from fe.runtime.laws.speed import Overflow, TableDamping, steady_force
 from fe.runtime.patch import PowerDamping, PowerStiffness
 
@@ -29,12 +29,15 @@ def damping(velocity_exponent, displacement_exponent=0.0):
 @pytest.mark.parametrize("law", [CUBIC, damping(2.0), damping(1.0, 1.0)], ids=["cubic", "drag", "by both"])
 def test_tangents_are_the_derivatives_of_the_force(law):
     step = 1e-6
-    along = force_and_tangents(law, TIME, POSITIONS, SPEEDS, 1e-4)
+    along = force_and_tangents(law, TIME, PortMotion(POSITIONS, SPEEDS), 1e-4)
     changes = []
     for by_position, by_speed in ((1.0, 0.0), (0.0, 1.0)):
         ends = [
             force_and_tangents(
-                law, TIME, POSITIONS + side * step * by_position, SPEEDS + side * step * by_speed, 1e-4
+                law,
+                TIME,
+                PortMotion(POSITIONS + side * step * by_position, SPEEDS + side * step * by_speed),
+                1e-4,
             )
             for side in (1.0, -1.0)
         ]
@@ -46,7 +49,7 @@ def test_tangents_are_the_derivatives_of_the_force(law):
 
 def test_dry_friction_has_a_tangent_where_the_motion_turns():
     half_window = 0.05 * float(np.sqrt(np.mean(SPEEDS**2)))
-    along = force_and_tangents(damping(0.0), TIME, POSITIONS, SPEEDS, 0.05)
+    along = force_and_tangents(damping(0.0), TIME, PortMotion(POSITIONS, SPEEDS), 0.05)
     turning = np.abs(SPEEDS) < 0.5 * half_window
     np.testing.assert_allclose(along.by_speed[turning], 2.0 / half_window)
     assert np.all(along.by_speed[np.abs(SPEEDS) > half_window] == 0.0)
@@ -85,5 +88,5 @@ def test_friction_that_changes_its_sign_within_a_substep_has_the_right_impulse()
     """A speed that rises evenly through zero, at any time between two stamps: -1 before and +1 after it."""
     time = np.arange(9.0)
     for crossing in np.linspace(3.0, 4.0, 7):
-        along = force_and_tangents(damping(0.0), time, np.ones(9), time - crossing, 1e-6)
+        along = force_and_tangents(damping(0.0), time, PortMotion(np.ones(9), time - crossing), 1e-6)
         assert np.trapezoid(along.force, time) == pytest.approx(2.0 * (8.0 - 2.0 * crossing), abs=1e-4)
