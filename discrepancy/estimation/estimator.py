@@ -44,6 +44,12 @@ MOST_FOLLOWED_FORCES = 4
 SMALL_FRACTION = 0.03
 """Standard deviation of the missing force beside laws whose motion is followed, divided by that
 without any law."""
+LARGEST_SHARE_BESIDE_LAWS = 0.5
+"""Standard deviation of the missing force beside laws, divided by that without any law, above which
+the laws do not make the motion."""
+FOLLOWED_SHARE = 0.1
+"""This ratio beside laws at their most probable values, above which the motion of the laws alone is
+not tried: without the missing force it is farther from the readings."""
 ROUGH_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01)
 """These standard deviations in a rough estimate."""
 MOST_ROUGH_ITERATIONS = 3
@@ -74,12 +80,27 @@ class MotionEstimator:
     ----------
     gauss_newton : GaussNewton
         The iteration under given missing forces.
-    small_processes : mapping of int to Process
-        The missing forces with which an estimate along the motion of the laws alone begins.
+    processes_without_effects : mapping of int to Process
+        The missing forces without any effect, by the number of the port.
     """
 
     gauss_newton: GaussNewton
-    small_processes: Processes
+    processes_without_effects: Processes
+
+    @property
+    def small_processes(self) -> dict[int, Process]:
+        """The missing forces with which an estimate along the motion of the laws alone begins."""
+        return scale_processes(self.processes_without_effects, SMALL_FRACTION, 1.0)
+
+    def share_of_missing_force(self, estimate: Estimate) -> float:
+        """Return the missing force beside a hypothesis over that without effects.
+
+        It is the ratio of the standard deviations, the largest one of all ports.
+        """
+        return max(
+            process.standard_deviation / self.processes_without_effects[port].standard_deviation
+            for port, process in estimate.processes.items()
+        )
 
     def estimate_from_far(self, laws: HypothesisLaws, start: EstimatorStart) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that may be far from them.
@@ -171,6 +192,8 @@ class MotionEstimator:
         if estimate is None:
             return self.follow_laws(laws, replace(start, processes=self.small_processes))
         tuned_estimate = self.tune_processes(laws, estimate)
+        if self.share_of_missing_force(tuned_estimate) > FOLLOWED_SHARE:
+            return tuned_estimate
         next_start = replace(start_from_estimate(tuned_estimate), processes=self.small_processes)
         return _more_probable(tuned_estimate, self.follow_laws(laws, next_start))
 

@@ -17,7 +17,7 @@ from discrepancy.trials_in_motion.effects import EffectLaws
 from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .estimate import NO_EFFECTS, Estimate, estimate_of_processes
-from .estimator import SMALL_FRACTION, USUAL_WINDOW, MotionEstimator
+from .estimator import LARGEST_SHARE_BESIDE_LAWS, USUAL_WINDOW, MotionEstimator
 from .force_states import Process
 from .gauss_newton import EstimatorStart, GaussNewton, start_from_estimate
 from .linearisation import Linearisation, plain_linearisation
@@ -36,9 +36,6 @@ MOST_LINEARISATIONS = 3
 SAME_POINT = 0.1
 """Change of all shared unknowns, in prior standard deviations, below which the trials are not
 linearised again."""
-LARGEST_SHARE_BESIDE_LAWS = 0.5
-"""Standard deviation of the missing force beside laws, over that without any, above which they do
-not make the motion: an estimate that began along their own motion ends there."""
 MOST_THINNED_SAMPLES = 3000
 """Number of samples of all trials together to which records are thinned at first. It is enough to
 tell laws from each other, and records that are shorter are not thinned."""
@@ -280,7 +277,7 @@ class ForceSearch:
         prior_medians = self.ported.prior_processes(processes)
         return MotionEstimator(
             GaussNewton(tuple(trials), self.ported.shared_priors, prior_medians),
-            small_processes=scale_processes(processes, SMALL_FRACTION, 1.0),
+            processes_without_effects=processes,
         )
 
     def estimate_effects(
@@ -341,19 +338,12 @@ class ForceSearch:
             The values to begin with.
         """
         estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
-        if estimate is None or self._share_of_missing_force(estimate) > LARGEST_SHARE_BESIDE_LAWS:
+        if (
+            estimate is None
+            or estimator.share_of_missing_force(estimate) > LARGEST_SHARE_BESIDE_LAWS
+        ):
             return None
         return self.estimate_about_own_values(estimate)
-
-    def _share_of_missing_force(self, estimate: Estimate) -> float:
-        """Return the missing force beside a hypothesis over that without effects.
-
-        It is the ratio of the standard deviations, the largest one of all ports.
-        """
-        return max(
-            process.standard_deviation / self.force_deviation(port)
-            for port, process in estimate.processes.items()
-        )
 
     def estimate_of_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
         """Return the estimate of a hypothesis whose simulation was fitted to the readings.

@@ -145,6 +145,7 @@ class _Ranking:
         }
         self.curve: Estimate | None = None
         self.estimated_in_full: set[CandidateKey] = {without_effects.candidate.key}
+        self.hopeless_forms: set[CandidateKey] = set()
 
     def score(self, estimate: Estimate) -> float:
         """Return the log of evidence times prior of an estimate [nat]."""
@@ -260,13 +261,21 @@ class _Ranking:
             ]
             # the values of the best hypothesis are preferred where both have the same effects
             form_by_effects = {form.candidate.key: form for form in simpler_forms}
-            for form in form_by_effects.values():
+            for key, form in form_by_effects.items():
+                if key in self.hopeless_forms:
+                    continue
                 self.on_progress(
                     f"estimating {form.candidate.description} together with the motion"
                 )
                 estimate = self.search.polish_effects(best_estimate, *form)
                 if estimate is not None:
                     self.record(estimate)
+                form_estimate = self.by_effects.get(key)
+                if (
+                    form_estimate is None
+                    or self.score(form_estimate) < self.score(best_estimate) - ESTIMATED_RANGE
+                ):
+                    self.hopeless_forms.add(key)
             if self.best is best_estimate:
                 break
             best_estimate = self.best
