@@ -30,21 +30,14 @@ BOOTSTRAP_SEED = 0
 NOMINAL_UNIT = "signal"
 """Unit in figures of a signal about which nothing is known."""
 CHANNELS_MENTIONED = 3
-"""Number of channels whose errors a sentence mentions: those with the largest error before."""
+"""Number of channels whose errors a sentence mentions."""
 
 
 def residuals_with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
-    """Return residuals with the noise deviation of a reference, to compare two hypotheses.
+    """Return residuals of a hypothesis with the noise deviations of another one, the reference.
 
-    The noise deviations of the two differ in channels without a noise record: there they are
-    estimated from the residuals of each hypothesis in the fitted trials.
-
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The residuals of a hypothesis.
-    reference : ResidualSet
-        The residuals of the same trials by another hypothesis.
+    Only then can the two be compared: the noise of a channel without a record is estimated from
+    the residuals of each hypothesis, and differs between them.
     """
     noise = {
         fitted_trial.trial.name: fitted_trial.noise_deviation for fitted_trial in reference.trials
@@ -195,6 +188,8 @@ def rms_errors_text(
     channels: Mapping[str, Channel], rms_before: Mapping[str, float], rms_after: Mapping[str, float]
 ) -> str:
     """Return rms errors before and after in the units of their channels, as in "x 3.6 to 0.95 mm".
+
+    The `CHANNELS_MENTIONED` channels with the largest error over noise before are mentioned.
 
     Parameters
     ----------

@@ -32,8 +32,8 @@ from .closed_share import closed_share_text
 from .proof import errors_of_fit
 
 CONTRADICTING_SHARE = -0.1
-"""Share of the gap below which held-out trials in which a law has hardly any force contradict
-it."""
+"""Share of the gap below which held-out trials contradict a law that has hardly any force in
+them."""
 
 HypothesisT = TypeVar("HypothesisT", bound=ComparedHypothesis)
 EffectSet = tuple[str, ...]
@@ -131,7 +131,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         """Return in words how much of the gap a hypothesis does not explain."""
 
     def subsets(self, hypothesis: HypothesisT) -> list[HypothesisT]:
-        """Return the hypotheses with some of the effects of a hypothesis, the fewest first."""
+        """Return the compared hypotheses that have some of the effects of one, the fewest first."""
         full_key = set(hypothesis.candidate.key)
         subsets = []
         for ranked_hypothesis in self.ranked_hypotheses:
@@ -157,7 +157,7 @@ class Comparison(ABC, Generic[HypothesisT]):
     def set_probabilities(self) -> Mapping[EffectSet, float]:
         """Return the probability of each set of effects over all places, in descending order.
 
-        Sets that can imitate nearly anything are no rivals of a name.
+        Sets that can imitate nearly anything are left out: they do not compete for a name.
         """
         scores_by_set: dict[EffectSet, list[float]] = {}
         for hypothesis in self.ranked_hypotheses:
@@ -301,15 +301,9 @@ class Comparison(ABC, Generic[HypothesisT]):
     def _survives_held_out(self, hypothesis: HypothesisT, least_low_end: float) -> bool:
         """Return whether held-out trials confirm a hypothesis, or at least do not contradict it.
 
-        Trials in which a law has hardly any force cannot test it. They contradict the law only if
-        the gap is clearly larger with it.
-
-        Parameters
-        ----------
-        hypothesis : HypothesisT
-            The hypothesis that the trials judge.
-        least_low_end : float
-            The least lower end of the interval of its share in held-out trials.
+        They confirm it if the interval of its share reaches `SEARCH.least_gap_share` and does not
+        begin below `least_low_end`. Trials in which a law has hardly any force cannot test it: they
+        contradict it only if the gap is at least a tenth larger with it (`CONTRADICTING_SHARE`).
         """
         share = self.gap_share(hypothesis, held_out=True)
         if share.is_tested:
@@ -320,9 +314,10 @@ class Comparison(ABC, Generic[HypothesisT]):
     def nameable_hypotheses(self) -> list[HypothesisT]:
         """The hypotheses that may be named, in descending order of score.
 
-        A set that contains both laws and errors of readings is fitted again without the errors of
-        readings: beside a law, these fit whatever remains. The smaller set is ranked by the score
-        of the whole set.
+        Nothing speaks against naming them (`objection_to_naming`), and their scores are within
+        `SEARCH.contender_range` of the best one. A set of both laws and errors of readings is
+        fitted again without the errors of readings, as these fit whatever a law leaves. The smaller
+        set is ranked by the score of the whole set.
         """
         contenders_with_scores: dict[CandidateKey, tuple[HypothesisT, float]] = {}
         for hypothesis in self.ranked_hypotheses:
@@ -460,14 +455,9 @@ class Comparison(ABC, Generic[HypothesisT]):
     def competing_hypotheses(self, best_hypothesis: HypothesisT) -> list[HypothesisT]:
         """Return the hypotheses that could be named instead of the best one.
 
-        The data do not separate a competing hypothesis from the best one: its score is within
-        `SEARCH.force_rival_range` of the best score, and its share of the gap is not smaller beyond
-        chance.
-
-        Parameters
-        ----------
-        best_hypothesis : HypothesisT
-            The hypothesis that would be named.
+        The data do not separate them from the best one: their scores are at most
+        `SEARCH.force_rival_range` lower, and their shares of the gap are not significantly smaller.
+        Hypotheses with more effects do not compete, nor does the same law with a free shape.
         """
         best_share = self.held_out_or_fitted_share(best_hypothesis)
         least_competing_score = self.score(best_hypothesis) - SEARCH.force_rival_range
@@ -476,7 +466,6 @@ class Comparison(ABC, Generic[HypothesisT]):
             candidate = hypothesis.candidate
             is_same_family = family_place_pairs(hypothesis) == family_place_pairs(best_hypothesis)
             is_longer = len(candidate.terms) > len(best_hypothesis.candidate.terms)
-            # no competitors: the same law with a free shape, and hypotheses of more effects
             if (candidate.has_free_shape and is_same_family) or is_longer:
                 continue
             if self.score(hypothesis) <= least_competing_score:

@@ -83,9 +83,9 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     Returns
     -------
     Gate
-        The outcome. Its statistic is the p value of the worst test, corrected for their number
-        (Bonferroni). `passed` is None if nothing can be tested: no trial has stated loads or
-        several runs, and no effect acts on one channel alone; or there are too few readings.
+        The outcome. Its statistic is the least p-value of all tests, multiplied by their number
+        (Bonferroni's correction). `passed` is None if nothing can be tested: no trial is static or
+        a flight and no effect acts on one channel alone, or there are too few readings.
     """
     tests = score_tests(problem, fit, directions_by_test(problem, fit))
     if not tests:
@@ -170,14 +170,7 @@ def _projected_directions(
 ) -> _ProjectedDirections:
     """Return directions without the part that nuisances and effect parameters can compensate.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    screen : Screen
-        The fit, with its nuisances and effect parameters eliminated.
-    directions : mapping of str to Direction
-        The directions by their names.
+    The screen must have eliminated both. Directions that change no reading are left out.
     """
     signs = screen.inner_product_signs
     labels = []
@@ -334,11 +327,13 @@ def directions_by_test(
 ) -> Mapping[str, Mapping[str, Direction]]:
     """Return the directions of each test by their names.
 
-    There are three kinds of tests. For static loads and for flight, the directions are the size,
-    the zero (static only) and the slope over the span of the response, for each place of the load.
-    For static runs, they are zeros that all channels of one quantity have in common. For the sensor
-    channel of an effect, they are the size of its response, for each kind of trial and place of the
-    load, and a drift over the campaign.
+    There are three kinds of tests:
+
+    - For static loads, and for flight: the size of the response, its zero (static loads only) and
+      its slope over the span (with enough stations), for each place of the load.
+    - For static runs: a zero that all channels of one quantity have in common.
+    - For the channel of an effect that acts on this channel alone: the size of its response for
+      each kind of trial and place of the load, and a drift of its zero over the campaign.
     """
     groups = _DirectionGroups()
     channels_of_effects = _channels_of_effects(problem, fit)
@@ -358,19 +353,7 @@ def directions_by_test(
 def _add_load_directions(
     groups: _DirectionGroups, problem: Problem, trial_index: int, response: FloatArray
 ) -> None:
-    """Add the size, zero and slope over the span of the response of a trial under load.
-
-    Parameters
-    ----------
-    groups : _DirectionGroups
-        The collection to which the directions are added.
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    trial_index : int
-        The index of the trial.
-    response : (N, C) array
-        The response of each channel to the load [unit of the channel].
-    """
+    """Add the directions of a trial under load: size, zero and slope of its response (N, C)."""
     data = problem.trials[trial_index]
     is_static = data.trial.kind is TrialKind.STATIC
     group = "static loads" if is_static else "loads of flight"
@@ -410,22 +393,10 @@ def _add_channel_directions(
     response: FloatArray,
     last_start: float,
 ) -> None:
-    """Add the size of an effect's channel in a trial, and its drift over the trials.
+    """Add the directions of one channel in a trial: the size of its response (N, C), and a drift.
 
-    Parameters
-    ----------
-    groups : _DirectionGroups
-        The collection to which the directions are added.
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    trial_index : int
-        The index of the trial.
-    channel : str
-        The channel of the effect.
-    response : (N, C) array
-        The response of the trial.
-    last_start : float
-        The start of the last trial [s].
+    The drift is proportional to the start of the trial [s]. At `last_start` it is as large as the
+    common zero of all channels of the same quantity, see `_zero_scale`.
     """
     data = problem.trials[trial_index]
     kind = data.trial.kind
@@ -445,8 +416,7 @@ def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -
     trial = problem.trials[trial_index].trial
     response = fit.responses[trial_index]
     if trial.kind is TrialKind.STATIC:
-        # subtract the row of least force: temperature and the offset of a run are not responses to
-        # it
+        # subtract the row of least force: temperature and the offset of a run do not depend on load
         response = response - response[np.argmin(np.abs(trial.force))]
     gains = problem.shared.gains(fit.point.shared, trial.channels)
     return np.asarray((1.0 + gains) * response)

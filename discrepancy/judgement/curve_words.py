@@ -73,7 +73,7 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
 
 
 def _position_text(position: float, unit: str) -> str:
-    """Return a position in its unit; a displacement in metres is told in millimetres."""
+    """Return a position with its unit; metres are converted to millimetres."""
     return f"{number(round(1e3 * position, 3))} mm" if unit == "m" else f"{number(position)} {unit}"
 
 
@@ -81,22 +81,22 @@ def _friction_in_words(
     velocities: FloatArray, forces: FloatArray, force_unit: str, velocity_unit: str
 ) -> str:
     """Return how a force depends on the velocity: as friction with a peak near rest, or a power."""
-    sizes = []
-    for side in (-1.0, 1.0):
-        on_side = side * velocities > 0.0
-        order = np.argsort(np.abs(velocities[on_side]))
-        sizes.append(side * forces[on_side][order])
-    count = min(len(size) for size in sizes)
+    resistances = []
+    for direction in (-1.0, 1.0):
+        is_in_direction = direction * velocities > 0.0
+        ascending = np.argsort(np.abs(velocities[is_in_direction]))
+        resistances.append(direction * forces[is_in_direction][ascending])
+    count = min(len(resistance) for resistance in resistances)
     if count < LEAST_POINTS_OF_FRICTION:
         return _growth("velocity", velocities, forces)
     # the mean of both directions, from rest to the largest velocity
-    mean_size = 0.5 * (sizes[0][:count] + sizes[1][:count])
+    mean_resistance = 0.5 * (resistances[0][:count] + resistances[1][:count])
     speeds = np.sort(np.abs(velocities[velocities > 0.0]))[:count]
-    peak = int(np.argmax(mean_size))
-    if mean_size[peak] > PEAK_OVER_END * abs(mean_size[-1]) and peak < count // 2:
+    peak = int(np.argmax(mean_resistance))
+    if mean_resistance[peak] > PEAK_OVER_END * abs(mean_resistance[-1]) and peak < count // 2:
         return (
-            f"it is largest near rest, and falls to {number(float(mean_size[-1]))} {force_unit} at "
-            f"{number(float(speeds[-1]))} {velocity_unit}"
+            f"it is largest near rest, and falls to {number(float(mean_resistance[-1]))} "
+            f"{force_unit} at {number(float(speeds[-1]))} {velocity_unit}"
         )
     return _growth("velocity", velocities, forces)
 
@@ -104,7 +104,7 @@ def _friction_in_words(
 def _line_to_zero(
     displacements: FloatArray, forces: FloatArray, is_beyond: BoolArray
 ) -> tuple[float, float]:
-    """Return the slope of a force beyond a stretch without force, and where its line is zero."""
+    """Fit a line to a force beyond a stretch without force; return its slope and its zero."""
     slope, at_zero = np.polyfit(displacements[is_beyond], forces[is_beyond], 1)
     return float(slope), float(-at_zero / slope)
 
@@ -112,10 +112,11 @@ def _line_to_zero(
 def _stretch_without_force(
     displacements: FloatArray, forces: FloatArray
 ) -> tuple[float, float] | None:
-    """Return the ends of the stretch in which there is no force; None if there is none.
+    """Return the ends of the longest stretch without force; None if it is no play.
 
-    Beyond such a stretch the force rises at once. That of a cubic spring is also small in the
-    middle, but rises slowly there.
+    It is play if it covers at least `LEAST_DEAD_BAND` of the range, and if the force next to it
+    rises at least half as steeply as at the end of the range. The force of a cubic spring is also
+    small in the middle, but rises slowly there.
     """
     is_zero = np.abs(forces) <= NO_FORCE * np.abs(forces).max()
     # the longest stretch of zeros
@@ -137,24 +138,26 @@ def _stretch_without_force(
     return low, high
 
 
-def _growth(variable: str, displacements: FloatArray, forces: FloatArray) -> str:
-    """Return how a force grows with the displacement or velocity, and to which side it acts."""
-    at_zero = float(np.interp(0.0, displacements, forces))
-    changes = forces - at_zero
+def _growth(variable: str, motion: FloatArray, forces: FloatArray) -> str:
+    """Return in words how a force grows with the motion, and whether it acts on one side only.
+
+    `variable` says whether the motion is a displacement or a velocity.
+    """
+    changes = forces - float(np.interp(0.0, motion, forces))
     largest_by_side = {}
     for side in (-1.0, 1.0):
-        on_side = np.where(side * displacements > 0.0, changes, 0.0)
-        largest_by_side[side] = float(np.abs(on_side).max())
+        changes_on_side = np.where(side * motion > 0.0, changes, 0.0)
+        largest_by_side[side] = float(np.abs(changes_on_side).max())
     stronger = max(largest_by_side, key=lambda side: largest_by_side[side])
     is_one_sided = largest_by_side[-stronger] < ONE_SIDED * largest_by_side[stronger]
-    # the force on the stronger side, as a power of the displacement
-    on_side = (stronger * displacements > 0.0) & (np.abs(changes) > 0.0)
-    size = np.log(np.abs(changes[on_side]))
-    distance = np.log(np.abs(displacements[on_side]))
-    weights = np.sqrt(np.abs(changes[on_side]))  # small forces tell little of the power
-    exponent = float(np.polyfit(distance, size, 1, w=weights)[0])
-    end = int(np.argmax(np.where(on_side, np.abs(changes), 0.0)))
-    acts_against = changes[end] * displacements[end] > 0.0
+    # the exponent of the force on the stronger side is a slope in logarithms
+    on_side = (stronger * motion > 0.0) & (np.abs(changes) > 0.0)
+    log_force = np.log(np.abs(changes[on_side]))
+    log_motion = np.log(np.abs(motion[on_side]))
+    weights = np.sqrt(np.abs(changes[on_side]))  # small forces tell little of the exponent
+    exponent = float(np.polyfit(log_motion, log_force, 1, w=weights)[0])
+    largest = int(np.argmax(np.where(on_side, np.abs(changes), 0.0)))
+    acts_against = changes[largest] * motion[largest] > 0.0
     if exponent < CONSTANT_EXPONENT:
         growth = "it is nearly constant"
     elif exponent < LINEAR_EXPONENT:

@@ -36,7 +36,7 @@ from .simulation_comparison import SimulationComparison
 from .verdict_checks import check_against_trials
 
 COLOURED = "which is coloured as its records admit"
-"""What is said of noise that is correlated in time."""
+"""Clause on noise that is correlated in time as in its records."""
 
 
 def reach_verdict(
@@ -149,9 +149,10 @@ def _leaves_more_than_noise(verdict: Verdict) -> bool:
 
 
 def _decide_on_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
-    """Return the verdict if what remains is noise of the colour that the noise records have.
+    """Return the verdict if what remains is noise correlated in time as in the noise records.
 
-    None is returned if more remains than such noise, or if no single set of effects is named.
+    None is returned if more remains than such noise, or if it is open what is missing: the verdict
+    must be that nothing is, that it is too small to be detected, or name one set of effects.
     """
     outcome = decide_on_noise(NoiseCase(comparison, noise=COLOURED))
     outcome = _with_test_on_held_out(comparison, outcome)
@@ -171,11 +172,13 @@ def _decide_on_coloured_noise(comparison: SimulationComparison) -> VerdictOutcom
 def _without_superfluous_effect(
     comparison: Comparison[HypothesisT], outcome: VerdictOutcome
 ) -> VerdictOutcome:
-    """Return the verdict on a named set, without effects that explain hardly anything.
+    """Return the verdict without those named effects that explain hardly anything.
 
-    If the residuals are nearly noise, what the smaller set leaves explains them as well as such an
-    effect does. So the subsets of the set are compared with it by what each leaves. An effect
-    remains if the evidence of the whole set is far above that of the set without it.
+    Such an effect may only describe a small remainder, which is no noise but has no cause of its
+    own either. So if a subset explains nearly the same share of the gap, or some effects deserve no
+    name (`notable_terms`), all are compared again together with what each leaves. A subset with
+    nearly the same share then replaces the set, if it has just the effects that deserve a name, or
+    if the score of the set is not far above its own.
     """
     verdict, fit = outcome.verdict, outcome.fit
     may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)

@@ -52,11 +52,11 @@ _GAIN_NUISANCE = _Nuisance("gain_deviation", "gain", UNKNOWN_GAIN_DEVIATION)
 def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]:
     """Return a sentence for each zero or gain that the campaign wrongly states as exact.
 
-    First it is estimated by how much the sum of squares falls if the zero (or gain) of a channel is
-    free and all other unknowns are fixed. The channels with the largest decrease are then fitted
-    with a free zero, each alone and then all together, because a change of other unknowns may have
-    the same effect as a free zero. A channel is reported if its fit removes at least
-    `LEAST_REMOVED_SHARE` of the misfit of all channels.
+    Zeros are tried first, then gains. With all other unknowns fixed, it is estimated by how much
+    the sum of squares falls if the zero of a channel is free. The channels with the largest
+    decrease are then fitted with a free zero, each alone and then all together, as other unknowns
+    may compensate for it. The first of these fits that removes at least `LEAST_REMOVED_SHARE` of
+    the misfit of all channels is reported, for each of its channels.
 
     Parameters
     ----------

@@ -89,11 +89,11 @@ class ForceComparison(Comparison[Estimate]):
         return self.search.exact_fits[candidate.key]
 
     def failed_check_reason(self, hypothesis: Estimate) -> str:
-        """Return why laws without memory are no name for a force with memory; empty if they may be.
+        """Return why a law of the present motion may not be named; empty if it may.
 
-        A force that follows a relaxed displacement depends on the history of the motion. A law of
-        the present motion, above all one with a free exponent, takes the largest part of it, and
-        would be a false name.
+        It may not if the missing force depends on the history of the motion, that is on a relaxed
+        displacement. A law without memory, above all one with a free exponent, then explains most
+        of the force, but would be a false name.
         """
         if hypothesis.leaves_no_force or self._missing_force is None:
             return ""

@@ -1,4 +1,4 @@
-"""Hypotheses in the words and records of a verdict: effects, values with intervals, outcome."""
+"""Hypotheses as a verdict lists and describes them: their effects, with values and intervals."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -31,15 +31,16 @@ from reporting.words import listing
 
 from .curve_words import curve_in_words, curve_of, followed_variable
 
-TOLD_POINT = 6
-"""Every how many points of a table of forces one is told."""
+POINT_STRIDE = 6
+"""A verdict lists every sixth point of a table of forces."""
 
 
 class VerdictOutcome(NamedTuple):
     """A verdict, the search on which it is based, and the fit that represents it.
 
-    The fit is that of the named set or family, of the most probable member of a group, or of the
-    effects that are too small to be detected; else the one without effect.
+    The fit is that of the effects that the verdict is about: the named set or family, the most
+    probable member of a group, the best hypothesis on an unexplained gap, or effects too small to
+    be detected. Without such effects it is the fit without effect.
     """
 
     verdict: Verdict
@@ -57,9 +58,9 @@ class WeightedHypothesis(NamedTuple):
 def outcome_with_hypotheses(
     verdict: Verdict, search: Search, fit: CandidateFit, hypotheses: Sequence[WeightedHypothesis]
 ) -> VerdictOutcome:
-    """Return a verdict that lists the hypotheses of a search, and what its fit leaves.
+    """Return a verdict together with the hypotheses of its search, and what its fit leaves.
 
-    The probability of each effect of the catalogue to be one of the missing ones is added, too.
+    The probability that each effect of the catalogue is one of the missing ones is added, too.
 
     Parameters
     ----------
@@ -148,7 +149,7 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
     """Return the effects of a hypothesis with the values and 90 % intervals of their parameters.
 
     Intervals are those of the posterior draws if the fit has any, else of its covariance. A
-    parameter that changes nothing at the place is left out.
+    parameter with a single level is left out if it changes nothing at the place.
     """
     low, high = _intervals(hypothesis, np.eye(hypothesis.candidate.parameter_count))
     first_parameter = 0
@@ -196,17 +197,17 @@ def _forces_of_table(
     port : str
         The port of the curve.
     hypothesis : ComparedHypothesis
-        The hypothesis, of which the curve is the only effect.
+        The hypothesis; the curve is its only effect.
     table : ForceTable
-        The curve, as functions of which the hypothesis has the amplitudes.
+        The curve as a sum of functions, whose amplitudes are the parameters of the hypothesis.
     """
-    functions = table.functions[::TOLD_POINT]
+    functions = table.functions[::POINT_STRIDE]
     forces = functions @ hypothesis.effect
     low, high = _intervals(hypothesis, functions)
     force_unit, motion_unit = problem.model.port_units(port)
     unit = motion_unit if table.variable == "displacement" else f"{motion_unit}/s"
     estimates = []
-    for number, point in enumerate(table.points[::TOLD_POINT].tolist()):
+    for number, point in enumerate(table.points[::POINT_STRIDE].tolist()):
         estimates.append(
             ParameterEstimate(
                 name=f"force_at_{point:.3g}",
@@ -223,14 +224,14 @@ def _forces_of_table(
 def _intervals(
     hypothesis: ComparedHypothesis, functions: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper ends (F,) of 90 % intervals of what is linear in the parameters.
+    """Return the ends (F,) of 90 % intervals of F linear functions of the effect parameters.
 
     Parameters
     ----------
     hypothesis : ComparedHypothesis
         The hypothesis with the posterior of its E scaled effect parameters.
     functions : (F, E) array
-        What each quantity changes by for a unit of each parameter.
+        The coefficients of the parameters in each function.
     """
     most_probable = functions @ hypothesis.effect
     if isinstance(hypothesis, CandidateFit) and hypothesis.draws is not None:

@@ -82,10 +82,11 @@ def _stated_unknowns(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
 
 
 def unknowns_moved_within_prior(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, ...]:
-    """Return the unknowns that a fit moves far within wide stated deviations, the farthest first.
+    """Return the unknowns that a fit moves far, but not improbably far, the farthest first.
 
-    An unknown belongs to them if the fit moves it by one to two stated deviations, by at least
-    `LEAST_RELATIVE_MOVE`, and by at least `LEAST_SIGNIFICANCE` posterior deviations.
+    Their stated deviations are wide. The fit moves such an unknown by one to two stated deviations,
+    by at least `LEAST_RELATIVE_MOVE`, and by at least `LEAST_SIGNIFICANCE` posterior deviations.
+    Unknowns without a posterior deviation, such as constants of inputs, are left out.
 
     Parameters
     ----------
@@ -224,19 +225,7 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
 def _unknown_stated_as_zero(
     name: str, scaled_value: float, scale: float, unit: str
 ) -> MovedUnknown:
-    """Return the record of an unknown whose stated value is zero.
-
-    Parameters
-    ----------
-    name : str
-        The name of the unknown.
-    scaled_value : float
-        The scaled value of the unknown in the fit.
-    scale : float
-        The stated standard deviation of the unknown [unit].
-    unit : str
-        The unit of the unknown.
-    """
+    """Return the record of an unknown that is stated as zero with a standard deviation, `scale`."""
     return MovedUnknown(
         name=name,
         stated=0.0,

@@ -151,10 +151,11 @@ def mutual_information(
 
 
 def _recorded_over_actual_noise(problem: Problem, most_probable_fit: CandidateFit) -> FloatArray:
-    """Return the noise deviation that residuals are divided by, over the actual one, (channels,).
+    """Return the assumed noise deviation of each channel over its actual one, (channels,).
 
-    It is one for a channel with a noise record. Without a record, the deviation is an assumption,
-    and the rms residual of the most probable hypothesis is taken for the actual noise.
+    It is one for a channel with a noise record. Without a record, the deviation by which residuals
+    are divided is a mere assumption, and the rms residual of the most probable hypothesis is taken
+    as the actual one.
     """
     recorded_over_rms_residual = np.sqrt(
         problem.noise_precisions(most_probable_fit.squares_by_channel)
@@ -397,12 +398,12 @@ def second_sensor_proposals(problem: Problem, fits: Sequence[CandidateFit]) -> I
 
 
 def _name_of_second_sensor(channel_name: str) -> str:
-    """Return the name of a sensor that is mounted beside that of a channel."""
+    """Return the name of the second sensor beside that of a channel."""
     return f"second sensor beside {channel_name}"
 
 
 def _with_second_sensor(trial: Trial, channel_name: str) -> Trial:
-    """Return a trial with a further channel, which has the readings of a channel."""
+    """Return a trial with a second sensor, which has the same readings as the channel."""
     column = trial.channels.index(channel_name)
     return replace(
         trial,

@@ -1,4 +1,4 @@
-"""What the rules for noise ask of a comparison of hypotheses."""
+"""A set of effects that is considered for a name, with the tests that only noise may remain."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -34,7 +34,7 @@ class CheckedFit(NamedTuple):
 
 
 class NoiseCase(Generic[HypothesisT]):
-    """A comparison of hypotheses with what the rules ask of it.
+    """A comparison of hypotheses, of which one set of effects is considered for a name.
 
     Parameters
     ----------
@@ -98,9 +98,9 @@ class NoiseCase(Generic[HypothesisT]):
     def probability(self) -> float:
         """The probability that the effects of the leading set are missing in the model.
 
-        It is the sum over all sets that contain the effects of the leading set. The exponents of a
-        law of free shape are fitted, so that all effects of its family (such as all dampings) can
-        become the same law. The probability of the family is then returned if it is larger.
+        It is the sum over all sets that contain them. The exponents of a law of free shape are
+        fitted, so that all effects of its family, such as all dampings, can become the same law. If
+        the set has such a law, the probability of its family is taken if that is larger.
         """
         leading_names = set(names_without_free_shape(self.leading_set))
         set_probability = sum(
@@ -139,9 +139,10 @@ class NoiseCase(Generic[HypothesisT]):
 
     @cached_property
     def _best_free_shape(self) -> CandidateFit | None:
-        """The fit of the most evidence in which the shape of one effect of the set is free.
+        """The fit with the most evidence in which one effect of the set has a free shape.
 
-        None if no effect of the set has a shape parameter, or one is free already.
+        None if no effect of the set has a shape parameter, if one is free already, or if the noise
+        is coloured.
         """
         if self.leading_fit.candidate.has_free_shape or self.noise:
             return None

@@ -1,14 +1,14 @@
-"""Whether less noise would show an effect, or what else allows the same change of the readings.
+"""Whether less noise would show an effect, and which unknowns could imitate it otherwise.
 
-Let d be the change of the readings by an effect, over their noise, J the derivatives of the
-readings by the unknowns that are fitted under every hypothesis (one row for each), and P the prior
-precisions of these unknowns. With a noise variance that is n times smaller, the squared distance of
-the effect from the model without it is
+Let d be the change of the readings by an effect, over their noise, and J the derivatives of the
+readings with respect to the U unknowns that are fitted under every hypothesis (one row for each).
+Let P be the prior precisions of these unknowns. With a noise variance that is n times smaller, the
+squared distance of the effect from the model without it is
 
     G(n) = min over u of n |d - J' u|^2 + u' P u.
 
-It grows with n only until the unknowns imitate the change. Then their prior deviations limit it,
-and neither less noise nor more trials of the same kind help.
+It grows in proportion to n only while the unknowns cannot imitate the change. If they can, their
+prior deviations limit it, and neither less noise nor more trials of the same kind help.
 """
 
 from math import inf, prod
@@ -28,7 +28,7 @@ from discrepancy.fits.trial_data import TrialData
 LARGEST_NOISE_REDUCTION = 100.0
 """How many times smaller the noise may have to be; more is beyond any instrument."""
 LEAST_PART_IN_IMITATION = 0.2
-"""Change of the readings by an unknown, over the largest one, from which the unknown is named."""
+"""Least change of the readings by an unknown, over the largest such change, for it to be named."""
 MOST_NAMED_UNKNOWNS = 3
 """Largest number of unknowns that are named."""
 
@@ -83,9 +83,10 @@ class NoiseForecast:
         return float(brentq(excess, 1.0, LARGEST_NOISE_REDUCTION, rtol=1e-3))
 
     def imitating_unknowns(self, change: ScreenedChange) -> tuple[str, ...]:
-        """Return the unknowns that imitate the change by an effect at much smaller noise.
+        """Return the names and stated values of the unknowns that imitate an effect.
 
-        Those that change the readings most come first. They are named with what is stated of them.
+        The noise is `LARGEST_NOISE_REDUCTION` times smaller. The unknowns that change the readings
+        most come first, at most `MOST_NAMED_UNKNOWNS`.
         """
         overlaps, _ = self._overlaps(change)
         imitation = self._imitation(overlaps, LARGEST_NOISE_REDUCTION)
@@ -107,7 +108,7 @@ class NoiseForecast:
         return noise_reduction**2 * (squared_change - float(overlaps @ imitation))
 
     def _overlaps(self, change: ScreenedChange) -> tuple[FloatArray, float]:
-        """Return J d (n,) and |d|^2 of a change."""
+        """Return J d (U,) and |d|^2 of a change d."""
         overlaps = np.zeros(len(self._information))
         squared_change = 0.0
         first_entry = 0
@@ -119,7 +120,7 @@ class NoiseForecast:
         return overlaps, squared_change
 
     def _imitation(self, overlaps: FloatArray, noise_reduction: float) -> FloatArray:
-        """Return the scaled unknowns (n,) that imitate a change with the overlaps J d (n,)."""
+        """Return the scaled unknowns (U,) that come closest to a change, given J d (U,)."""
         matrix = self._information + self._prior_precision / noise_reduction**2
         return np.asarray(np.linalg.solve(matrix, overlaps))
 

@@ -1,4 +1,4 @@
-"""Verdicts on hypotheses of which a right one leaves only noise, as its records have it.
+"""Verdicts for the case that the right hypothesis leaves only noise, as in the noise records.
 
 A set of effects is *named* if it is probable enough, has enough evidence against the model as it
 is, and passes all tests of its simulation.
@@ -145,7 +145,7 @@ def family_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -> Ver
 
 
 def failed_test_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -> VerdictOutcome:
-    """Return the verdict of an unexplained gap, as the leading set or its family fails a test.
+    """Return the verdict of an unexplained gap after the leading set or its family failed a test.
 
     Parameters
     ----------
@@ -216,7 +216,12 @@ class _Member(NamedTuple):
 
 
 def undecided_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
-    """Return the verdict if no set reaches the probability that a name needs."""
+    """Return the verdict if no set of effects is probable enough to be named.
+
+    Something may be missing that is too small to be detected, if the model without effect is among
+    the probable sets. Otherwise the probable sets that pass the test of absolute fit are a group.
+    If none passes, or more than `SEARCH.largest_group` do, the gap is unexplained.
+    """
     if () in case.probable_sets:
         return _below_limit_verdict(case)
     members = []
@@ -229,8 +234,8 @@ def undecided_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
     probability = total_probability(
         case.probabilities[member.effect_names] for member in passing_members
     )
-    # an effect with its canonical and with a free shape is one member, and what explains the
-    # readings alone needs no further effect beside it
+    # an effect with its canonical and with a free shape is one member; a set is no member if a
+    # subset of it is one
     distinct_members: dict[EffectSet, _Member] = {}
     for member in passing_members:
         distinct_members.setdefault(names_without_free_shape(member.effect_names), member)

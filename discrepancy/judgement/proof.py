@@ -192,7 +192,7 @@ def correlation_time(series: FloatArray) -> float:
 
 
 def _uniformity_p_value(
-    transforms: Sequence[FloatArray], used_by_trial: Sequence[BoolArray], counts: IntArray
+    standardised: Sequence[FloatArray], used_by_trial: Sequence[BoolArray], counts: IntArray
 ) -> float:
     """Return the p-value of Pearson's χ² test that a histogram is uniform over its bins.
 
@@ -200,7 +200,7 @@ def _uniformity_p_value(
 
     Parameters
     ----------
-    transforms : sequence of (N, C) array
+    standardised : sequence of (N, C) array
         The residuals of each trial over their predictive deviation.
     used_by_trial : sequence of (N, C) array of bool
         For each trial, whether a sample counts.
@@ -209,7 +209,7 @@ def _uniformity_p_value(
     """
     sample_count = 0
     independent_count = 0.0
-    for values, is_used in zip(transforms, used_by_trial, strict=True):
+    for values, is_used in zip(standardised, used_by_trial, strict=True):
         for column in range(values.shape[1]):
             series = values[is_used[:, column], column]
             if series.size:
@@ -233,9 +233,10 @@ def _uniformity_p_value(
 def score_gain(residuals_before: ResidualSet, residuals_after: ResidualSet) -> tuple[float, float]:
     """Return the gain of the mean predictive log density per sample, and its standard error [nat].
 
-    Trials are the units: the error is that of a ratio over clusters. With fewer than five trials it
-    is at least the error within them, from sums over sixteenths of each record (all channels at
-    once, so that neighbouring samples may depend on each other); with one trial it is that alone.
+    The standard error is that of a ratio over clusters, and the trials are the clusters. With fewer
+    than five trials it is at least the error within the trials, and with one trial it is just that.
+    The error within a trial comes from sums over sixteenths of its record, so that neighbouring
+    samples and the channels may depend on each other.
 
     Parameters
     ----------
@@ -301,8 +302,9 @@ def check_held_out(residuals_after: ResidualSet) -> Gate:
     -------
     Gate
         It fails if χ² per sample of the held-out trials is more than `HELD_OUT_DEVIATIONS` of its
-        deviations above what is expected, or the coverage of 90 % intervals is outside `COVERAGE`.
-        `passed` is None without a held-out trial or without a noise record.
+        deviations above what is expected. It also fails if the coverage of 90 % intervals is
+        outside `COVERAGE`, given at least `LEAST_SAMPLES_FOR_COVERAGE` samples. `passed` is None
+        without a held-out trial or without a noise record.
     """
     if residuals_after.held_out is None:
         return _held_out_gate(None, nan, "No trial was held out.")
@@ -363,7 +365,7 @@ def compare_errors(residuals_before: ResidualSet, residuals_after: ResidualSet) 
 def errors_of_fit(search: FittedCandidates, fit: CandidateFit) -> ErrorComparison:
     """Return the errors of the deciding trials without effect and with a fit of a search.
 
-    They are computed once for each fit, so that all that is said of a fit is said of one record.
+    They are computed once for each fit and size of the time steps.
     """
     key = (fit, search.problem.refinement)
     if key not in search.errors_by_fit:

@@ -142,7 +142,7 @@ def _shape_sentence(comparison: Comparison[HypothesisT], best_hypothesis: Hypoth
 
     A parameter is determined if its standard deviation is below
     `SEARCH.determined_shape_deviation`. The sentence is empty if there is none, if the hypothesis
-    has several laws, or if the law with a fitted shape explains less of the gap in the decisive
+    has several effects, or if the law with a fitted shape explains less of the gap in the decisive
     trials, by more than `SEARCH.least_added_share`.
     """
     if len(best_hypothesis.candidate.terms) != 1:
@@ -173,28 +173,28 @@ def _unproved_addition_sentence(
 ) -> str:
     """Return the sentence on effects that may be missing besides those of the best hypothesis.
 
-    They are those that the best ranked larger hypothesis adds. It must have all effects of the best
-    hypothesis, by family and place, and more; all must act on the structure rather than on sensors;
-    its score must be less than `SEARCH.contender_range` lower; and it must explain more of the gap
-    by `SEARCH.negligible_share`. The sentence is empty if there is no such hypothesis.
+    A larger hypothesis has all effects of the best one, by family and place, and more, which act on
+    the structure and not on sensors; its score is at most `SEARCH.contender_range` lower. The
+    sentence names what the most probable larger hypothesis adds. It is empty if there is none, or
+    if that one does not explain more of the gap by at least `SEARCH.negligible_share`.
     """
     best_pairs = family_place_pairs(best_hypothesis)
-    score_floor = comparison.score(best_hypothesis) - SEARCH.contender_range
+    least_score = comparison.score(best_hypothesis) - SEARCH.contender_range
     larger_hypothesis = None
     for hypothesis in comparison.ranked_hypotheses:
         has_more_pairs = family_place_pairs(hypothesis) > best_pairs  # a proper superset
         only_on_structure = all(
             comparison.acts_on_structure(term) for term in hypothesis.candidate.terms
         )
-        if has_more_pairs and only_on_structure and comparison.score(hypothesis) > score_floor:
+        if has_more_pairs and only_on_structure and comparison.score(hypothesis) > least_score:
             larger_hypothesis = hypothesis
             break
     if larger_hypothesis is None:
         return ""
-    share_floor = (
+    least_share = (
         comparison.held_out_or_fitted_share(best_hypothesis).value + SEARCH.negligible_share
     )
-    if comparison.held_out_or_fitted_share(larger_hypothesis).value < share_floor:
+    if comparison.held_out_or_fitted_share(larger_hypothesis).value < least_share:
         return ""
     added_effects = []
     for effect in named_effects(comparison.problem, larger_hypothesis):

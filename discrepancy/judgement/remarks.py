@@ -128,9 +128,9 @@ def verdict_with_untested_effects(
 ) -> Verdict:
     """Return the verdict with a sentence on effects that may be the cause, but cannot be tested.
 
-    They are easily mistaken for an effect of the verdict, and act on trials of these kinds. But
-    they need another trial, port or place, so that none of them could be compared. An effect whose
-    counterpart in this kind of model was compared is not among them.
+    Such an effect is easily mistaken for one of the verdict, and acts on trials of these kinds. But
+    it could not be compared, since it needs another trial, port or place, and neither could its
+    counterpart for this kind of model.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     Returns
     -------
     str or None
-        One or two sentences; None if nothing is named.
+        One or two sentences; None if the verdict is not `VerdictKind.NAMED`.
     """
     if verdict.kind is not VerdictKind.NAMED:
         return None

@@ -51,7 +51,8 @@ class Detectability:
     place : str
         The place at which the effect changes the readings most.
     distance : float
-        The squared distance of the effect at its prior median from the model without it [sigma^2].
+        The squared distance of the effect at its prior median from the model without it [sigma^2],
+        or, if that is less, that of a small effect scaled up to the median.
     parameter : str
         The name of the parameter that is the magnitude of the effect.
     detectable : float
@@ -109,7 +110,7 @@ class Separability:
 
 
 def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
-    """Return a campaign in which the readings are replaced by those that the model predicts.
+    """Return a campaign in which the readings of the fitted trials are those that a model predicts.
 
     Such readings leave no residuals from which an unrecorded noise could be estimated. So a channel
     without a noise record gets one, of a thousandth of its range. An unknown initial state of a
@@ -145,7 +146,7 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
 
 
 def has_free_initial_state(trial: Trial) -> bool:
-    """Return whether a trial begins in a moving state that only its readings can tell."""
+    """Return whether a trial begins in an unknown state, which only its readings can show."""
     if trial.begins is Start.UNKNOWN:
         return True
     return trial.release is not None and not trial.release.at_rest
@@ -269,17 +270,9 @@ def _reference_change(
 ) -> ScreenedChange | None:
     """Return the largest change of the readings by an effect at its prior median.
 
-    If that is not detectable, parameters such as a place along the span are varied too, while the
-    magnitude stays. None is returned if the model can be evaluated with no change.
-
-    Parameters
-    ----------
-    screen : Screen
-        The fit without effect, about which changes are linear.
-    effect : Effect
-        The effect of the catalogue.
-    options : sequence of ScreenedChange
-        The changes by the effect over a grid of its parameters.
+    If the change is not detectable, the other parameters, such as a place along the span, are
+    varied as in `options`, the changes over a grid. If the model cannot be evaluated at the median,
+    the largest of the options is returned, and None if there are none.
     """
     references = _changes_at_prior_median(screen, effect) or options
     if not references:
@@ -364,18 +357,10 @@ def _with_forecast(
     small_reference: "_SmallChange",
     forecast: NoiseForecast,
 ) -> Detectability:
-    """Return how well an effect can be detected, with what would make it detectable.
+    """Return the record of an undetected effect with the noise at which it would be detected.
 
-    Parameters
-    ----------
-    row : Detectability
-        An effect that is not detected at its prior median.
-    reference : ScreenedChange
-        The change by the effect at its prior median.
-    small_reference : _SmallChange
-        The same change at a small magnitude.
-    forecast : NoiseForecast
-        The distances at smaller noise.
+    If less noise would not help, the unknowns that imitate the effect are added. `small_reference`
+    is the reference change at a small magnitude.
     """
     if row.distance <= 0.0:
         return replace(row, noise_factor=inf)
@@ -412,10 +397,12 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     growth = np.array([1.0 / reference.factor**2 for reference in small_references])
     distance = np.zeros((len(effects), len(effects)))
     for j, other_effect in enumerate(effects):
-        reach = _Reach(screen, other_effect.options)
-        small_reach = _Reach(screen, [small_change.change for small_change in small_changes[j]])
-        at_reference = reach.squared_distances(references)
-        to_first_order = small_reach.squared_distances(small_targets) * growth
+        reachable = _ReachableChanges(screen, other_effect.options)
+        small_reachable = _ReachableChanges(
+            screen, [small_change.change for small_change in small_changes[j]]
+        )
+        at_reference = reachable.squared_distances(references)
+        to_first_order = small_reachable.squared_distances(small_targets) * growth
         distance[:, j] = np.minimum(at_reference, to_first_order)
     # an effect whose reference cannot be detected is compared at the least size that can
     squared_sizes = np.array([reference.squared_size for reference in references])
@@ -448,8 +435,8 @@ class _LinearSpace(NamedTuple):
     gram: FloatArray
 
 
-class _Reach:
-    """The changes that an effect can make, to tell how far other changes are from them.
+class _ReachableChanges:
+    """All changes of the readings that an effect can make, and distances of others from them.
 
     Near each of the options they are approximated by a linear space. It is spanned by the option,
     and by its differences when the parameters of the effect are varied.
@@ -468,7 +455,10 @@ class _Reach:
         self._spaces: dict[int, _LinearSpace] = {}  # by the number of the option
 
     def squared_distances(self, targets: Sequence[ScreenedChange]) -> FloatArray:
-        """Return the squared distance (T,) of each of T changes from these changes [sigma^2]."""
+        """Return the squared distances (T,) of T changes from the nearest reachable ones [sigma^2].
+
+        The nearest option is the one closest in direction.
+        """
         return np.array(
             [
                 self._squared_distance(target, option_number)

@@ -147,7 +147,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         ]
 
     def subsets(self, hypothesis: CandidateFit) -> list[CandidateFit]:
-        """Return the fits with some of the effects of a hypothesis that converged."""
+        """Return the converged fits that have some of the effects of a hypothesis."""
         return [fit for fit in super().subsets(hypothesis) if fit.candidate.key in self._exact_fits]
 
     @property
@@ -224,9 +224,10 @@ class SimulationComparison(Comparison[CandidateFit]):
         self.search.wide_fits = compared
 
     def _single_laws_like(self, best_fit: CandidateFit) -> list[CandidateFit]:
-        """Return the best single law of each family and place that is easily mistaken for the best.
+        """Return fits of the single laws that are easily mistaken for the best one.
 
-        The best law itself is one of them, if it has a shape parameter.
+        For each family and place it is the one with the highest score. Only laws with a shape
+        parameter that is not free yet count; the best law is one of them if it has one.
         """
         (best_term,) = best_fit.candidate.terms
         single_fits: dict[tuple[str, str], CandidateFit] = {}
@@ -254,9 +255,9 @@ class SimulationComparison(Comparison[CandidateFit]):
     def failed_check_reason(self, hypothesis: CandidateFit) -> str:
         """Return the reason why a hypothesis fails the test of consistency or of held-out trials.
 
-        It is empty if it fails neither, or if its residuals are more than noise anyway. In held-out
-        trials they may be more than noise too if the hypothesis explains nearly all of the gap
-        there: the verdict then states the size of what remains.
+        It is empty if the hypothesis fails neither, or if its residuals are more than noise anyway.
+        Held-out trials are not tested if it explains nearly all of the gap there: the verdict then
+        states how much remains.
         """
         if hypothesis.residual_process is not None:
             return ""

@@ -191,7 +191,7 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
     deviation of the readings about their mean. A channel may show nothing but noise, so the rms
     residual must also exceed `VETO_NOISE_DEVIATIONS` noise deviations.
     """
-    unexplained_records = []
+    unfitted = []
     for fitted_trial in residuals.trials:
         if fitted_trial.trial.held_out or not fitted_trial.trial.is_dynamic:
             continue
@@ -206,8 +206,8 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
                 record = UnfittedRecord(
                     fitted_trial.trial.name, channel, residual_rms, signal_deviation
                 )
-                unexplained_records.append(record)
-    return tuple(unexplained_records)
+                unfitted.append(record)
+    return tuple(unfitted)
 
 
 def _noise_deviation(residuals: ResidualSet, fitted_trial: FittedTrial, column: int) -> float:

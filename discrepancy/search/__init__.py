@@ -1,1 +1,1 @@
-"""Which candidates, in which order."""
+"""The search: which sets of effects are fitted, and in which order."""

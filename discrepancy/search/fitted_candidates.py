@@ -98,10 +98,10 @@ class FittedCandidates:
 
     @cached_property
     def _mesh_error_misfit(self) -> float:
-        """The misfit by errors of a mesh, `SEARCH.mesh_error` of each reading [nat].
+        """The misfit that an error of `SEARCH.mesh_error` in each reading causes [nat].
 
-        It is zero without a mesh, and where all trials are at rest. A large effect is never exactly
-        as in the model, and what a mesh leaves of it looks like a second effect that is small.
+        It is zero if the model has no mesh, or if all trials are at rest. A mesh predicts a large
+        effect with a small error, which looks like a second, small effect.
         """
         in_motion = any(data.trial.is_dynamic for data in self.problem.trials)
         if not self.problem.model.nuisance_parameters or not in_motion:
@@ -120,7 +120,10 @@ class FittedCandidates:
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
     def best(self) -> CandidateFit:
-        """Return the fit of the most probable candidate among the compared fits."""
+        """Return the fit with the highest score; rough fits do not count.
+
+        It is one of the fits under the wider noise if there are any, else one of the exact fits.
+        """
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def residuals(self, fit: CandidateFit) -> ResidualSet:
@@ -161,10 +164,7 @@ class FittedCandidates:
         return fits[key]
 
     def is_unexplained(self) -> bool:
-        """Return whether the best candidate does not pass the test of absolute fit.
-
-        It fails the test, or there is no noise record to test it by.
-        """
+        """Return whether the best candidate fails the test of absolute fit, or cannot be tested."""
         return not check_absolute_fit(self.problem, self.best()).passed
 
     @property
@@ -176,8 +176,8 @@ class FittedCandidates:
         """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
         If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
-        has clearly more evidence. If hypotheses are compared under a wider noise, the candidate's
-        fit under that noise is returned as it is.
+        has more evidence by `SEARCH.refit_gain`. A candidate that has a fit under the wider noise
+        is not fitted again: that fit is returned.
         """
         key = rough_fit.candidate.key
         if key in self.wide_fits:

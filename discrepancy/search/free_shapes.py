@@ -1,4 +1,4 @@
-"""Laws of free shape: the best single effects, fitted again with their shape parameters."""
+"""Laws of free shape: the best single effects are fitted again together with their shapes."""
 
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape
 from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit
@@ -8,10 +8,11 @@ from .fitted_candidates import FittedCandidates
 
 
 def fits_of_free_shape(candidates: FittedCandidates) -> list[CandidateFit]:
-    """Return the best single effects, fitted with free shapes, that explain the data better.
+    """Return fits of the best single effects with free shapes, where the shape gains evidence.
 
-    Effects of one family at one place lead to the same free law; of their fits, the one with the
-    highest score is returned.
+    A fit is returned if the free shape gains more than `LEAST_SHAPE_GAIN` and the test of absolute
+    fit does not fail. Effects of one family at one place become the same law when their shape is
+    free, so only the fit with the highest score is returned for each family and place.
 
     Parameters
     ----------
@@ -47,16 +48,11 @@ def _is_not_refuted(candidates: FittedCandidates, fit: CandidateFit) -> bool:
 
 
 def _single_fits_to_free(candidates: FittedCandidates) -> list[CandidateFit]:
-    """Return the single effects that are to be fitted with a free shape, the best first.
+    """Return the best single effects, at most `SEARCH.most_exact_fits`, the best first.
 
-    They are the best ones, at most `SEARCH.most_exact_fits`, also if one of them explains the data:
-    a law that is not in the catalogue explains them with another shape. There are none if the model
-    without effect explains the data.
-
-    Parameters
-    ----------
-    candidates : FittedCandidates
-        All candidates that were fitted so far, with the problem.
+    None is returned if the model without effect explains the data, or cannot be tested. If a single
+    effect explains the data, a free shape is still tried: the right law may be of the same family,
+    but not in the catalogue.
     """
     if _is_not_refuted(candidates, candidates.no_effect):
         return []

@@ -1,7 +1,7 @@
-"""Starting points of fits near other optima than the one that was found.
+"""Fits from other starting points, in case a fit has ended in the wrong optimum.
 
-They have another stretch of the structure that an effect covers, or another place of one effect of
-a set.
+The starting points differ from the fit in the stretch of the structure that an effect covers, or in
+the place of one effect of a set.
 """
 
 from collections.abc import Callable
@@ -17,16 +17,17 @@ from discrepancy.fits.fitting import CandidateFit, try_fit
 from .fitted_candidates import FittedCandidates
 
 LEAST_TAIL = 0.02
-"""Prior probability that is left beyond a moved end of a stretch."""
+"""Least prior probability on either side of the moved end of a stretch."""
 
 
 def refit_from_other_stretches(
     candidates: FittedCandidates, on_progress: Callable[[str], None]
 ) -> None:
-    """Fit the best set again from other stretches of the structure that its effect may cover.
+    """Fit the best set again, beginning with other stretches of the structure.
 
-    The response has a kink where an end of a stretch passes a line of the mesh. A fit may end in an
-    optimum on the wrong side of a line, where the stretch seems to be known far better than it is.
+    Some effects, such as a local loss of stiffness, cover a stretch of the structure. Where an end
+    of the stretch passes a line of the mesh, the response has a kink. A fit may end in an optimum
+    on the wrong side of a line, where the stretch seems to be known far better than it is.
 
     Parameters
     ----------
@@ -44,27 +45,24 @@ def refit_from_other_stretches(
 
 
 def points_at_other_stretches(fit: CandidateFit) -> list[Point]:
-    """Return points at which an effect covers another stretch of the structure, to begin fits at.
+    """Return starting points at which one end of a stretch is moved to either side.
 
-    Both ends of a stretch are unknowns of such an effect, and the catalogue gives the number of
-    levels that the screen tries of each. The points have one of these unknowns half a level higher
-    or lower, in units of its prior probability. They are none if no effect covers a stretch.
-
-    Parameters
-    ----------
-    fit : CandidateFit
-        The fit that was found.
+    An effect covers a stretch if the catalogue gives a number of levels for more than one of its
+    parameters: these are the ends of the stretch. Each end is moved by half a level, which is 0.5 /
+    (number of levels) of its prior probability, while all other unknowns stay.
     """
     points = []
     first_parameter = 0
     for term in fit.candidate.terms:
-        numbers_with_levels = [k for k, item in enumerate(term.parameters) if item.levels > 1]
-        if len(numbers_with_levels) > 1:  # both ends
-            for number in numbers_with_levels:
+        end_numbers = [
+            number for number, parameter in enumerate(term.parameters) if parameter.levels > 1
+        ]
+        if len(end_numbers) > 1:
+            for number in end_numbers:
                 half_level = 0.5 / term.parameters[number].levels
                 index = first_parameter + number
-                for move in (-half_level, half_level):
-                    probability = float(ndtr(fit.effect[index])) + move
+                for change in (-half_level, half_level):
+                    probability = float(ndtr(fit.effect[index])) + change
                     effect = fit.effect.copy()
                     effect[index] = ndtri(np.clip(probability, LEAST_TAIL, 1.0 - LEAST_TAIL))
                     points.append(replace(fit.point, effect=effect))
@@ -73,7 +71,7 @@ def points_at_other_stretches(fit: CandidateFit) -> list[Point]:
 
 
 def sets_at_other_places(candidate: Candidate, setting: Setting) -> list[Candidate]:
-    """Return all candidates that differ from a set of effects by the place of one effect."""
+    """Return all sets of effects that differ from a given one by the place of one effect."""
     moved_candidates = []
     for number, term in enumerate(candidate.terms):
         for place in term.effect.places(setting):

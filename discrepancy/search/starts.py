@@ -90,7 +90,7 @@ def _moves_frequencies(effect: Effect, setting: Setting) -> bool:
 
 
 def free_places(effect: Effect, candidate: Candidate, setting: Setting) -> tuple[str, ...]:
-    """Return the places of an effect at which a set of effects does not have it yet."""
+    """Return the places of an effect that a set of effects leaves free for it."""
     taken_places = {
         term.place for term in candidate.terms if term.effect.identifier == effect.identifier
     }
@@ -111,11 +111,11 @@ def are_related(effect: Effect, other_effect: Effect) -> bool:
 
 
 def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChange]:
-    """Return the changes of the prediction by an effect from which its fits should begin.
+    """Return the changes of the prediction from which the fits of an effect should begin.
 
-    They are those with the least expected objective over all places and a grid of parameters. An
-    effect with several parameters to begin at besides its magnitude, such as the place and width of
-    a box, gets more starts than others.
+    All places and a grid of parameters are tried, and those with the least expected objective are
+    kept: `SEARCH.starts_near_data` of them, or three times as many if more than one parameter
+    besides the magnitude is varied, such as the place and width of a box.
 
     Parameters
     ----------
@@ -128,12 +128,12 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
     places = free_places(effect, screen.fit.candidate, setting)
     has_few_places = len(places) <= SEARCH.few_places
     moves_frequencies = _moves_frequencies(effect, setting)
-    other_parameter_count = sum(
+    varied_parameter_count = sum(
         not parameter.magnitude and parameter.levels != 1 for parameter in effect.parameters
     )
-    start_count = (
-        SEARCH.starts_near_data * 3 if other_parameter_count > 1 else SEARCH.starts_near_data
-    )
+    start_count = SEARCH.starts_near_data
+    if varied_parameter_count > 1:
+        start_count *= 3
     best_changes: list[ScreenedChange] = []
     for place in places:
         best_of_place: list[ScreenedChange] = []
@@ -149,7 +149,9 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
                 with suppress(DiscrepancyError):
                     small_change, _ = screen.shrink_change(change)
                     tried_changes.append(small_change)
-            nonzero_changes = [change for change in tried_changes if change.squared_size > 0.0]
+            nonzero_changes = [
+                tried_change for tried_change in tried_changes if tried_change.squared_size > 0.0
+            ]
             best_of_place = sorted(
                 [*best_of_place, *nonzero_changes], key=_expected_objective_change
             )[:start_count]
@@ -158,7 +160,7 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
 
 
 def _expected_objective_change(change: ScreenedChange) -> float:
-    """Return the expected change of the objective by a change at its best scale [nat].
+    """Return how a change of the prediction, at its best scale, should change the objective [nat].
 
     It is the negative log prior of the parameters minus the decrease of the misfit.
     """
@@ -167,39 +169,42 @@ def _expected_objective_change(change: ScreenedChange) -> float:
 
 
 class ScreenedPair(NamedTuple):
-    """Changes by two effects, scaled to reduce the misfit most together.
+    """Changes by two effects, scaled such that both together reduce the misfit most.
 
     Attributes
     ----------
-    misfit : float
-        The change of the misfit by both, negative for a decrease [nat].
+    misfit_change : float
+        The change of the misfit by both together, negative for a decrease [nat].
     first, second : ScreenedChange
         The two changes with their best scales.
     """
 
-    misfit: float
+    misfit_change: float
     first: ScreenedChange
     second: ScreenedChange
 
 
-def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[ScreenedPair]:
+def best_pairs(
+    changes: Sequence[ScreenedChange], inner_product_signs: FloatArray
+) -> list[ScreenedPair]:
     """Return the best pair of changes for each pair of effects, the best first.
 
-    The two effects are different, or the same one at two places if it may act at both at once.
+    The two effects are different, or one effect at two places if it may act at both at once. Pairs
+    are left out if their changes are parallel, or if an effect would need a sign that it cannot
+    have.
 
     Parameters
     ----------
     changes : sequence of ScreenedChange
         The changes by all effects.
-    sign : (D,) array
-        The signs of the inner product of changes, `Screen.inner_product_signs`: entries of a vector
-        that are projections on nuisances count negative, as they are subtracted from those of
-        readings.
+    inner_product_signs : (D,) array
+        The signs of the entries in the inner product of two changes, see
+        `Screen.inner_product_signs`.
     """
     best_by_effects: dict[tuple[str, str], ScreenedPair] = {}
     for first_change, second_change in combinations(changes, 2):
         effect_names = (first_change.term.effect.identifier, second_change.term.effect.identifier)
-        inner_product = float(first_change.vector * sign @ second_change.vector)
+        inner_product = float(first_change.vector * inner_product_signs @ second_change.vector)
         gram = np.array(
             [
                 [first_change.squared_size, inner_product],
@@ -223,7 +228,7 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
         misfit_change = -0.5 * float(overlap @ best_scales)
         is_best_of_effects = (
             effect_names not in best_by_effects
-            or misfit_change < best_by_effects[effect_names].misfit
+            or misfit_change < best_by_effects[effect_names].misfit_change
         )
         if all(has_possible_sign) and is_best_of_effects:
             best_by_effects[effect_names] = ScreenedPair(
@@ -231,14 +236,12 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
                 _with_scale(first_change, best_scales[0]),
                 _with_scale(second_change, best_scales[1]),
             )
-    return sorted(best_by_effects.values(), key=lambda pair: pair.misfit)
+    return sorted(best_by_effects.values(), key=lambda pair: pair.misfit_change)
 
 
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
-    """Return a change whose best scale is the given one, so that a fit begins there.
-
-    The best scale of a change is its overlap over its squared size (`ScreenedChange.best_scale`).
-    """
+    """Return a change whose best scale is the given one, so that a fit begins there."""
+    # the best scale of a change is its overlap over its squared size
     return replace(change, overlap=scale * change.squared_size)
 
 
@@ -262,12 +265,14 @@ def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatA
 
 
 def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[FitStart]:
-    """Return the points of a grid of an effect's parameters at which the objective is least.
+    """Return the points of a parameter grid at which a fit of one more effect should begin.
 
-    A grid is used if the residuals are so large that a screen, which is linear, is not reliable. It
-    costs a simulation for each point. If mass or stiffness changes at one of many places, few
-    sizes are tried at all places, then all sizes at the best of these, and each start is at another
-    place.
+    They are the points with the least objective, at most `SEARCH.starts_far_from_data`. A grid
+    needs a simulation for each point. It is used where the residuals are so large that a screen,
+    which is linear, is not reliable.
+
+    If the effect changes mass or stiffness at one of many places, the grid covers only the best few
+    places (see `_best_places`), and the best point of each of them is returned.
 
     Parameters
     ----------
@@ -306,10 +311,10 @@ def _best_places(
 ) -> tuple[str, ...]:
     """Return the places at which an effect lowers the objective most in the first periods.
 
-    Each place is searched on its own, since the size that gives the measured first frequency
-    differs between places: first with few of the levels (L,), then with those about the best of
-    these. Objectives are compared to two digits; places that are then equal stay in their order, in
-    which named sets come first.
+    Each place is searched on its own, since the magnitude that gives the measured first frequency
+    differs between places. Every `SEARCH.coarse_level_step`-th of the levels (L,) is tried first,
+    then the levels next to the best of them. Objectives are compared to two digits; places that are
+    then equal stay in their given order, in which named sets of nodes come first.
     """
     early_problem = _problem_of_first_periods(problem)
     half_step = SEARCH.coarse_level_step // 2
@@ -328,7 +333,11 @@ def _best_places(
 
 
 def _problem_of_first_periods(problem: Problem) -> Problem:
-    """Return the problem with the first periods of the first mode of each trial in motion."""
+    """Return the problem in which only the first periods of each trial in motion are compared.
+
+    They are `SEARCH.first_periods` periods of the first mode. Without trials in motion it is the
+    problem itself.
+    """
     period = 2.0 * np.pi / problem.setting.scales.angular_frequency
     intervals = [data.trial.interval for data in problem.trials if data.trial.is_dynamic]
     if not intervals:
@@ -337,7 +346,7 @@ def _problem_of_first_periods(problem: Problem) -> Problem:
 
 
 class _GridPoint(NamedTuple):
-    """A point of a grid, the place of its effect and its objective [nat]."""
+    """The start of a fit at a point of a grid, the place of its effect and its objective [nat]."""
 
     objective: float
     place: str
@@ -351,9 +360,10 @@ def _grid_points(
     places: Sequence[str],
     levels: FloatArray,
 ) -> list[_GridPoint]:
-    """Return the points of a grid of an effect's parameters at some places, the best first.
+    """Return the points of a parameter grid of an effect at some places, the best first.
 
-    `levels` (L,) are the scaled values of each parameter that fits may begin at.
+    Each parameter is tried at all scaled values in `levels` (L,), or only at its median if the
+    catalogue gives it one level. Points at which the model cannot be evaluated are left out.
     """
     points = []
     for place in places:

@@ -1,10 +1,11 @@
 """The search for the set of effects that explains a campaign.
 
-Effects are screened at a fit (see `fits.screening`), the promising ones are fitted by few steps and
-the best of these to convergence; then effects are added to the best set, moved to other places, and
-dropped. The *score* of a fit is ln (evidence times prior). A *family* is a law whose shape
-parameters are fitted too. *Far from the truth* is a fit whose residuals are much larger than the
-noise, so that predictions are not linear between it and the right one.
+Effects are screened at a fit (see `fits.screening`). The promising ones are fitted in a few steps,
+and the best of these to convergence. Then effects are added to the best set, moved to other places,
+and dropped. The *score* of a fit is ln (evidence times prior). A *family* is a law whose shape
+parameters are fitted too. A fit is *far from the truth* if its residuals are much larger than the
+noise, or if it moves a shared unknown far from its prior: predictions are then not linear between
+this fit and the right one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -80,8 +81,10 @@ class Search(FittedCandidates):
 
     def estimate_of(self, candidate: Candidate) -> Estimate | None:
         """Return the estimate of a set of effects with the missing force; None without one."""
-        estimates = (item for item in self.force_estimates if item.candidate.key == candidate.key)
-        return next(estimates, None)
+        for estimate in self.force_estimates:
+            if estimate.candidate.key == candidate.key:
+                return estimate
+        return None
 
     # ---------------------------------------------------------------- rough fits of one more effect
 
@@ -90,10 +93,11 @@ class Search(FittedCandidates):
     ) -> list[CandidateFit]:
         """Add each effect to a base, one at a time, and fit the sets in a few steps.
 
-        The fits begin where a screen, a linear prediction of what each effect gains, expects the
-        best fit. If the base is far from the truth, its phases drift away from those of the
-        readings, which no linear prediction can see. Fits then begin at the best points of a grid,
-        too.
+        The fits begin where a screen, which is linear, expects the best fit. If the base is far
+        from the truth, its phases drift away from those of the readings, and a screen does not see
+        that. Effects of the structure are then fitted from the best points of a grid. If the base
+        is far only because it moves shared unknowns, they are fitted from the screen, too, and the
+        grid is left out if one of these fits passes the test of absolute fit.
 
         Parameters
         ----------
@@ -155,19 +159,11 @@ class Search(FittedCandidates):
         )
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
-        """Fit each promising effect in a few steps, and return the best fit of each.
+        """Fit each effect that a screen finds promising, and return the best fit of each.
 
-        A screen predicts to first order by how much an effect would decrease the misfit, its gain,
-        at each place and point of a grid of its parameters. Effects whose gain is too small are not
-        fitted. The fits of the others start from the points of the largest gain, and the effect of
-        the largest gain is fitted first.
-
-        Parameters
-        ----------
-        base : CandidateFit
-            The fit that effects are added to.
-        effects : sequence of Effect
-            The effects to add, one at a time.
+        The screen predicts the gain of each effect, which is the decrease of the misfit to first
+        order, at all places and on a grid of parameters. Effects with too small a gain are not
+        fitted. The effect of the largest gain is fitted first.
         """
         has_effects = bool(base.candidate.terms)
         least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
@@ -182,11 +178,11 @@ class Search(FittedCandidates):
     def _promising_changes(
         self, base: CandidateFit, effects: Sequence[Effect], least_gain: float
     ) -> list[list[ScreenedChange]]:
-        """Screen effects at a base, and return the best changes of the prediction by each.
+        """Screen effects at a base, and return for each the changes that gain enough.
 
-        Changes with a gain below `least_gain` [nat] are left out, and so are effects without any
-        other. The effect of the largest gain comes first. If the base has no effect, the largest
-        gain of each effect is kept in `screened_gains`.
+        Changes that gain less than `least_gain` [nat] are left out. An effect that has no other
+        changes has no entry. The effect of the largest gain comes first. If the base has no effect,
+        the largest gain of each effect is stored in `screened_gains`.
         """
         screen = Screen(self.problem, base)
         changes_by_effect = []
@@ -205,10 +201,10 @@ class Search(FittedCandidates):
         )
 
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
-        """Return a base whose nuisances are not distorted by the errors of the model.
+        """Return the base with all nuisances at their prior means.
 
-        The nuisances of a wrong model compensate a part of its error, and are a bad start. They
-        are set to their prior means.
+        The fitted nuisances of a wrong model compensate a part of its error, so fits should not
+        begin with them.
         """
         point = self.problem.prior_mean_point(base.candidate)
         return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
@@ -216,28 +212,27 @@ class Search(FittedCandidates):
     def _fit_from_starts(
         self, starts_by_effect: Sequence[Sequence[FitStart]], base: CandidateFit, least_gain: float
     ) -> list[CandidateFit]:
-        """Fit each effect by few steps from several points, and return the best fit of each.
+        """Fit each effect in a few steps from several points, and return the best fit of each.
 
-        The fit minimises an objective: the negative log posterior of the unknowns [nat]. A fit that
-        is not expected to come below a limit of the objective ends early, to save time. The limit
-        begins `least_gain` below the objective of the base fit. It falls whenever a fit, of
-        whichever effect, is so good that fits near the limit could no longer compete with it.
+        A fit ends early if its objective, the negative log posterior, is not expected to come below
+        a limit. The limit begins `least_gain` below the objective of the base. It falls to
+        `SEARCH.largest_rough_deficit` above the best objective of all fits so far, since worse fits
+        cannot become the best one.
 
         Parameters
         ----------
         starts_by_effect : sequence of sequence of FitStart
             For each effect, the points from which its fits start.
         base : CandidateFit
-            The fit without the effect. The derivatives of its predictions by nuisances (unknowns
-            other than those of effects) are used for the first steps in place of new ones.
+            The fit without the effect. Its derivatives with respect to nuisances are used for the
+            first steps instead of new ones.
         least_gain : float
             The decrease of the objective, from that of the base, that makes a fit worthwhile [nat].
 
         Returns
         -------
         list of CandidateFit
-            For each effect that could be fitted, its fit with the highest score. The score is the
-            logarithm of evidence times prior probability.
+            For each effect that could be fitted, its fit with the highest score.
         """
         best_fits = []
         objective_limit = base.objective - least_gain
@@ -302,8 +297,8 @@ class Search(FittedCandidates):
     def refine_time_steps(self) -> None:
         """Halve the time steps until their error in the best candidate is small against the noise.
 
-        The best candidates are fitted again with the smaller steps. The others are not, as no
-        verdict depends on them.
+        They are halved until `SEARCH.largest_step_reduction` at most. After each time the best
+        `SEARCH.most_refitted` candidates are fitted again; no verdict depends on the others.
         """
         problem = self.problem
         while (
@@ -329,7 +324,11 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def search_sets(self) -> None:
-        """Fit laws of free shape, sets of several effects, and pairs, if these explain more."""
+        """Fit laws of free shape, then sets of several effects, and improve the best set.
+
+        Effects are added unless a law of free shape is the best fit. Pairs are fitted only if the
+        best set still leaves more than noise.
+        """
         self.fit_free_shapes()
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
@@ -348,12 +347,9 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def search_by_missing_force(self, force_search: ForceSearch) -> None:
-        """Estimate the sets of effects together with the missing force, and fit the best one.
+        """Estimate sets of effects together with the missing force, and fit the best to readings.
 
-        Parameters
-        ----------
-        force_search : ForceSearch
-            The search for the missing force.
+        Sets that can imitate nearly anything are ranked, but not fitted.
         """
         force_search.begin_along_simulation(self.no_effect.point)
         self.force_estimates = rank_by_missing_force(force_search, self.effects, self.on_progress)
@@ -371,11 +367,14 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def add_effects(self) -> None:
-        """Add one effect at a time to the best set, as long as the score rises."""
+        """Add one effect at a time to the best set, as long as the score rises.
+
+        A third effect is added only if two effects nearly explain the data.
+        """
         current_fit = self.best()
         while 0 < len(current_fit.candidate.terms) < SEARCH.largest_set:
             if len(current_fit.candidate.terms) > 1 and self._is_far_from_truth(current_fit):
-                break  # a third effect is added only if two effects nearly explain the data
+                break
             current_score = self.score(current_fit)
             present_identifiers = {term.effect.identifier for term in current_fit.candidate.terms}
             other_effects = [
@@ -401,10 +400,11 @@ class Search(FittedCandidates):
         return self.is_unexplained() and fit.chi_square > largest_remainder
 
     def fit_effects_at_several_places(self) -> None:
-        """Fit effects that may act at several places at once at more and more places.
+        """Add further places to each effect that may act at several places at once.
 
-        At one place such an effect explains little if it acts at two, so that errors of sensors may
-        lead and no set with it would be tried. The places are therefore compared beside each other.
+        If such an effect acts at two places, it explains little at one place alone. Errors of
+        sensors may then explain more, and `add_effects`, which begins with the best fit, would not
+        reach it. So places are added to each such effect on its own, as long as the score rises.
         """
         for effect in self.effects:
             if not effect.at_several_places:
@@ -427,10 +427,10 @@ class Search(FittedCandidates):
                 current_fit = exact_fits[0]
 
     def move_effects(self) -> None:
-        """Fit the best set with one effect at another place, until the set explains the data.
+        """Move one effect of the best set to another place, until the set explains the data.
 
-        Of each set, only the fit at one place is kept after few steps, and these may have chosen a
-        wrong place.
+        The place of an effect was chosen by fits of few steps, and may be wrong. The search also
+        ends when no move raises the score.
         """
         best_fit = self.best()
         while len(best_fit.candidate.terms) > 1 and self.is_unexplained():
@@ -473,7 +473,7 @@ class Search(FittedCandidates):
             best_fit = self.best()
 
     def fit_free_shapes(self) -> None:
-        """Fit the best single effects with free shapes, and record those that explain the data.
+        """Fit the best single effects with free shapes, see `fits_of_free_shape`.
 
         One law with a free shape is a simpler cause than two laws, so it is tried before pairs.
         """
@@ -481,7 +481,11 @@ class Search(FittedCandidates):
             self.record_fit(free_fit, exact=True)
 
     def fit_pairs(self) -> None:
-        """Fit the pairs of effects that reduce the misfit most, according to a linear screen."""
+        """Fit the pairs of effects that should reduce the misfit most according to a screen.
+
+        The screen is at the fit without effect. At most `SEARCH.most_fitted_pairs` pairs are
+        fitted, unless they were fitted before.
+        """
         screen = Screen(self.problem, self.no_effect)
         changes: list[ScreenedChange] = []
         for effect in self.effects:

@@ -29,9 +29,10 @@ def search(
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
 
-    The model without effect is fitted first. If all trials are in motion, and have a channel for
-    each port of the model, sets of effects are then compared with the missing force. Otherwise
-    single effects are fitted, then sets.
+    The model without effect is fitted first. If all trials are in motion, each with at least as
+    many channels as the model has ports, sets of effects are compared by the force that they leave
+    missing. Otherwise, or if that force cannot be estimated, single effects are fitted to the
+    readings, then sets.
 
     Parameters
     ----------
@@ -61,8 +62,8 @@ def search(
     variants = variants_in_events(usable_catalogue, problem.setting)
     usable_effects = with_prior_weights((*usable_catalogue, *variants))
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
-    _, own_laws = problem.model.without_laws()
-    if len(own_laws) and result.force_search is not None and result.is_unexplained():
+    _, laws_of_model = problem.model.without_laws()
+    if len(laws_of_model) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
         start = result.force_search.point(result.force_search.estimate_without_effects)

@@ -160,7 +160,7 @@ def _add_correlation_in_time(
     white_variance: FloatArray,
     interval: float,
 ) -> _ChannelProcess:
-    """Return the random process of a channel with amplitude, correlation time and frequency set.
+    """Return a process with its amplitude, correlation time and frequency.
 
     The residuals of the channel are the sum of white noise and this process. The process oscillates
     if its autocorrelation has a deep first minimum; otherwise its frequency is zero.
@@ -168,7 +168,7 @@ def _add_correlation_in_time(
     Parameters
     ----------
     process : _ChannelProcess
-        The process, whose amplitude, correlation time and frequency are not set yet.
+        The process without these three values.
     variance_ratio : float
         The variance of the process divided by the variance of the white noise.
     autocorrelation : (K,) array
@@ -233,7 +233,7 @@ def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
 
 
 class _RecordedColour(NamedTuple):
-    """The correlation in time that the residuals of a channel have if they are recorded noise.
+    """The correlation in time that residuals have if they are noise as in the noise record.
 
     Attributes
     ----------
@@ -253,20 +253,12 @@ class _RecordedColour(NamedTuple):
 def _recorded_colour(
     problem: Problem, name: str, records: Sequence[ResidualRecord], interval: float
 ) -> _RecordedColour:
-    """Return the correlation in time of residuals that are noise as in the noise record.
+    """Return the correlation in time that the residuals of a channel have if they are its noise.
 
-    If residuals are whitened, the record is passed through the same whitening filter first.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    name : str
-        The name of the channel.
-    records : sequence of ResidualRecord
-        The residuals of the channel.
-    interval : float
-        The interval between successive samples [s].
+    It comes from the noise record, at the time steps of the residuals, as a mean over their
+    records. If residuals are whitened, the noise record is passed through the same filter first.
+    The correlation is nan if there are no noise samples, or if their interval differs from
+    that of the residuals, `interval` [s], by more than `LARGEST_INTERVAL_DIFFERENCE`.
     """
     unknown_colour = _RecordedColour(np.nan, 0.0, 1.0)
     record = problem.campaign.channels[name].noise
@@ -390,10 +382,9 @@ def compare_under_wide_noise(search: Search) -> None:
 
 
 def _best_fits_of_probable_sets(search: Search) -> list[CandidateFit]:
-    """Return the best fits of the most probable sets of one, two and three effects.
+    """Return the best fit of each of the most probable sets of one, two and three effects.
 
-    Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has
-    the number of sets of each length.
+    `SEARCH.most_weighed_sets` limits the number of sets of each length.
     """
     best_by_set: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
@@ -413,16 +404,10 @@ def _best_fits_of_probable_sets(search: Search) -> list[CandidateFit]:
 def _fit_under_wide_noise(
     search: Search, wide_problem: Problem, fits: Sequence[CandidateFit]
 ) -> dict[CandidateKey, CandidateFit]:
-    """Return the most promising hypotheses fitted under a wider noise.
+    """Return the hypotheses that are compared under a wider noise, fitted under it.
 
-    Parameters
-    ----------
-    search : Search
-        The search whose hypotheses they are.
-    wide_problem : Problem
-        The problem under the wider noise.
-    fits : sequence of CandidateFit
-        The fits to choose from.
+    They are the model without effect, the given fits with the highest expected scores, and the
+    subsets of the best of these, so that each of its effects can be shown to be needed.
     """
     # choose by the expected score under the wider noise
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in fits]
@@ -440,7 +425,7 @@ def _fit_under_wide_noise(
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
     ):
         _add_wide_fit(wide_fits, search, wide_problem, search.fit_to_convergence(fit))
-    # fit the subsets of the best set, to compare whether each of its effects is needed
+    # fit the subsets of the best set
     leading_names = set(max(wide_fits.values(), key=search.score).candidate.identifiers)
     for fit in list(search.compared_fits().values()):
         names = set(fit.candidate.identifiers)
@@ -469,10 +454,10 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score that a fit would have under a wider noise, without fitting it again [nat].
+    """Return the score that a fit should have under a wider noise, without fitting it again [nat].
 
-    The score is ln (evidence times prior). Only the misfit of the residuals is computed for the
-    wider noise; the other terms of the score are those under the recorded noise.
+    Only the misfit of its present residuals is computed for the wider noise; the other terms of the
+    score are those under the recorded noise.
     """
     problem = search.problem
     scaled_residuals = []
