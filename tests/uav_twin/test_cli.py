@@ -35,7 +35,7 @@ from tests.twin_master.runs import text_of, written
 from tests.uav_twin.test_discrepancy_import import TWO
 from twin_master.errors import InvalidModelError, MissionInputError, NotResumableError, ScenarioError
 from twin_master.mission.plant import Truth
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.workflow import check_scenario
 from uav_twin import _HOMES, cli, load_design, load_scenario
 
@@ -154,6 +154,8 @@ FLIGHT = (  # `run --no-report`
         ("uav_twin.cli", "numpy scipy skfem pymor fmpy xarray matplotlib numba pydantic pint openpyxl"),
         (FLIGHT, "xarray pandas dask distributed zarr matplotlib bokeh skfem pymor meshio scipy.interpolate "
                  "scipy.optimize scipy.sparse"),
+        ("twin_master.watch.workflow, twin_master.fleet.engine",
+         "xarray pandas dask distributed zarr matplotlib bokeh"),
     ],
 )  # fmt: skip
 def test_start_up_is_lazy(modules, heavy):

@@ -1,15 +1,16 @@
 """Feeds give messages to a watch and take its decisions; those of recordings can be read again."""
 
+from __future__ import annotations
+
 import io
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
-import xarray as xr
 
 from reporting.arrays import Float
 from reporting.errors import DamagedFileError
@@ -29,6 +30,9 @@ from twin_master.feeds.payload import PayloadReader
 from twin_master.mission.journal import JOURNAL_NAME, record_of_line
 from twin_master.mission.journal_packing import array_from_json
 from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Decision = JsonRecord
 """A decision as it is published; `docs/how_to/watch.md` lists its keys."""
@@ -239,7 +243,9 @@ class RunFeed(RecordedFeed):
         for reading in self.scenario.inspection_readings:
             if reading.name in group:
                 values = group[reading.name].values.tolist()
-                _add_finite_values(records, reading.name, values)
+                for record, value in zip(records, values, strict=True):
+                    if math.isfinite(value):
+                        record[reading.name] = value
         covariance = group.get(f"{role}_covariance")  # of modes
         if covariance is not None:
             for record, triangle in zip(records, covariance.values, strict=False):
@@ -277,13 +283,6 @@ class RunFeed(RecordedFeed):
     def open_file(self, position: Position | None) -> BinaryIO:
         """Return the messages as a file with a line of JSON for each step."""
         return io.BytesIO(self._lines)
-
-
-def _add_finite_values(records: Sequence[JsonObject], name: str, values: Sequence[float]) -> None:
-    """Add the value of each step to its record, if it is finite."""
-    for record, value in zip(records, values, strict=True):
-        if math.isfinite(value):
-            record[name] = value
 
 
 class FolderFeed(RecordedFeed):

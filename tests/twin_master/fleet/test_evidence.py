@@ -19,6 +19,7 @@ from tests.twin_master.fleet.test_learning import tiny
 from tests.twin_master.network.decision_oracles import precise_forward_backward
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError
+from twin_master.fleet import engine
 from twin_master.fleet.engine import Engine, TaskPool, open_task_pool
 from twin_master.fleet.learning import evidence_tasks
 from twin_master.fleet.learning.evidence import (
@@ -29,7 +30,7 @@ from twin_master.fleet.learning.evidence import (
 from twin_master.fleet.learning.evidence_kernels import LEAST_EVIDENCE
 from twin_master.fleet.learning.parameter_evidence import parameter_evidence
 from twin_master.fleet.plan import ensemble
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet
 
 EACH = {"2g": 0.07, "3g": 0.2}
@@ -115,8 +116,8 @@ def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a task have seven twins."""
-    monkeypatch.setattr(evidence_tasks, "TASK_TWINS", 7)
+    """Let a task have fourteen twins: there are three tasks, and the last one is smaller."""
+    monkeypatch.setattr(evidence_tasks, "TASK_TWINS", 14)
 
 
 def lessons(flown: Path, folder: Path, **options: Any) -> bytes:
@@ -125,15 +126,20 @@ def lessons(flown: Path, folder: Path, **options: Any) -> bytes:
     return (folder / "learnt.toml").read_bytes()
 
 
-def test_a_fleet_teaches_the_same_bytes_with_any_number_of_workers(flown, tmp_path, small_tasks):
-    alone = lessons(flown, tmp_path)
-    assert lessons(flown, tmp_path, engine=Engine(1)) == alone
+@pytest.fixture(scope="module")
+def alone(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """What the fleet teaches if this process computes all tasks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evidence_tasks, "TASK_TWINS", 14)
+        return lessons(flown, tmp_path_factory.mktemp("alone"))
+
+
+def test_a_fleet_teaches_the_same_bytes_with_several_workers(flown, tmp_path, small_tasks, alone):
     assert lessons(flown, tmp_path, engine=Engine(2)) == alone
 
 
-def test_a_worker_that_dies_changes_nothing(flown, tmp_path, small_tasks):
+def test_a_fleet_teaches_the_same_bytes_with_one_worker_that_dies(flown, tmp_path, small_tasks, alone):
     progress = KillingProgress(local_workers)
-    alone = lessons(flown, tmp_path)
     assert lessons(flown, tmp_path, engine=Engine(1), progress=progress) == alone
     assert progress.killed
 
@@ -144,11 +150,17 @@ def end_this_process(_task: int) -> int:
     return 0
 
 
-def test_twins_over_which_workers_die_again_and_again_end_the_command_with_a_sentence():
-    with (
-        open_task_pool(Engine(1), Progress()) as pool,
-        refused(FleetError, "3 workers died over the same twins"),
-    ):
+@pytest.fixture(scope="module")
+def pool() -> Iterator[TaskPool]:
+    """A pool with one worker process, in which a task may kill one worker."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "ALLOWED_DEATHS", 1)
+        with open_task_pool(Engine(1), Progress()) as pool:
+            yield pool
+
+
+def test_twins_over_which_workers_die_again_and_again_end_the_command_with_a_sentence(pool):
+    with refused(FleetError, "2 workers died over the same twins"):
         list(pool.results(end_this_process, [1]))
 
 
@@ -157,10 +169,9 @@ def variable_of_worker(name: str) -> str | None:
     return os.environ.get(name)
 
 
-def test_local_workers_keep_memory_for_their_next_arrays():
+def test_local_workers_keep_memory_for_their_next_arrays(pool):
     """With this variable, which Dask sets, glibc would take fresh memory for each array."""
-    with open_task_pool(Engine(1), Progress()) as pool:
-        assert list(pool.results(variable_of_worker, ["MALLOC_TRIM_THRESHOLD_"])) == [None]
+    assert list(pool.results(variable_of_worker, ["MALLOC_TRIM_THRESHOLD_"])) == [None]
 
 
 class Load:
@@ -171,12 +182,11 @@ def nothing_of(_load: Load) -> None:
     """Compute nothing."""
 
 
-def test_a_pool_forgets_the_tasks_that_are_done():
+def test_a_pool_forgets_the_tasks_that_are_done(pool):
     """Dask logs the last messages to a worker, with the tasks in them."""
-    with open_task_pool(Engine(1), Progress()) as pool:
-        list(pool.results(nothing_of, (Load() for _ in range(200))))
-        gc.collect()
-        kept = sum(type(thing) is Load for thing in gc.get_objects())
+    list(pool.results(nothing_of, (Load() for _ in range(200))))
+    gc.collect()
+    kept = sum(type(thing) is Load for thing in gc.get_objects())
     assert kept < 40
 
 
@@ -200,10 +210,9 @@ class DistantPool(TaskPool):
 
 
 def test_observations_are_sent_to_workers_that_do_not_see_the_fleet(
-    flown, tmp_path, small_tasks, monkeypatch
+    flown, tmp_path, small_tasks, monkeypatch, alone
 ):
     pool = DistantPool(flown)
-    alone = lessons(flown, tmp_path)
     monkeypatch.setattr("twin_master.fleet.learning.learn.open_task_pool", lambda *_: nullcontext(pool))
     assert lessons(flown, tmp_path) == alone
     # The first task comes back without an answer; then all tasks go with their observations.
