@@ -39,7 +39,7 @@ from twin_master.mission.planning import encode_policy, read_policy
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.kinds import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.store.mission_result import MissionResult

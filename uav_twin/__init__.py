@@ -39,17 +39,17 @@ if TYPE_CHECKING:  # the names as type checkers and editors read them
     from twin_master.fleet.learning.learn import learn_from_fleet as learn_from_fleet
     from twin_master.fleet.plan import ensemble as ensemble
     from twin_master.fleet.reading import open_fleet as open_fleet
-    from twin_master.gauges.monitor import WatchfulEstimator as WatchfulEstimator
+    from twin_master.gauges.gauge_watch import WatchfulEstimator as WatchfulEstimator
     from twin_master.mission.preparation import prepare_twin as prepare_twin
     from twin_master.network.estimator import Carried as Carried
     from twin_master.network.estimator import Estimate as Estimate
     from twin_master.network.estimator import Estimator as Estimator
-    from twin_master.network.estimator import ExactFilter as ExactFilter
     from twin_master.network.estimator import Learnt as Learnt
     from twin_master.network.estimator import Notice as Notice
     from twin_master.network.estimator import NoticeWording as NoticeWording
     from twin_master.network.estimator import SensorModel as SensorModel
     from twin_master.network.graphical_model import GraphicalModel as GraphicalModel
+    from twin_master.network.inference import ExactFilter as ExactFilter
     from twin_master.network.inference import filter_sequence as filter_sequence
     from twin_master.network.planner import BeliefPolicy as BeliefPolicy
     from twin_master.network.planner import Hold as Hold
@@ -100,12 +100,12 @@ _HOMES = {
     "learn_from_fleet": "twin_master.fleet.learning.learn",
     "ensemble": "twin_master.fleet.plan",
     "open_fleet": "twin_master.fleet.reading",
-    "WatchfulEstimator": "twin_master.gauges.monitor",
+    "WatchfulEstimator": "twin_master.gauges.gauge_watch",
     "prepare_twin": "twin_master.mission.preparation",
     "Carried": "twin_master.network.estimator",
     "Estimate": "twin_master.network.estimator",
     "Estimator": "twin_master.network.estimator",
-    "ExactFilter": "twin_master.network.estimator",
+    "ExactFilter": "twin_master.network.inference",
     "Learnt": "twin_master.network.estimator",
     "Notice": "twin_master.network.estimator",
     "NoticeWording": "twin_master.network.estimator",

@@ -34,11 +34,20 @@ def init(
 
     Example: `uav-twin init mesh my_part part.inp`
     """  # noqa: E501
-    from uav_twin.projects.projects import make_project
+    from uav_twin.projects.fmu import fmu_project
+    from uav_twin.projects.mesh import mesh_project
+    from uav_twin.projects.rig import rig_project
+    from uav_twin.projects.stream import stream_project
 
     require_one_of(kind, KINDS, "KIND")
+    makers = {
+        "mesh": mesh_project,
+        "fmu": fmu_project,
+        "rig": rig_project,
+        "stream": stream_project,
+    }
     with terminal.progress().stage("Writing the project"):
-        project = make_project(kind, folder.resolve().name, file)
+        project = makers[kind](folder.resolve().name, file)
         project.write(folder)
     terminal.say(f"Wrote {folder}: {project.title}")
     terminal.say(f"Next: cd {folder}, and the commands of README.md:")

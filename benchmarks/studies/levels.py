@@ -27,10 +27,11 @@ from reporting.progress import SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.gauges.monitor import WatchfulEstimator
+from twin_master.gauges.gauge_watch import WatchfulEstimator
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.network.estimator import Carried, ExactFilter
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.estimator import Carried
+from twin_master.network.graphical_model import build_graphical_model
+from twin_master.network.inference import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 

@@ -22,7 +22,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, loaded_from, noted, prepared, written
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.watch.workflow import begin_watch
 from uav_twin import fly, load_calibration, open_run, structure_files

@@ -26,8 +26,12 @@ from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSo
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import InvalidModelError, MissionInputError
-from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import (
+    Factor,
+    GraphicalModel,
+    StateSpace,
+    build_graphical_model,
+)
 from twin_master.scenario.kinds import BeliefSection
 from twin_master.scenario.schema import Scenario
 

@@ -77,13 +77,10 @@ class CsvFeed(RecordedFeed):
             return False
         # Sensors may have numbers as names, so that numbers alone do not show readings
         try:
-            return not all(self._is_column(PRESENT_NAMES.get(cell, cell)) for cell in cells)
+            names = [PRESENT_NAMES.get(cell, cell) for cell in cells]
+            return not all(name in OTHER_KEYS or self.reader.find_column(name) for name in names)
         except Refused:  # a known name with a wrong unit
             return False
-
-    def _is_column(self, name: str) -> bool:
-        """Return whether a name is that of a sensor or of another column."""
-        return name in OTHER_KEYS or self.reader.find_column(name) is not None
 
     def _set_columns(self, names: Sequence[str]) -> None:
         """Check the names of columns, and use them for the rows that follow.

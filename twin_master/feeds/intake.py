@@ -272,7 +272,9 @@ class Intake:
         there is no message and no `on_poll`.
         """
         with suppress(_EndRequested):
-            while not self.end_is_requested and not self._has_all_steps(twin):
+            while not self.end_is_requested:
+                if self.step_limit is not None and twin.steps >= self.step_limit:
+                    return None
                 # Checked again each time, because `replace_impossible` refuses messages, too
                 if self.stops_at_refusals and self.stream.has_refusals_to_report:
                     return None
@@ -288,10 +290,6 @@ class Intake:
                 if not has_message:
                     time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
         return None
-
-    def _has_all_steps(self, twin: Twin) -> bool:
-        """Return whether the twin has assimilated as many steps as the limit of the watch."""
-        return self.step_limit is not None and twin.steps >= self.step_limit
 
     def _receive_message(self, twin: Twin) -> bool:
         """Queue the readings of the next message, or refuse it; return whether there was one."""

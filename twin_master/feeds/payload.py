@@ -14,9 +14,8 @@ from twin_master.feeds.message import (
 from twin_master.feeds.points import (
     FieldValue,
     Point,
-    TimedRecord,
-    records_of_points,
     seconds_since_1970,
+    values_by_timestamp,
 )
 from twin_master.scenario.schema import Scenario
 
@@ -81,22 +80,25 @@ class PayloadReader:
     def _read_points(self, points: Sequence[Point]) -> list[Message | Refused]:
         """Return a message for each time of some points."""
         try:
-            records = records_of_points(points)
+            values_of_time = values_by_timestamp(points)
         except Refused as refusal:
             return [refusal]
-        return [self._read_record(record) for record in records]
-
-    def _read_record(self, record: TimedRecord) -> Message | Refused:
-        """Return the message for the values at a time, unless they name a step or time."""
-        message = self.reader.read(record.values)
-        if isinstance(message, Refused) or record.timestamp is None:
-            return message
-        if message.step is not None or message.time is not None:
-            return message
-        try:
-            return replace(message, time=seconds_since_1970(record.timestamp))
-        except Refused as refusal:
-            return refusal
+        messages: list[Message | Refused] = []
+        for timestamp, values in values_of_time.items():
+            message = self.reader.read(values)
+            # A step or time among the values comes before the timestamp of the points.
+            if (
+                isinstance(message, Message)
+                and message.step is None
+                and message.time is None
+                and timestamp is not None
+            ):
+                try:
+                    message = replace(message, time=seconds_since_1970(timestamp))
+                except Refused as refusal:
+                    message = refusal
+            messages.append(message)
+        return messages
 
 
 def is_of_telegraf(record: Mapping[str, object]) -> bool:

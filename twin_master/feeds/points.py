@@ -59,16 +59,8 @@ def seconds_since_1970(timestamp: float) -> float:
     return seconds
 
 
-@dataclass
-class TimedRecord:
-    """The values of all points at one time, under the keys of a JSON message."""
-
-    values: dict[str, object]
-    timestamp: float | None
-
-
-def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
-    """Return a record for each time of some points, in the order of the points.
+def values_by_timestamp(points: Iterable[Point]) -> dict[float | None, dict[str, object]]:
+    """Return the values of points at each time, under the keys of a JSON message.
 
     The key of a field is its own name, or the measurement if the field is called `value`. Of the
     tags, only `control` is read.
@@ -78,19 +70,19 @@ def records_of_points(points: Iterable[Point]) -> list[TimedRecord]:
     Refused
         If two points at one time have different values under one name.
     """
-    record_of_time: dict[float | None, TimedRecord] = {}
+    values_of_time: dict[float | None, dict[str, object]] = {}
     for point in points:
-        record = record_of_time.setdefault(point.timestamp, TimedRecord({}, point.timestamp))
+        values = values_of_time.setdefault(point.timestamp, {})
         if "control" in point.tags:
-            _add_value(record, "control", point.tags["control"])
+            _add_value(values, "control", point.tags["control"])
         for name, value in point.fields.items():
-            _add_value(record, point.measurement if name == _VALUE_FIELD else name, value)
-    return list(record_of_time.values())
+            _add_value(values, point.measurement if name == _VALUE_FIELD else name, value)
+    return values_of_time
 
 
-def _add_value(record: TimedRecord, name: str, value: FieldValue) -> None:
-    """Add a value to a record; refuse it if the record has another value under its name."""
-    former_value = record.values.setdefault(name, value)
+def _add_value(values: dict[str, object], name: str, value: FieldValue) -> None:
+    """Add a value to those at a time; refuse it if there is another one under its name."""
+    former_value = values.setdefault(name, value)
     if former_value is not value and former_value != value:
         raise Refused(
             f"`{name[:60]}` has two values at one time: each sensor needs a field of its own, such "

@@ -50,8 +50,8 @@ from twin_master.mission.parts import (
 )
 from twin_master.mission.plant import FLIGHT_ERRORS
 from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.network.twin import build_graphical_model
 from twin_master.pictures import plot_courses
 from twin_master.scenario.schema import Scenario
 

@@ -27,7 +27,7 @@ from twin_master.fleet.members import (
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import encode_policy
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import (
@@ -171,14 +171,12 @@ class Group:
             "members": self.members.record(),
         }
         if self.observations:
-            files = [member.file for member in self.members if member.file is not None]
-            record["recordings"] = [_hash_recording(file) for file in files]
+            # A recording is a file, or the folder of a run with its journal.
+            recordings = [member.file for member in self.members if member.file is not None]
+            record["recordings"] = [
+                hash_file(path / JOURNAL_NAME if path.is_dir() else path) for path in recordings
+            ]
         return record
-
-
-def _hash_recording(path: Path) -> str:
-    """Return the hash of a recording, which is a file or the folder of a run with its journal."""
-    return hash_file(path / JOURNAL_NAME if path.is_dir() else path)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from reporting.arrays import Float, Index, product_of_each
 from reporting.words import between, rounded
 from twin_master.mission.planning import ComparedPolicy, discounts, simulate_decisions
 from twin_master.mission.preparation import Knowledge
-from twin_master.network.planner import BeliefPolicy, RiskPolicy
+from twin_master.network.twin import DecisionRule
 from twin_master.scenario.mission import Reference
 from twin_master.scenario.schema import Scenario
 
@@ -148,9 +148,13 @@ class _SimulatedDecisions:
 
     def __init__(self, knowledge: Knowledge) -> None:
         scenario = knowledge.scenario
-        self._plan = knowledge.plan
-        self._hold = knowledge.hold
-        self._decides_on_predicted = scenario.planner.decide_on == "predicted"
+        self._rule = DecisionRule(
+            knowledge.model.transition,
+            knowledge.plan.policy,
+            knowledge.plan.on_belief,
+            looks_ahead=scenario.planner.decide_on == "predicted",
+            hold=knowledge.hold,
+        )
         self._first_control = scenario.control_names.index(scenario.mission.first_control)
         self._control: Index = np.empty(0, dtype=np.int64)
         self._proposals: Index = np.empty(0, dtype=np.int64)
@@ -160,17 +164,8 @@ class _SimulatedDecisions:
         if step == 1:
             self._control = np.full(len(belief), self._first_control)
             self._proposals = np.zeros(len(belief), dtype=np.int64)
-        decided_on = belief if self._decides_on_predicted else filtered_belief
-        policy_on_belief = self._plan.on_belief
-        if isinstance(policy_on_belief, BeliefPolicy):
-            probability = np.eye(self._plan.policy.shape[1])[policy_on_belief.decide(belief)]
-        elif isinstance(policy_on_belief, RiskPolicy):
-            probability = np.eye(self._plan.policy.shape[1])[policy_on_belief.decide(decided_on)]
-        else:
-            probability = product_of_each(decided_on, self._plan.policy)
-        if self._hold is not None:
-            probability, self._proposals = self._hold.apply(
-                probability, self._control, self._proposals
-            )
-        self._control = np.argmax(probability, axis=1)
+        probability = self._rule.probabilities(filtered_belief, self._control, predicted=belief)
+        _, self._control, self._proposals = self._rule.decide(
+            probability, self._control, self._proposals
+        )
         return self._control

@@ -15,8 +15,7 @@ from reporting.arrays import Float, Index
 from reporting.progress import Progress, SilentProgress
 from reporting.system.log import module_logger
 from twin_master.assets.asset_source import Asset, StatelessAsset
-from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch
-from twin_master.gauges.monitor import gauge_watch_of
+from twin_master.gauges.gauge_watch import CheckedReadings, GaugeWatch, gauge_watch_of
 from twin_master.gauges.watch_state import WatchState
 from twin_master.mission.plant import FLIGHT_ERRORS, Plant, Truth
 from twin_master.mission.preparation import Knowledge
@@ -28,8 +27,8 @@ from twin_master.mission.steps import (
     log_notices,
     operate,
 )
-from twin_master.network.estimator import ExactFilter, Notice
-from twin_master.network.inference import NO_CONTROL, Filtered
+from twin_master.network.estimator import Notice
+from twin_master.network.inference import NO_CONTROL, ExactFilter, Filtered
 from twin_master.network.planner import BeliefPolicy, ration_controls
 from twin_master.network.twin import LARGEST_CARRIED, Twin, unbelievable_observation
 from twin_master.scenario.schema import Scenario
@@ -390,14 +389,13 @@ class TwinsSideBySide:
 
     def _decide(self, beliefs: Float, unexplained: Float) -> Index:
         """Return the next control (B,) of each twin, within the budget of inspections."""
-        probability = self._twin.control_probabilities(beliefs, self.previous_control, unexplained)
-        if self._twin.hold is not None:
-            probability, self._proposals = self._twin.hold.apply(
-                probability, self.previous_control, self._proposals
-            )
-        control = np.argmax(probability, axis=1)
+        rule = self._twin.decision_rule
+        probability = rule.probabilities(beliefs, self.previous_control, unexplained)
+        _, control, self._proposals = rule.decide(
+            probability, self.previous_control, self._proposals
+        )
         budget = self._scenario.planner.inspections_per_step
-        policy_on_belief = self._twin.on_belief
+        policy_on_belief = rule.on_belief
         if budget is not None and isinstance(policy_on_belief, BeliefPolicy):
             flying = np.flatnonzero(self._flights.is_flying)
             control[flying] = ration_controls(
@@ -409,7 +407,7 @@ class TwinsSideBySide:
                 self._inspecting_controls,
                 budget,
             )
-        return np.asarray(control)
+        return control
 
 
 def fly_one_by_one(

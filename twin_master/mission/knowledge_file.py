@@ -15,8 +15,8 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import RunFolderError
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.preparation import Knowledge
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.network.planner import BeliefPolicy, RiskPolicy
-from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
 
 KNOWLEDGE_NAME = "twin.npz"

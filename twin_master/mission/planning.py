@@ -4,7 +4,6 @@ import io
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,24 +41,9 @@ def discounts(scenario: Scenario) -> Float:
     return np.where(ends, 0.0, scenario.planner.gamma)
 
 
-class PricedPlan(NamedTuple):
-    """A plan, and the price of a step beyond the health limit for which it was made.
-
-    Attributes
-    ----------
-    plan : BeliefPlan
-        The plan on the belief.
-    price : float
-        The price, in rewards; zero without a limit.
-    """
-
-    plan: BeliefPlan
-    price: float
-
-
 def plan_within_limit(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
-) -> PricedPlan:
+) -> tuple[BeliefPlan, float]:
     """Return the plan on the belief that exceeds the health limit no more often than allowed.
 
     The scenario may bound the fraction of steps beyond the limit (`planner.limit_probability`).
@@ -71,6 +55,14 @@ def plan_within_limit(
     problem : DecisionProblem
         The decision problem of the mission, without a price.
 
+    Returns
+    -------
+    plan : BeliefPlan
+        The plan.
+    price : float
+        The price of a step beyond the limit for which it was made, in rewards; zero if there is no
+        limit, or if the plan without a price keeps it.
+
     Raises
     ------
     PlanningError
@@ -80,27 +72,28 @@ def plan_within_limit(
     allowed_probability = scenario.planner.limit_probability
     probability_beyond = _probability_beyond_limit(rewards)
 
-    def plan_with_price(price: float) -> PricedPlan:
+    def plan_with_price(price: float) -> BeliefPlan:
         priced_problem = replace(problem, reward=problem.reward - price * probability_beyond)
         gap = _GAP if allowed_probability is None else _GAP_OF_PRICED_PLANS
-        return PricedPlan(plan_on_belief(priced_problem, first=first_control, gap=gap), price)
+        return plan_on_belief(priced_problem, first=first_control, gap=gap)
 
-    def keeps_limit(candidate: PricedPlan) -> bool:
+    def keeps_limit(candidate: BeliefPlan) -> bool:
         if allowed_probability is None:
             return True
-        fraction = fraction_beyond_limit(scenario, problem, rewards, candidate.plan.policy)
+        fraction = fraction_beyond_limit(scenario, problem, rewards, candidate.policy)
         return fraction <= allowed_probability
 
     without_price = plan_with_price(0.0)
     if keeps_limit(without_price):
-        return without_price
+        return without_price, 0.0
 
     # Raise the price until the bound holds.
     too_low = 0.0
-    cheapest_plan = plan_with_price(1.0)
+    price = 1.0
+    cheapest_plan = plan_with_price(price)
     while not keeps_limit(cheapest_plan):
-        too_low = cheapest_plan.price
-        price = 4.0 * cheapest_plan.price
+        too_low = price
+        price = 4.0 * price
         if price > _LARGEST_PRICE:
             raise PlanningError(
                 f"no plan keeps the probability beyond a health limit at {allowed_probability:g}: "
@@ -110,12 +103,14 @@ def plan_within_limit(
 
     # Bisect between the largest price known to be too low and the lowest price that suffices.
     for _ in range(_BISECTIONS):
-        middle = plan_with_price(0.5 * (too_low + cheapest_plan.price))
-        if keeps_limit(middle):
-            cheapest_plan = middle
+        middle_price = 0.5 * (too_low + price)
+        plan = plan_with_price(middle_price)
+        if keeps_limit(plan):
+            cheapest_plan = plan
+            price = middle_price
         else:
-            too_low = middle.price
-    return cheapest_plan
+            too_low = middle_price
+    return cheapest_plan, price
 
 
 def _probability_beyond_limit(rewards: RewardModel) -> Float:

@@ -19,16 +19,17 @@ from twin_master.assets.resolution import (
     asset_source,
     resolve_scenario,
 )
-from twin_master.gauges.monitor import WatchfulEstimator
+from twin_master.gauges.gauge_watch import WatchfulEstimator
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.mission.parts import NO_PARTS, TwinParts
 from twin_master.mission.planning import discounts, plan_within_limit
 from twin_master.mission.plant import Plant, Truth
 from twin_master.network.decision_problem import DecisionProblem, observation_classes
-from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
-from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.estimator import Estimator, NoticeWording
+from twin_master.network.graphical_model import GraphicalModel, build_graphical_model
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
+from twin_master.network.inference import ExactFilter
 from twin_master.network.planner import (
     BeliefPolicy,
     Hold,
@@ -39,7 +40,7 @@ from twin_master.network.planner import (
 )
 from twin_master.network.quantity import RewardModel
 from twin_master.network.sensor_model import GaussianSensorModel, check_noise
-from twin_master.network.twin import Planner, Twin, build_graphical_model
+from twin_master.network.twin import Planner, Twin
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
@@ -224,8 +225,8 @@ class Knowledge:
             # returns for each control (Littman, Cassandra and Kaelbling 1995).
             return BeliefPolicy(plan.action_value.T, np.arange(len(self.scenario.control)))
         if self.scenario.planner.policy == "belief":
-            priced_plan = plan_within_limit(self.scenario, self.problem, self.rewards)
-            return priced_plan.plan.policy
+            belief_plan, _price = plan_within_limit(self.scenario, self.problem, self.rewards)
+            return belief_plan.policy
         return None
 
     @cached_property

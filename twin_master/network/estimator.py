@@ -1,4 +1,4 @@
-"""Estimators of the belief of a twin: their protocol, and the exact filter.
+"""Estimators of the belief of a twin: their protocol, and what they conclude in a step.
 
 An estimator has no state of its own. It returns the arrays that it needs of a step with each
 estimate, and receives them for the next step. So a twin that keeps these arrays can smooth over the
@@ -17,15 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from reporting.arrays import AnyArray, Float
 from reporting.json_file import JsonObject
 from reporting.words import listing
-from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import (
-    NO_CONTROL,
-    Filtered,
-    checked_sequence,
-    filter_many,
-    smooth,
-)
 from twin_master.scenario.schema import Scenario
 
 CarriedArrays = Mapping[str, AnyArray]
@@ -267,127 +259,6 @@ class Estimator(Protocol):
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
         """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
-
-
-class ExactFilter:
-    """The exact filter and smoother: Kapteyn et al. 2021, eqs. (2), (28)-(31).
-
-    It carries the logarithm of the filtered belief, `log_filtered` (S,).
-
-    Parameters
-    ----------
-    model : GraphicalModel
-        States, controls, prior and transitions.
-    sensor_model : SensorModel
-        The probability of observations in each state.
-    name : str
-        The name of the twin, for messages.
-    """
-
-    def __init__(
-        self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin"
-    ) -> None:
-        self.model = model
-        self._sensor_model = sensor_model
-        self._name = name
-
-    def step(
-        self, before: Carried | None, observation: Float, control_index: int, step: int
-    ) -> Estimate:
-        """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
-        log_belief = self.model.log_prior
-        previous_control = NO_CONTROL
-        if before is not None:
-            log_belief = before.arrays["log_filtered"]
-            previous_control = before.control_index
-        beliefs, errors = self.step_of_twins(
-            log_belief, previous_control, np.asarray(observation)[None], [control_index], step
-        )
-        for error in errors.values():
-            raise error
-        belief = beliefs[0]
-        return Estimate(
-            forecast=belief.forecast,
-            filtered=belief.filtered,
-            log_evidence=float(belief.log_evidence),
-            carried=Carried(control_index, {"log_filtered": belief.log_filtered}),
-        )
-
-    def step_of_twins(
-        self,
-        log_before: Float,
-        control_before: ArrayLike,
-        observations: Float,
-        control_index: ArrayLike,
-        step: int,
-    ) -> tuple[Filtered, dict[int, ImpossibleObservation]]:
-        """Advance the beliefs of B twins to step t, and correct each by its observation.
-
-        The belief of a twin does not depend on the other twins, not even in the last bit.
-
-        Parameters
-        ----------
-        log_before : (B, S) or (S,) array
-            The log beliefs in step t - 1; the log prior if this is the first step.
-        control_before : int or (B,) array
-            The controls in force in step t - 1; `NO_CONTROL` if this is the first step.
-        observations : (B, G) array
-            The sensor values, SI; NaN where a sensor is lost.
-        control_index : (B,) array
-            The controls in force in step t.
-        step : int
-            The number t of the step, for messages.
-
-        Returns
-        -------
-        beliefs : Filtered
-            The beliefs, with the leading axis B.
-        errors : dict of int to ImpossibleObservation
-            The error of each twin whose observation is impossible, by its number. Such a twin has
-            the prior as its belief.
-
-        Raises
-        ------
-        InvalidObservationError, InvalidModelError
-            If an observation has another shape, is infinite or cannot be weighed, or if there is no
-            such control.
-        """
-        # A sensor model of a user may take only one observation at a time.
-        sequence_likelihood = getattr(self._sensor_model, "log_likelihood_sequence", None)
-        if sequence_likelihood is not None:
-            likelihoods = sequence_likelihood(observations, control_index)
-        else:
-            pairs = zip(observations, np.asarray(control_index).tolist(), strict=True)
-            likelihoods = [self._sensor_model.log_likelihood(row, u) for row, u in pairs]
-        (controls,), (log_likelihood,) = checked_sequence(
-            self.model, control_index, likelihoods, what="log-likelihood"
-        )
-        # The filter takes sequences of steps; each twin has a sequence of one.
-        sequences, failed_step = filter_many(
-            self.model.transition,
-            controls[:, None],
-            log_likelihood[:, None],
-            log_before,
-            control_before,
-        )
-        beliefs = sequences[:, 0]
-        errors = {}
-        for twin in np.flatnonzero(failed_step >= 0).tolist():
-            worst_residuals = getattr(self._sensor_model, "worst_residuals", None)
-            residuals = None
-            if worst_residuals is not None:
-                residuals = worst_residuals(observations[twin], int(controls[twin]))
-            errors[twin] = ImpossibleObservation(self._name, step, residuals)
-            beliefs.filtered[twin] = self.model.prior
-            beliefs.log_filtered[twin] = self.model.log_prior
-        return beliefs, errors
-
-    def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
-        controls = [step.control_index for step in carried]
-        log_filtered = np.array([step.arrays["log_filtered"] for step in carried])
-        # The shape is given because there may be no steps.
-        return smooth(self.model, controls, log_filtered.reshape(-1, self.model.states.size))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from twin_master.network.transition import (
     distribution,
     stochastic_matrix,
 )
+from twin_master.scenario.schema import Scenario
+from twin_master.scenario.tables import probability_of
 
 
 @dataclass(frozen=True)
@@ -436,3 +438,66 @@ def leaving_table(table: Float, factor: float) -> Float:
             "`learning.transition_factors`"
         )
     return np.asarray(result + np.diag(staying), dtype=np.float64)
+
+
+def factor_tables(
+    scenario: Scenario, leaving_multiplier: float = 1.0
+) -> dict[str, dict[str, Float]]:
+    """Return the transition table of each state factor under each control, with repairs by actions.
+
+    Parameters
+    ----------
+    leaving_multiplier : float
+        All probabilities of leaving a level are multiplied by this, but not those of a repair.
+
+    Returns
+    -------
+    dict of str to dict of str to (levels, levels) array
+        p(next level | level), by the name of the control, then that of the state factor.
+    """
+    tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
+    if leaving_multiplier != 1.0:
+        for control_tables in tables.values():
+            for name, table in control_tables.items():
+                control_tables[name] = leaving_table(table, leaving_multiplier)
+    for action in scenario.action:
+        action_tables = tables[action.name]
+        for name in action.repairs:
+            action_tables[name] = repaired_table(action_tables[name], action.success)
+    return tables
+
+
+def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
+    """Return the table of each state factor under a control, as stated, without any repair."""
+    transition = scenario.transition
+    if transition.kind == "independent_tables":
+        stated_tables = transition.tables[control]
+        return {name: np.asarray(stated_tables[name], np.float64) for name in scenario.state_names}
+    tables = {}
+    for factor in scenario.state:
+        probability = probability_of(transition.probability, control, factor.name)
+        tables[factor.name] = worsening_table(len(factor.levels), probability)
+    return tables
+
+
+def build_graphical_model(scenario: Scenario, leaving_multiplier: float = 1.0) -> GraphicalModel:
+    """Return the states, controls, prior and transitions of a scenario.
+
+    It is assumed that the factors of the state change independently given the control, and are
+    independent before the first observation: Kapteyn et al. 2021, eqs. (28)-(29).
+
+    Parameters
+    ----------
+    leaving_multiplier : float
+        All probabilities of leaving a level are multiplied by this, but not those of a repair.
+
+    Raises
+    ------
+    InvalidModelError
+        If the multiplier makes a probability larger than one.
+    """
+    return GraphicalModel.from_tables(
+        levels={factor.name: factor.levels for factor in scenario.state},
+        tables=factor_tables(scenario, leaving_multiplier),
+        prior={factor.name: factor.prior for factor in scenario.state},
+    )

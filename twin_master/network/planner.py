@@ -1,4 +1,4 @@
-"""Decisions, and planning by value iteration: Kapteyn et al. 2021, eq. (36)."""
+"""Policies, and planning by value iteration: Kapteyn et al. 2021, eq. (36)."""
 
 from __future__ import annotations
 
@@ -238,62 +238,6 @@ class PlannedPolicy:
     def control_index(self) -> Index:
         """The control to take in each state (S,): the mode of the policy, the first of equals."""
         return np.asarray(np.argmax(self.policy, axis=1), dtype=np.int64)
-
-
-def decision_probability(
-    transition: TransitionModel,
-    filtered_belief: Float,
-    control: Index,
-    policy: Float,
-    on_belief: BeliefPolicy | RiskPolicy | None = None,
-    *,
-    ahead: bool = False,
-    unexplained: Float | None = None,
-    safest: Float | None = None,
-) -> Float:
-    """Return the probability of each next control of B twins: (B, U).
-
-    The result of a twin does not depend on the other twins, not even in the last bit.
-
-    Parameters
-    ----------
-    transition : TransitionModel
-        The transitions between S states.
-    filtered_belief : (B, S) array
-        p(D_t | o_0..o_t).
-    control : (B,) array
-        The control in force in step t.
-    policy : (S, U) array
-        p(U | D), which is averaged over the belief.
-    on_belief : BeliefPolicy or RiskPolicy, optional
-        A policy that takes the place of `policy`. A `BeliefPolicy` always decides by
-        p(D_{t+1} | o_0..o_t).
-    ahead : bool
-        Whether the other policies decide by p(D_{t+1} | o_0..o_t) instead of `filtered_belief`.
-    unexplained : (B,) array, optional
-        The probability that no state explains the sensors, with which the safest control is taken.
-    safest : (U,) array, optional
-        One for the safest control, zero for the others; only the policy decides if left out.
-    """
-    belief = filtered_belief
-    if ahead or isinstance(on_belief, BeliefPolicy):
-        pairs = zip(control.tolist(), filtered_belief, strict=True)
-        belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
-    if isinstance(on_belief, RiskPolicy):
-        # The risk contains the case that no state explains the sensors.
-        doubt_of_twin = 0.0 if unexplained is None else np.nan_to_num(unexplained)
-        controls = on_belief.decide(np.nan_to_num(belief), doubt_of_twin)
-        return np.asarray(np.eye(policy.shape[1])[controls])
-    if on_belief is not None:
-        # The policy is deterministic: its control has the probability one.
-        # A twin whose flight has failed has no belief, and its control is not used.
-        probability = np.eye(policy.shape[1])[on_belief.decide(np.nan_to_num(belief))]
-    else:
-        probability = product_of_each(belief, policy)
-    if unexplained is None or safest is None:
-        return probability
-    doubt = unexplained[:, None]
-    return (1.0 - doubt) * probability + doubt * safest
 
 
 def ration_controls(

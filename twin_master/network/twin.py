@@ -16,29 +16,15 @@ from numpy.typing import ArrayLike
 
 from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from reporting.arrays import AnyArray, Float, Index, nan_where_masked
+from reporting.arrays import AnyArray, Float, Index, nan_where_masked, product_of_each
 from reporting.choices import require_one_of
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
-from twin_master.network.estimator import (
-    Carried,
-    Estimate,
-    Estimator,
-    ExactFilter,
-    Notice,
-    SensorModel,
-)
-from twin_master.network.graphical_model import (
-    GraphicalModel,
-    leaving_table,
-    repaired_table,
-    worsening_table,
-)
-from twin_master.network.inference import NO_CONTROL, Predicted, predict
-from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy, decision_probability
-from twin_master.network.transition import checked_beliefs, checked_controls
-from twin_master.scenario.schema import Scenario
-from twin_master.scenario.tables import probability_of
+from twin_master.network.estimator import Carried, Estimate, Estimator, Notice, SensorModel
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import NO_CONTROL, ExactFilter, Predicted, predict
+from twin_master.network.planner import BeliefPolicy, Hold, RiskPolicy
+from twin_master.network.transition import TransitionModel, checked_beliefs, checked_controls
 
 LARGEST_CARRIED = np.float64(1e150)
 """Upper bound of carried numbers: their squares are still finite."""
@@ -52,67 +38,107 @@ _FORMER_COUNT = re.compile(r"(?<![^/])turns$")
 """Pattern of the former name `turns` of arrays in saved states, with or without a prefix."""
 
 
-def factor_tables(
-    scenario: Scenario, leaving_multiplier: float = 1.0
-) -> dict[str, dict[str, Float]]:
-    """Return the transition table of each state factor under each control, with repairs by actions.
+@dataclass(frozen=True)
+class DecisionRule:
+    """The rule by which twins with the same model choose their next controls.
 
-    Parameters
+    It is the same for a single twin, for twins side by side, and in simulated missions. The
+    decision of a twin does not depend on the other twins, not even in the last bit.
+
+    Attributes
     ----------
-    leaving_multiplier : float
-        All probabilities of leaving a level are multiplied by this, but not those of a repair.
-
-    Returns
-    -------
-    dict of str to dict of str to (levels, levels) array
-        p(next level | level), by the name of the control, then that of the state factor.
+    transition : TransitionModel
+        The transitions between S states.
+    policy : (S, U) array
+        p(U | D), which is averaged over the belief.
+    on_belief : BeliefPolicy, RiskPolicy or None
+        A policy that takes the place of `policy`.
+    looks_ahead : bool
+        Whether the policy is averaged over p(D_{t+1} | o_0..o_t), and not over p(D_t | o_0..o_t). A
+        `BeliefPolicy` always decides by the former.
+    safest : (U,) array or None
+        One for the control that is taken if no state explains the sensors, zero for the others. If
+        it is None, that case is ignored.
+    hold : Hold or None
+        How often a harder control must be proposed in a row; once if None.
     """
-    tables = {control: _stated_tables(scenario, control) for control in scenario.control_names}
-    if leaving_multiplier != 1.0:
-        for control_tables in tables.values():
-            for name, table in control_tables.items():
-                control_tables[name] = leaving_table(table, leaving_multiplier)
-    for action in scenario.action:
-        action_tables = tables[action.name]
-        for name in action.repairs:
-            action_tables[name] = repaired_table(action_tables[name], action.success)
-    return tables
 
+    transition: TransitionModel
+    policy: Float
+    on_belief: BeliefPolicy | RiskPolicy | None = None
+    looks_ahead: bool = False
+    safest: Float | None = None
+    hold: Hold | None = None
 
-def _stated_tables(scenario: Scenario, control: str) -> dict[str, Float]:
-    """Return the table of each state factor under a control, as stated, without any repair."""
-    transition = scenario.transition
-    if transition.kind == "independent_tables":
-        stated_tables = transition.tables[control]
-        return {name: np.asarray(stated_tables[name], np.float64) for name in scenario.state_names}
-    tables = {}
-    for factor in scenario.state:
-        probability = probability_of(transition.probability, control, factor.name)
-        tables[factor.name] = worsening_table(len(factor.levels), probability)
-    return tables
+    def probabilities(
+        self,
+        filtered: Float,
+        control: Index,
+        unexplained: Float | None = None,
+        *,
+        predicted: Float | None = None,
+    ) -> Float:
+        """Return the probability of each next control by the policy alone: (B, U).
 
+        Parameters
+        ----------
+        filtered : (B, S) array
+            p(D_t | o_0..o_t).
+        control : (B,) array
+            The indices of the controls in force in step t.
+        unexplained : (B,) array, optional
+            The probability that no state explains the sensors; zero if left out.
+        predicted : (B, S) array, optional
+            p(D_{t+1} | o_0..o_t), if it is known already.
+        """
+        belief = filtered
+        if self.looks_ahead or isinstance(self.on_belief, BeliefPolicy):
+            if predicted is None:
+                pairs = zip(control.tolist(), filtered, strict=True)
+                predicted = np.stack([self.transition.forward(u, row) for u, row in pairs])
+            belief = predicted
+        # A policy on the belief is deterministic: its control has the probability one. A twin whose
+        # flight has failed has no belief, and its control is not used.
+        certain = np.eye(self.policy.shape[1])
+        if isinstance(self.on_belief, RiskPolicy):
+            # The risk contains the case that no state explains the sensors.
+            doubt_of_twin = 0.0 if unexplained is None else np.nan_to_num(unexplained)
+            return np.asarray(certain[self.on_belief.decide(np.nan_to_num(belief), doubt_of_twin)])
+        if self.on_belief is not None:
+            probability = certain[self.on_belief.decide(np.nan_to_num(belief))]
+        else:
+            probability = product_of_each(belief, self.policy)
+        if unexplained is None or self.safest is None:
+            return probability
+        doubt = unexplained[:, None]
+        return (1.0 - doubt) * probability + doubt * self.safest
 
-def build_graphical_model(scenario: Scenario, leaving_multiplier: float = 1.0) -> GraphicalModel:
-    """Return the states, controls, prior and transitions of a scenario.
+    def decide(
+        self, probability: Float, control: Index, proposals_before: Index
+    ) -> tuple[Float, Index, Index]:
+        """Return the decisions of B twins, given the probabilities (B, U) by the policy.
 
-    It is assumed that the factors of the state change independently given the control, and are
-    independent before the first observation: Kapteyn et al. 2021, eqs. (28)-(29).
+        Parameters
+        ----------
+        control : (B,) array
+            The indices of the controls in force.
+        proposals_before : (B,) array
+            How often in a row a harder control than the one in force was proposed before.
 
-    Parameters
-    ----------
-    leaving_multiplier : float
-        All probabilities of leaving a level are multiplied by this, but not those of a repair.
-
-    Raises
-    ------
-    InvalidModelError
-        If the multiplier makes a probability larger than one.
-    """
-    return GraphicalModel.from_tables(
-        levels={factor.name: factor.levels for factor in scenario.state},
-        tables=factor_tables(scenario, leaving_multiplier),
-        prior={factor.name: factor.prior for factor in scenario.state},
-    )
+        Returns
+        -------
+        probability : (B, U) array
+            The probability of each next control; held changes are taken out.
+        next_control : (B,) array
+            The most probable next control, the first of equals.
+        proposals : (B,) array
+            How often in a row a harder control was proposed, this step included; 0 without a
+            `Hold`.
+        """
+        proposals = np.zeros_like(proposals_before)
+        if self.hold is not None:
+            probability, proposals = self.hold.apply(probability, control, proposals_before)
+        return probability, np.argmax(probability, axis=1), proposals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,11 +258,15 @@ class Twin:
         self.name = name
         self.sensor_model = sensor_model
         self.estimator: Estimator = estimator or ExactFilter(model, sensor_model, name)
-        self.policy = model.policy(policy(model) if callable(policy) else policy)
+        self.decision_rule = DecisionRule(
+            model.transition,
+            model.policy(policy(model) if callable(policy) else policy),
+            on_belief,
+            looks_ahead=decide_on == "predicted",
+            safest=None if safest is None else np.eye(len(model.controls))[self._index_of(safest)],
+            hold=hold,
+        )
         self.prediction_steps = prediction_steps
-        self.decide_on = decide_on
-        self.on_belief = on_belief
-        self.hold = hold
         self.lag = lag
         # The present step, `lag` steps before it, and one more: to filter the first of these again,
         # the arrays carried on from the step before it are needed.
@@ -244,9 +274,6 @@ class Twin:
         self._kept_steps: deque[_KeptStep] = deque(maxlen=most_kept)
         self._steps = 0
         self._proposed = self._index_of(first_control)
-        self._safest: Float | None = None
-        if safest is not None:
-            self._safest = np.eye(len(model.controls))[self._index_of(safest)]
 
     def __repr__(self) -> str:
         return brief(self, name=self.name, model=self.model, steps=self._steps, lag=self.lag)
@@ -374,7 +401,8 @@ class Twin:
             if not all(np.all(np.asarray(values) < LARGEST_CARRIED) for values in results):
                 raise unbelievable_observation(self.name, step)
             proposals_before = proposals
-            proposals = self._proposals_after(estimate, proposals_before)
+            if self.decision_rule.hold is not None:
+                proposals = self._proposals_after(estimate, proposals_before)
             new_steps.append(_KeptStep(observation, previous_carried, proposals))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
@@ -396,7 +424,11 @@ class Twin:
         """Predict through the policy from any belief (S,) under a control in force: (37)-(39)."""
         horizon = self.prediction_steps if steps is None else steps
         return predict(
-            self.model, checked_beliefs(belief), self._index_of(control), self.policy, horizon
+            self.model,
+            checked_beliefs(belief),
+            self._index_of(control),
+            self.decision_rule.policy,
+            horizon,
         )
 
     def smoothed(self) -> Float:
@@ -433,7 +465,7 @@ class Twin:
         for index, kept_step in enumerate(kept_steps):
             arrays[f"{index}/observation"] = kept_step.observation
             arrays[f"{index}/control"] = np.array(kept_step.carried.control_index)
-            if self.hold is not None:
+            if self.decision_rule.hold is not None:
                 arrays[f"{index}/proposals"] = np.array(kept_step.proposals)
             for name, value in kept_step.carried.arrays.items():
                 arrays[f"{index}/carried/{name}"] = value
@@ -480,57 +512,31 @@ class Twin:
             return controls.index(control)
         return int(checked_controls(control, len(controls)))
 
-    def control_probabilities(self, beliefs: Float, control: Index, unexplained: Float) -> Float:
-        """Return the probability of each next control for each of B beliefs.
-
-        Parameters
-        ----------
-        beliefs : (B, S) array
-            p(D_t | o_0..o_t) of several twins, or of one under several hypotheses.
-        control : (B,) array
-            The indices of the controls in force.
-        unexplained : (B,) array
-            The probability that no state explains the sensors, with which the safest control is
-            taken.
-
-        Returns
-        -------
-        (B, U) array
-            The probabilities.
-        """
-        return decision_probability(
-            self.model.transition,
-            beliefs,
-            control,
-            self.policy,
-            self.on_belief,
-            ahead=self.decide_on == "predicted",
-            unexplained=unexplained,
-            safest=self._safest,
-        )
-
     def _proposals_after(self, estimate: Estimate, proposals_before: int) -> int:
         """Return how often in a row a harder control has been proposed, counting this step."""
-        if self.hold is None:
-            return 0
         control = np.array([estimate.carried.control_index])
-        unexplained = np.array([estimate.unexplained])
-        probability = self.control_probabilities(estimate.filtered[None], control, unexplained)
-        _, proposals = self.hold.apply(probability, control, np.array([proposals_before]))
-        return int(proposals[0])
+        probability = self.decision_rule.probabilities(
+            estimate.filtered[None], control, np.array([estimate.unexplained])
+        )
+        before = np.array([proposals_before])
+        _, _, (proposals,) = self.decision_rule.decide(probability, control, before)
+        return int(proposals)
 
     def _decide(self, estimate: Estimate, proposals_before: int) -> TwinStep:
         """Predict from the estimate of the last step, and decide on the next control.
 
         With the probability that no state explains the sensors, the safest control is taken.
         """
-        control_index = estimate.carried.control_index
-        unexplained = estimate.unexplained
+        rule = self.decision_rule
         prediction = predict(
-            self.model, estimate.filtered, control_index, self.policy, self.prediction_steps
+            self.model,
+            estimate.filtered,
+            estimate.carried.control_index,
+            rule.policy,
+            self.prediction_steps,
         )
-        if self._safest is not None:
-            prediction = prediction.mix_control(unexplained, self._safest)
+        if rule.safest is not None:
+            prediction = prediction.mix_control(estimate.unexplained, rule.safest)
 
         # The next controls by the belief of the step, and by the belief under each hypothesis.
         believed_hypotheses = [
@@ -538,30 +544,26 @@ class Twin:
         ]
         hypothesis_beliefs = [hypothesis.belief for hypothesis in believed_hypotheses]
         beliefs = np.array([estimate.filtered, *hypothesis_beliefs])
-        unexplained_of_belief = np.zeros(len(beliefs))
-        unexplained_of_belief[0] = unexplained
-        controls_in_force = np.full(len(beliefs), control_index)
-        probability, *hypothesis_decisions = self.control_probabilities(
-            beliefs, controls_in_force, unexplained_of_belief
+        unexplained = np.zeros(len(beliefs))
+        unexplained[0] = estimate.unexplained
+        control = np.full(len(beliefs), estimate.carried.control_index)
+        probability, *hypothesis_policies = rule.probabilities(beliefs, control, unexplained)
+        (decision_probability,), (next_control,), _ = rule.decide(
+            probability[None], control[:1], np.array([proposals_before])
         )
-        if self.hold is not None:
-            held_probability, _ = self.hold.apply(
-                probability[None], controls_in_force[:1], np.array([proposals_before])
-            )
-            probability = held_probability[0]
-        self._proposed = int(np.argmax(probability))
+        self._proposed = int(next_control)
 
         # The hypothesis that decided adds most to the probability of the proposed control.
         suspicion = estimate.suspicion
         if suspicion is not None and estimate.hypotheses:
             names = [hypothesis.name for hypothesis in believed_hypotheses]
-            decision_by_name = dict(zip(names, hypothesis_decisions, strict=True))
+            policy_by_name = dict(zip(names, hypothesis_policies, strict=True))
             contribution = {}
             for hypothesis in estimate.hypotheses:
-                decision = decision_by_name.get(hypothesis.name, self._safest)
+                policy_under_hypothesis = policy_by_name.get(hypothesis.name, rule.safest)
                 contribution[hypothesis.name] = 0.0
-                if decision is not None:
-                    proposed_probability = float(decision[self._proposed])
+                if policy_under_hypothesis is not None:
+                    proposed_probability = float(policy_under_hypothesis[self._proposed])
                     contribution[hypothesis.name] = hypothesis.probability * proposed_probability
             decided_by = max(contribution, key=contribution.__getitem__)
             suspicion = replace(suspicion, decided_by=decided_by)
@@ -576,7 +578,7 @@ class Twin:
             hypotheses=estimate.hypotheses,
             step=self._steps - 1,
             prediction=prediction,
-            decision_probability=probability,
+            decision_probability=decision_probability,
             next_control=self._proposed,
         )
 

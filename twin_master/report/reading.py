@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from reporting.json_file import JsonObject, JsonRecord, read_json
 from twin_master.errors import RunFolderError, TwinMasterError
-from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.graphical_model import GraphicalModel, build_graphical_model
 from twin_master.network.inference import smooth
-from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario

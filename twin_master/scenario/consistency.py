@@ -135,13 +135,16 @@ class ScenarioTables(Section):
         # `self.action` holds all tables `[[action]]`; each action is also a control of its name.
         for action in self.action:
             control_index = self.control_names.index(action.name)
-            for reading in action.readings:
+            deviations = action.standard_deviation
+            if not isinstance(deviations, tuple):
+                deviations = (deviations or 0.0,) * len(action.inspects)
+            for state, deviation in zip(action.inspects, deviations, strict=True):
                 all_readings.append(
                     InspectionReading(
                         control_index=control_index,
-                        state_index=self.state_names.index(reading.state),
-                        name=reading.name,
-                        standard_deviation=reading.standard_deviation,
+                        state_index=self.state_names.index(state),
+                        name=f"{action.name}_{state}",
+                        standard_deviation=deviation,
                     )
                 )
         return tuple(all_readings)

@@ -275,24 +275,6 @@ class TruthSection(Section):
             yield "noise" not in self.model_fields_set, "`truth.noise` is missing"
 
 
-class InspectedState(NamedTuple):
-    """The reading of a state factor by an action.
-
-    Attributes
-    ----------
-    name : str
-        The name of the reading.
-    state : str
-        The name of the state factor.
-    standard_deviation : float
-        The standard deviation of the reading.
-    """
-
-    name: str
-    state: str
-    standard_deviation: float
-
-
 class Action(Section):
     """A choice in a step in addition to the controls, such as an inspection or a repair."""
 
@@ -333,17 +315,6 @@ class Action(Section):
             not has_effect,
             f"action `{self.name}` does nothing that its control does not: give `inspects`, "
             "`repairs` or `ends`",
-        )
-
-    @property
-    def readings(self) -> tuple[InspectedState, ...]:
-        """The readings that the action takes."""
-        deviations = self.standard_deviation
-        if not isinstance(deviations, tuple):
-            deviations = (deviations or 0.0,) * len(self.inspects)
-        return tuple(
-            InspectedState(f"{self.name}_{state}", state, deviation)
-            for state, deviation in zip(self.inspects, deviations, strict=True)
         )
 
 

@@ -40,10 +40,11 @@ def run_groups(result: MissionResult) -> dict[str, NetcdfGroup]:
     scenario = result.scenario
     flight = result.flight
     plan = result.knowledge.plan
+    smoothed = _expected_in_flight(result, flight.smoothed, is_smoothed=True)
     entries: dict[str, Iterable[Entry]] = {
         "observed": _observed_entries(result),
         "filtered": _plain_entries(_filtered_variables(result)),
-        "smoothed": _plain_entries(_smoothed_variables(result)),
+        "smoothed": _plain_entries(_belief_variables(result, flight.smoothed, smoothed)),
         "predicted": _plain_entries(_predicted_variables(result)),
         "earned": _plain_entries({**vars(result.earned), "return": result.discounted_return}),
         "policy": _plain_entries(
@@ -125,13 +126,6 @@ def _filtered_variables(result: MissionResult) -> dict[str, ArrayLike]:
         "residual": residual / expectation.noise_standard_deviation,
         "sensors_received": np.isfinite(flight.observed).sum(axis=1),
     }
-
-
-def _smoothed_variables(result: MissionResult) -> dict[str, ArrayLike]:
-    """Return the smoothed belief."""
-    smoothed_belief = result.flight.smoothed
-    expectation = _expected_in_flight(result, smoothed_belief, is_smoothed=True)
-    return _belief_variables(result, smoothed_belief, expectation)
 
 
 def _predicted_variables(result: MissionResult) -> dict[str, ArrayLike]:

@@ -1,6 +1,5 @@
 """The files of a watch in addition to its journal: `run.nc`, tables, summary and report."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
 
@@ -88,7 +87,9 @@ def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
     first_alarm = watch.teaching.first_alarm
     if first_alarm is not None and first_alarm[0] < first_step:
         records.append(first_alarm)
-    for line in _lines_since(watch, first_step):
+    backwards = (line for line, _, _ in records_backwards(watch.journal_path))
+    lines_since = list(takewhile(lambda line: _step_of(line) >= first_step, backwards))
+    for line in reversed(lines_since):
         for notice in line.get("notices", []):
             records.append((_step_of(line), notice))
     notices: dict[str, tuple[int, Notice]] = {}
@@ -96,13 +97,6 @@ def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
         notice = Notice(**{**record, "sensors": tuple(record["sensors"])})
         notices.setdefault(notice.sentence, (step, notice))
     return list(notices.values())
-
-
-def _lines_since(watch: Watch, first_step: int) -> Sequence[JournalLine]:
-    """Return the lines of the journal from a step on, in order."""
-    backwards = (line for line, _, _ in records_backwards(watch.journal_path))
-    lines = list(takewhile(lambda line: _step_of(line) >= first_step, backwards))
-    return lines[::-1]
 
 
 def _step_of(line: JournalLine) -> int:

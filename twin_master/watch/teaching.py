@@ -118,12 +118,6 @@ class Teaching:
         """Return the state with the keys of a journal."""
         return {key: getattr(self, attribute) for attribute, key in _KEYS.items()}
 
-    def _restore(self, record: Mapping[str, object]) -> None:
-        """Restore the state from a record that `as_record` returned."""
-        for attribute, key in _KEYS.items():
-            if key in record:
-                setattr(self, attribute, record[key])
-
     def read_journal(self, path: Path) -> None:
         """Restore the state after the last line of a journal.
 
@@ -153,7 +147,10 @@ class Teaching:
                 state_before = line.get("standing", {}).get("teaching")
             if state_before is not None and journal_size - begin > CHECKED_BYTES:
                 break
-        self._restore(state_before or {})
+        # The state as `as_record` returned it; earlier versions have not recorded all of it.
+        for attribute, key in _KEYS.items():
+            if state_before is not None and key in state_before:
+                setattr(self, attribute, state_before[key])
         for line in reversed(lines_since_state):
             self.take_line(line)
 

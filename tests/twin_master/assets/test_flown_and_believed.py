@@ -34,7 +34,7 @@ from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.fleet.storage.store import in_credible_set
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.schema import Scenario
 from twin_master.workflow import check_scenario
 from uav_twin import fly as new_run

@@ -42,8 +42,8 @@ from twin_master.feeds.message import MessageReader
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.plant import Plant, Truth
 from twin_master.mission.sensor_design import add_candidate_gauges
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.network.identified import packed_row
-from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_run, report_figures, resume, structure_files, watch

@@ -48,8 +48,8 @@ from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.reading import ControlForecast, probability_of_leaving, severity
 from twin_master.fleet.storage.store_layout import ALL_ROWS, observation_rows, row_blocks
 from twin_master.mission.knowledge_file import load_knowledge, save_knowledge
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.network.planner import BeliefPolicy
-from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from uav_twin import GaussianSensorModel, fly_fleet, learn_from_fleet, load_scenario, open_fleet

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from tests.twin_master.runs import of_library
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.errors import InvalidModelError, InvalidObservationError
-from twin_master.gauges.monitor import gauge_watch_of
+from twin_master.gauges.gauge_watch import gauge_watch_of
 from twin_master.mission import flights as flights_of_missions
 from twin_master.mission.flights import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.parts import TwinParts

@@ -42,7 +42,7 @@ from twin_master.mission.plant import Plant, SensorStatus, Truth
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.replay import journal_sink, restore_flight
 from twin_master.mission.steps import History, MissionStep
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import SensorFault

@@ -20,11 +20,10 @@ from twin_master.assets.resolution import Overrides, asset_source, check_scenari
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network import transition as transition_file
-from twin_master.network.graphical_model import Factor, StateSpace, worsening_table
+from twin_master.network.graphical_model import Factor, StateSpace, build_graphical_model, worsening_table
 from twin_master.network.inference import filter_many, predict, smooth
 from twin_master.network.sensor_model import check_noise
 from twin_master.network.transition import TransitionModel, stochastic_matrix
-from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import parse_scenario
 from uav_twin import GraphicalModel, filter_sequence, load_scenario
 

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from twin_master.network.planner import Hold, RiskPolicy, decision_probability
+from twin_master.network.planner import Hold, RiskPolicy
 from twin_master.network.transition import TransitionModel
+from twin_master.network.twin import DecisionRule
 from uav_twin import GraphicalModel, Twin
 
 GENTLE, MIDDLE, HARD = 0, 1, 2
@@ -50,14 +51,9 @@ def test_without_an_explanation_the_gentlest_control_is_taken():
 
 def test_the_decision_of_twins_contains_that_no_state_explains_the_sensors():
     transition = TransitionModel((np.stack([np.eye(3)] * 3),))
-    probability = decision_probability(
-        transition,
-        np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
-        np.array([HARD, HARD]),
-        np.eye(3),
-        by_risk(0.05),
-        unexplained=np.array([0.0, 0.1]),
-        safest=np.eye(3)[GENTLE],
+    rule = DecisionRule(transition, np.eye(3), by_risk(0.05), safest=np.eye(3)[GENTLE])
+    probability = rule.probabilities(
+        np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([HARD, HARD]), np.array([0.0, 0.1])
     )
     assert np.array_equal(probability, np.eye(3)[[HARD, GENTLE]])
 

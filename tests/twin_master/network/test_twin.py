@@ -15,8 +15,9 @@ from tests.twin_master.runs import of_library, table_of
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.estimator import Learnt
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.network.inference import smooth
-from twin_master.network.twin import TwinStep, build_graphical_model
+from twin_master.network.twin import TwinStep
 from twin_master.scenario.reading import parse_scenario
 from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence
 

@@ -13,7 +13,7 @@ from tests.twin_master.runs import flight_of, loaded_from, of_library, table_of
 from twin_master.errors import InvalidModelError, RunFolderError
 from twin_master.fleet.storage.store import in_credible_set
 from twin_master.mission.earnings import promised_return
-from twin_master.network.twin import build_graphical_model
+from twin_master.network.graphical_model import build_graphical_model
 from twin_master.scenario.mission import Reference
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import MissionResult

@@ -22,9 +22,9 @@ from twin_master.fleet.learning.evidence_kernels import (
 )
 from twin_master.fleet.learning.grid_density import Axes
 from twin_master.fleet.learning.posterior import GRID_POINTS
+from twin_master.network.graphical_model import build_graphical_model, factor_tables
 from twin_master.network.kernels import PredecessorLists
 from twin_master.network.transition import predecessor_lists
-from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
 
 _LEARNABLE_KIND = "independent_worsening"

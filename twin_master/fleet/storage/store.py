@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ def stored_variables(
     states = knowledge.model.states
     mean = [states.mean(belief) for belief in flights.filtered]
     standard_deviation = [states.standard_deviation(belief) for belief in flights.filtered]
-    fallbacks = fallbacks_of(knowledge, flights)
+    delay, early = fallbacks_of(knowledge, flights)
     earned = earnings(knowledge, flights.control_index, flights.filtered, flights.state)
     returns = discounted_return(knowledge.scenario, earned.reward, flights.control_index)
     # The belief after the last flown step, (B, S); of a failed twin the last row, which is NaN.
@@ -94,8 +94,8 @@ def stored_variables(
         "filtered/log_evidence": flights.log_evidence,
         "notice/none_of_these": flights.unexplained,
         "filtered/last_probability": last_belief,
-        "delay": np.where(has_failed, np.nan, fallbacks.delay),
-        "early": np.where(has_failed, _NOT_DEFINED, fallbacks.early),
+        "delay": np.where(has_failed, np.nan, delay),
+        "early": np.where(has_failed, _NOT_DEFINED, early),
         **_notice_variables(flights),
         "credible": np.where(has_failed, np.nan, _credible_fraction(knowledge, flights)),
     }
@@ -147,14 +147,16 @@ def _notice_variables(flights: Flights) -> dict[str, list[list[int]]]:
     return {"notice/count": counts, "notice/first_step": first_steps}
 
 
-class Fallbacks(NamedTuple):
-    """Fallbacks of B twins: changes from the initial to a gentler control because of damage.
+def fallbacks_of(knowledge: Knowledge, flights: Flights) -> tuple[Float, Index]:
+    """Return the delays and the early cases of the fallbacks of B twins, from their flights.
 
-    A fallback is called for once the true state reaches a level at which the policy leaves the
-    initial control, that of the first step.
+    A fallback is a change from the initial to a gentler control because of damage. It is called for
+    once the true state reaches a level at which the policy leaves the initial control, that of the
+    first step. Real assets have the delay NaN and -1 for `early`, because their true state is not
+    known.
 
-    Attributes
-    ----------
+    Returns
+    -------
     delay : (B,) array
         The number of steps from the call to the fallback. It is infinite if the fallback did not
         come within the mission, and NaN if none was called for or if the mission ended within
@@ -162,16 +164,6 @@ class Fallbacks(NamedTuple):
     early : (B,) array
         1 if a fallback came before it was called for, else 0; -1 if the policy does not depend on
         the level of one factor alone.
-    """
-
-    delay: Float
-    early: Index
-
-
-def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
-    """Return delays and early cases of the twins' fallbacks, from their flights.
-
-    Real assets have the delay NaN and -1 for `early`, because their true state is not known.
     """
     scenario = knowledge.scenario
     first_control = scenario.control_names.index(scenario.mission.first_control)
@@ -197,7 +189,7 @@ def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
             delay[twin] = fallback.delay
         elif steps_flown - fallback.step_at_switch_level > WITHIN:
             delay[twin] = np.inf
-    return Fallbacks(delay, early)
+    return delay, early
 
 
 def in_credible_set(
