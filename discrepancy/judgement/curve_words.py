@@ -62,12 +62,21 @@ def curve_in_words(curve: TableStiffness | TableDamping, force_unit: str) -> str
         return _growth("displacement", points, forces)
     low, high = dead_band
     slopes = []
+    is_below, is_above = points <= low, points >= high
+    # a force at one end that is small beside that at the other is none, either
+    least_force = ONE_SIDED * np.abs(forces).max()
+    if low > points[0] and np.abs(forces[is_below]).max() < least_force:
+        low = float(points[0])
+    if high < points[-1] and np.abs(forces[is_above]).max() < least_force:
+        high = float(points[-1])
     if low > points[0]:
-        slope, low = _line_to_zero(points, forces, points <= low)
+        slope, low = _line_to_zero(points, forces, is_below)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} below")
     if high < points[-1]:
-        slope, high = _line_to_zero(points, forces, points >= high)
+        slope, high = _line_to_zero(points, forces, is_above)
         slopes.append(f"{number(slope)} {force_unit}/{motion_unit} above")
+    if low >= high:  # the forces beyond the stretch are no lines that begin at its ends
+        return _growth("displacement", points, forces)
     begin, end = _position_text(low, motion_unit), _position_text(high, motion_unit)
     return f"it is zero from {begin} to {end}, with a slope of {listing(slopes)}"
 

@@ -177,13 +177,13 @@ class EffectLaws:
             forces_of_term = self._forces_of_patch(arguments, laws_of_term(values))
             for port, force in forces_of_term.items():
                 forces[port] = force.plus(forces[port]) if port in forces else force
-            # a force of free shape is linear in its amplitudes
-            forces_below = forces_of_term if term.effect.table is not None else None
-            # an effect without a force at a port changes readings, see `_linearised_sensor_errors`
-            for number in range(len(values)) if forces_of_term else ():
-                slopes = self._slopes(arguments, laws_of_term, values, number, forces_below)
-                for port, slope in slopes.items():
-                    derivatives[port][first_unknown + number] = slope
+            if forces_of_term:  # else it changes readings, see `_linearised_sensor_errors`
+                # a force of free shape is linear in its amplitudes
+                forces_below = forces_of_term if term.effect.table is not None else None
+                for number in range(len(values)):
+                    slopes = self._slopes(arguments, laws_of_term, values, number, forces_below)
+                    for port, slope in slopes.items():
+                        derivatives[port][first_unknown + number] = slope
             first_unknown += len(values)
         return {
             port: LinearisedForce(force, derivatives[port], by_model.get(port, 0.0))

@@ -30,10 +30,14 @@ DISPLACEMENTS = np.linspace(-0.02, 0.02, 49)
             -1e5 * np.maximum(DISPLACEMENTS, 0.0) ** 2,
             "it softens, growing about as the power 2 of the displacement at positive displacements only",
         ),
+        (
+            np.where(DISPLACEMENTS < -0.005, -0.08, -40.0 * np.maximum(DISPLACEMENTS - 0.0075, 0.0)),
+            "it is zero from −20 mm to 7.5 mm, with a slope of −40 N/m above",
+        ),
         (80.0 * DISPLACEMENTS, "it grows in proportion to the displacement"),
         (0.5 * np.sign(DISPLACEMENTS), "it is nearly constant"),
     ],
-    ids=["stop", "play", "cubic", "one-sided", "linear", "constant"],
+    ids=["stop", "play", "cubic", "one-sided", "small on one side", "linear", "constant"],
 )
 def test_a_curve_is_told_by_its_shape(forces, words):
     assert curve_in_words(TableStiffness("p", tuple(DISPLACEMENTS), tuple(forces)), "N") == words
