@@ -23,8 +23,8 @@ HIDDEN_SHARE = 0.5
 intervals of a weaker law contain only 4 of 9 true values."""
 LEAST_EVIDENCE = 3.0
 """Log evidence over no missing force from which on a force is missing [nat]."""
-NEGLIGIBLE_SIZE = 1e-9
-"""Factor on the size of a missing force that stands for none: a process of size zero is
+NEGLIGIBLE_AMPLITUDE = 1e-9
+"""Factor on the amplitude of a missing force that stands for none: a process without amplitude is
 singular."""
 
 
@@ -100,7 +100,7 @@ class Estimate:
     @cached_property
     def log_evidence_without_force(self) -> float:
         """The log evidence of the same trials and laws if no force is missing [nat]."""
-        no_force = scale_processes(self.processes, NEGLIGIBLE_SIZE, 1.0)
+        no_force = scale_processes(self.processes, NEGLIGIBLE_AMPLITUDE, 1.0)
         return self.linearisation.solve(no_force).log_evidence
 
     @property

@@ -1,7 +1,7 @@
 """Gauss-Newton's method for the motion, the missing force and the unknowns of a hypothesis.
 
-The trials are linearised along the last trajectory, and one filter and one smoother give the next
-one, until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4,
+The trials are linearised along the last trajectory, and a filter and a smoother give the next one,
+until nothing changes. This is the iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4,
 626-636; damped: Särkkä and Svensson 2020, ICASSP). Where little force is missing, the trials are
 linearised along the motion that the laws alone give (shooting). The innovations at the end give the
 evidence by Laplace's approximation.
@@ -32,7 +32,7 @@ from .process_search import Processes, prior_log_density
 from .regression import Priors
 
 MOST_ITERATIONS = 12
-"""Largest number of linearisations at one size of the missing force."""
+"""Largest number of linearisations at one amplitude of the missing force."""
 CONVERGED_STEP = 0.02
 """Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
 CONVERGED_EVIDENCE = 0.05
@@ -176,7 +176,7 @@ def linearise_trials(
     speed_window: float,
     shared_priors: Priors,
 ) -> Linearisation | None:
-    """Return all trials with a hypothesis' laws, linearised along trajectories.
+    """Return all trials with the laws of a hypothesis, linearised along trajectories.
 
     Parameters
     ----------
@@ -225,7 +225,9 @@ def linearise_along_laws(
     speed_window: float,
     shared_priors: Priors,
 ) -> Linearisation | None:
-    """Return all trials linearised along the motion that a hypothesis' laws alone give them.
+    """Return all trials linearised along the motion that the laws of a hypothesis alone give them.
+
+    Unless the record is thinned, a linear trial also gets the residuals of a simulation.
 
     Parameters
     ----------
@@ -253,7 +255,7 @@ def linearise_along_laws(
         if trajectory is None:
             return None
         trajectories.append(trajectory)
-        if trials[trial_index].stride > 1:  # a record that is thinned is compared roughly
+        if trials[trial_index].stride > 1:  # a rough comparison is enough for a thinned record
             simulations.append(None)
             continue
         residual = laws.residual_of_simulation(arguments, local_values)
@@ -276,18 +278,7 @@ def _start_after_step(
 ) -> EstimatorStart:
     """Return the values and trajectories a fraction of the way from a start to an estimate.
 
-    No unknown of an effect moves by more than `LONGEST_STEP`.
-
-    Parameters
-    ----------
-    laws : HypothesisLaws
-        The laws of the hypothesis.
-    start : EstimatorStart
-        The values and trajectories before the step.
-    estimate : Estimate
-        Those at the end of the whole step.
-    fraction : float
-        The fraction of the step that is taken.
+    The fraction is reduced if an unknown of an effect would move by more than `LONGEST_STEP`.
     """
     change = estimate.effect - start.effect
     longest_change = float(np.max(np.abs(change), initial=0.0))
@@ -309,7 +300,10 @@ def _start_after_step(
 
 
 def _at_start_of_step(estimate: Estimate, start: EstimatorStart) -> Estimate:
-    """Return an estimate with the unknowns about which its trials are linear."""
+    """Return the estimate with the unknowns and the motion at the start of its step, not its end.
+
+    The linear trials of the estimate were computed at this start.
+    """
     shared_and_effect = np.concatenate((start.shared, start.effect))
     filtered_trials = estimate.linearisation.filter(start.processes)
     trials = tuple(
@@ -340,11 +334,11 @@ class GaussNewton:
     def linearise(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> Linearisation | None:
-        """Return the trials with laws along trajectories, see `linearise_trials`."""
+        """Return `linearise_trials` of these trials."""
         return linearise_trials(laws, self.trials, start, speed_window, self.shared_priors)
 
     def log_evidence(self, linearisation: Linearisation, processes: Processes) -> float:
-        """Return log evidence plus log prior of missing forces in linear trials [nat]."""
+        """Return the log evidence of linear trials plus the log prior of missing forces [nat]."""
         return linearisation.log_evidence_with_prior(self.prior_medians, processes)
 
     @np.errstate(over="ignore", invalid="ignore")  # a motion that diverges is rejected
@@ -372,8 +366,8 @@ class GaussNewton:
         Returns
         -------
         Estimate or None
-            The last estimate; None if the laws are not possible along the first trajectories, or if
-            the first evidence is not finite.
+            The last estimate, converged or not; None if the laws are not possible along the first
+            trajectories, or if the first evidence is not finite.
         """
         current_start = start
         last_evidence = -inf
@@ -412,12 +406,13 @@ class GaussNewton:
         speed_window: float,
         most_iterations: int = MOST_ITERATIONS,
     ) -> Estimate | None:
-        """Return the most probable of several estimates, each along the motion of the laws alone.
+        """Return the estimate by damped Gauss-Newton steps along the motion of the laws alone.
 
         This is a shooting method: each trajectory is simulated with the unknowns of the last
-        estimate, so that laws with kinks, such as dry friction, are linear about a motion that they
-        make. It is meant for small missing forces, which the simulation leaves out. A step is
-        halved where the evidence at its end is lower, and the next one is at most twice as long.
+        estimate. Laws with kinks, such as dry friction, are thus linearised along a motion that
+        they cause themselves. The simulation leaves out missing forces, which must be small. If the
+        evidence after a step is lower, half the step is tried from the best start so far; after a
+        rise, the next step is a fraction at most twice as large.
 
         Parameters
         ----------
@@ -434,7 +429,8 @@ class GaussNewton:
         Returns
         -------
         Estimate or None
-            The estimate; None if the laws are not possible at the first unknowns.
+            The most probable estimate, converged or not; None if the laws are not possible at the
+            first unknowns, or if the first evidence is not finite.
         """
         best_estimate: Estimate | None = None
         best_start = start
@@ -450,7 +446,8 @@ class GaussNewton:
             )
             if estimate is None:
                 break
-            # the laws are linear about the unknowns of the start, where the evidence is lower
+            # The evidence is that of the linear laws at the end of the step. At the start, where
+            # they are exact, the log posterior is lower by the Newton decrement.
             decrement = _newton_decrement(start, estimate)
             estimate = replace(
                 estimate,
@@ -469,7 +466,7 @@ class GaussNewton:
             start = _start_after_step(laws, best_start, best_estimate, fraction)
         if best_estimate is None or best_estimate.converged:
             return best_estimate
-        # the evidence is that at the start of the last step, whose end may be worse
+        # the evidence holds at the start of the last step; its end may be worse
         return _at_start_of_step(best_estimate, best_start)
 
     def _estimate_of_linearisation(
@@ -540,8 +537,8 @@ class GaussNewton:
 
         At the end of a step the linear laws differ from the true ones. This difference acts like a
         further missing force, which is not part of the smoother's model. A fraction is admissible
-        if the rms difference is at most the standard deviation of the missing force. If no fraction
-        of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
+        if the rms difference is at most the largest standard deviation of the missing forces. If no
+        fraction of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
 
         Parameters
         ----------
@@ -584,7 +581,9 @@ class GaussNewton:
         linearisation: Linearisation,
         speed_window: float,
     ) -> float | None:
-        """Return the rms error of the linear laws after a step, over the missing force's deviation.
+        """Return the rms error of the linear laws after a step, relative to the missing forces.
+
+        It is divided by the largest standard deviation of the missing forces at all ports.
 
         Parameters
         ----------
@@ -634,7 +633,7 @@ class GaussNewton:
 
 
 def _newton_decrement(start: EstimatorStart, estimate: Estimate) -> float:
-    """Return by how much the log posterior rises from the unknowns of a start to an estimate's.
+    """Return by how much the log posterior of linear trials rises from a start to an estimate.
 
     The trials are linear about the start, so that the log of likelihood times prior is quadratic in
     the unknowns. Half the squared step in the metric of its curvature is the Newton decrement.

@@ -1,6 +1,6 @@
-"""The most probable sizes and correlation times of missing forces, by Newton's method.
+"""The most probable amplitudes and correlation times of missing forces, by Newton's method.
 
-The size of a missing force is its standard deviation as a random process.
+The amplitude of a missing force is its standard deviation as a random process.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,14 +17,14 @@ from .force_states import Process
 Processes = Mapping[int, Process]
 """Missing forces as processes, by the numbers of their ports."""
 
-PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
-"""Prior standard deviations of the logarithms of size and correlation time of a process. They allow
-factors of about 20 in size and 3 in time."""
-PRIOR_LOG_DEVIATIONS = np.array((PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME))
+PRIOR_LOG_DEVIATION_OF_AMPLITUDE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
+"""Prior standard deviations of the logarithms of amplitude and correlation time of a process. They
+allow factors of about 20 in amplitude and 3 in time."""
+PRIOR_LOG_DEVIATIONS = np.array((PRIOR_LOG_DEVIATION_OF_AMPLITUDE, PRIOR_LOG_DEVIATION_OF_TIME))
 """Both of these deviations, as an array."""
-START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
-"""Logarithms of the factors on size and time that make the grid around the given processes. Small
-sizes are in it, as only a part of the force remains missing if a law explains the rest."""
+LOG_FACTORS_OF_GRID = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
+"""Logarithms of the factors on amplitude and time that make the grid around the given processes.
+Small amplitudes are in it, as a law may explain most of the force."""
 LARGEST_DISTANCE = 5.0
 """Bound of the search, in prior standard deviations from the median."""
 DIFFERENCE = 0.02
@@ -38,7 +38,7 @@ MOST_STEPS = 20
 def prior_log_density(median_processes: Processes, processes: Processes) -> float:
     """Return the log prior density of missing forces [nat], up to a constant.
 
-    The size and the correlation time of a missing force are independent and log-normal.
+    The amplitude and the correlation time of a missing force are independent and log-normal.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def prior_log_density(median_processes: Processes, processes: Processes) -> floa
 
 
 def _ratios_to_median(process: Process, median_process: Process) -> tuple[float, float]:
-    """Return the ratios of size and correlation time between a process and its prior median."""
+    """Return amplitude and correlation time of a process over those of its prior median."""
     return (
         process.standard_deviation / median_process.standard_deviation,
         process.correlation_time / median_process.correlation_time,
@@ -67,7 +67,7 @@ _TIME = 1
 
 @dataclass(frozen=True, eq=False)
 class ProcessSearch:
-    """The search for the most probable sizes and correlation times of P missing forces.
+    """The search for the most probable amplitudes and correlation times of P missing forces.
 
     It is Newton's method on their logarithms (P, 2), with numerical derivatives and within bounds.
 
@@ -77,9 +77,9 @@ class ProcessSearch:
         The function that takes processes by port, and returns the log of evidence times prior
         [nat].
     initial : mapping of int to Process
-        The processes to begin with; only their sizes and times are changed.
+        The processes to begin with; only their amplitudes and times are changed.
     low, high : (P, 2) ndarray
-        The bounds of the logarithms of size and time.
+        The bounds of the logarithms of amplitude and time.
     """
 
     log_evidence: Callable[[dict[int, Process]], float]
@@ -95,7 +95,7 @@ class ProcessSearch:
         initial_processes: Processes,
         time_range: tuple[float, float],
     ) -> "ProcessSearch":
-        """Return the search within `LARGEST_DISTANCE` prior deviations of the medians.
+        """Return a search within `LARGEST_DISTANCE` prior deviations of the medians.
 
         Parameters
         ----------
@@ -118,15 +118,15 @@ class ProcessSearch:
         return cls(log_evidence, initial_processes, low, high)
 
     def processes(self, log_values: FloatArray) -> dict[int, Process]:
-        """Return the processes whose sizes and times have logarithms (P, 2)."""
+        """Return the processes, given the logarithms (P, 2) of their amplitudes and times."""
         values = np.exp(log_values).tolist()
         return {
-            port: replace(process, standard_deviation=size, correlation_time=time)
-            for (port, process), (size, time) in zip(self.initial.items(), values, strict=True)
+            port: replace(process, standard_deviation=amplitude, correlation_time=time)
+            for (port, process), (amplitude, time) in zip(self.initial.items(), values, strict=True)
         }
 
     def log_posterior(self, log_values: FloatArray) -> float:
-        """Return the log of evidence times prior [nat] at logarithms (P, 2) of sizes and times."""
+        """Return the log of evidence times prior at log amplitudes and times (P, 2) [nat]."""
         return self.log_evidence(self.processes(log_values))
 
     def most_probable(
@@ -148,24 +148,24 @@ class ProcessSearch:
         return self.processes(log_values), value
 
     def _best_of_grid(self, log_values: FloatArray) -> FloatArray:
-        """Return the logarithms (P, 2) of the highest log posterior on a grid about a given point.
+        """Return the point (P, 2) with the highest log posterior on a grid about a given point.
 
         The grid of each port is searched in turn, with the other ports at their best values so far.
         """
         for port in range(len(log_values)):
             candidates = []
-            for factors in START_FACTORS:
+            for log_factors in LOG_FACTORS_OF_GRID:
                 candidate = log_values.copy()
-                candidate[port] += factors
+                candidate[port] += log_factors
                 candidates.append(np.clip(candidate, self.low, self.high))
             log_values = max(candidates, key=self.log_posterior)
         return log_values
 
     def _climb(self, log_values: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
-        """Return the logarithms (P, 2) that Newton's method reaches, and the value there [nat].
+        """Return the point (P, 2) that Newton's method reaches, and the log posterior there [nat].
 
-        `most_steps` should be large enough to reach the maximum. The result of a search that ends
-        before it depends on rounding errors; the maximum does not.
+        `most_steps` should be large enough to reach the maximum: before it, the result depends on
+        rounding errors.
         """
         value = self.log_posterior(log_values)
         offsets = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
@@ -197,18 +197,11 @@ class ProcessSearch:
         values_above: FloatArray,
         values_below: FloatArray,
     ) -> FloatArray:
-        """Return the second differences (2 P, 2 P) of the value for all pairs of logarithms.
+        """Return the second differences (2 P, 2 P) of the log posterior.
 
-        They are the second derivatives, multiplied by `DIFFERENCE` squared.
-
-        Parameters
-        ----------
-        log_values : (P, 2) array
-            The logarithms of the size and the correlation time of each of the P missing forces.
-        value : float
-            The log posterior density at these logarithms [nat].
-        values_above, values_below : (2 P,) array
-            The values with one logarithm `DIFFERENCE` larger, or smaller.
+        They are the second derivatives, multiplied by `DIFFERENCE` squared. `value` is the log
+        posterior at the point; `values_above` and `values_below` (2 P,) are those with one
+        logarithm `DIFFERENCE` larger, or smaller.
         """
         # step i enlarges logarithm i alone
         steps = DIFFERENCE * np.eye(log_values.size).reshape(-1, *log_values.shape)
@@ -228,20 +221,13 @@ class ProcessSearch:
     def _newton_step(
         self, log_values: FloatArray, slope: FloatArray, curvature: FloatArray
     ) -> FloatArray:
-        """Return a step (P, 2) of Newton's method towards the maximum, within the bounds.
+        """Return a step (P, 2) of Newton's method uphill, at most `LONGEST_STEP` in each logarithm.
 
-        Parameters
-        ----------
-        log_values : (P, 2) array
-            The logarithms of the size and the correlation time of each of the P missing forces.
-        slope : (2 P,) array
-            The gradient of the value, multiplied by `DIFFERENCE` squared.
-        curvature : (2 P, 2 P) array
-            The second derivatives of the value, multiplied by the same.
+        A logarithm at its bound stays there if the log posterior rises beyond the bound. `slope`
+        (2 P,) and `curvature` are the first and second derivatives, times `DIFFERENCE` squared.
         """
         may_rise = np.ravel(log_values < self.high)
         may_fall = np.ravel(log_values > self.low)
-        # a logarithm at its bound stays there if the value rises beyond the bound
         free_axes = np.flatnonzero(np.where(slope > 0.0, may_rise, may_fall))
         eigenvalues, eigenvectors = np.linalg.eigh(curvature[np.ix_(free_axes, free_axes)])
         # magnitudes of the eigenvalues: the step leads uphill where the value is convex, too
@@ -255,19 +241,10 @@ class ProcessSearch:
     def _backtrack(
         self, log_values: FloatArray, value: float, step: FloatArray
     ) -> tuple[FloatArray, float]:
-        """Return logarithms (P, 2) of a larger value along a step, and the value (backtracking).
+        """Return the point (P, 2) after a step, halved until the log posterior is not lower there.
 
-        The step is halved until the value is not below the present one. If the step becomes too
-        short first, the value returned is below it.
-
-        Parameters
-        ----------
-        log_values : (P, 2) array
-            The logarithms of the size and the correlation time of each of the P missing forces.
-        value : float
-            The log posterior density at these logarithms [nat].
-        step : (P, 2) array
-            The step of Newton's method in the logarithms.
+        The log posterior at this point is returned, too. It is below `value`, that before the step,
+        if the step became shorter than `SHORTEST_STEP` first.
         """
         next_log_values, next_value = log_values, -np.inf
         while next_value < value and np.abs(step).max() > SHORTEST_STEP:
@@ -278,29 +255,21 @@ class ProcessSearch:
 
 
 def logarithms(processes: Processes) -> FloatArray:
-    """Return the logarithms (P, 2) of the sizes and times of processes."""
+    """Return the logarithms (P, 2) of the amplitudes and correlation times of processes."""
     return np.log(
         [(process.standard_deviation, process.correlation_time) for process in processes.values()]
     )
 
 
 def scale_processes(
-    processes: Processes, size_factor: float, time_factor: float
+    processes: Processes, amplitude_factor: float, time_factor: float
 ) -> dict[int, Process]:
-    """Return processes with their sizes and correlation times multiplied by factors.
-
-    Parameters
-    ----------
-    processes : mapping of int to Process
-        The processes, by the number of the port.
-    size_factor, time_factor : float
-        The factors on all standard deviations and on all correlation times.
-    """
+    """Return processes with all amplitudes and all correlation times multiplied by a factor."""
     scaled_processes = {}
     for port, process in processes.items():
         scaled_processes[port] = replace(
             process,
-            standard_deviation=process.standard_deviation * size_factor,
+            standard_deviation=process.standard_deviation * amplitude_factor,
             correlation_time=process.correlation_time * time_factor,
         )
     return scaled_processes
@@ -311,7 +280,7 @@ def processes_within_range(
 ) -> dict[int, Process]:
     """Return processes whose correlation times are clipped to a range [s].
 
-    A force that stays the same throughout the records is a constant, not a process.
+    The records cannot show longer or shorter ones.
     """
     shortest, longest = time_range
     return {

@@ -1,8 +1,8 @@
 """The ranking of hypotheses on the missing force, in two rounds if the records are long.
 
-A screen finds the promising effects; each is estimated roughly, the best ones in full, together
+A screen finds the promising effects. Each is estimated roughly, and the best ones in full, together
 with the motion. Then effects are added to the best hypothesis. Long records are thinned in the
-first round, and the leading hypotheses are estimated in all samples.
+first round, after which the leading hypotheses are estimated in all samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,13 +25,13 @@ from .estimate import Estimate
 from .force_search import ForceSearch
 from .screen import screen_effects
 
-FOLLOWED_COUNTS = (10, 4, 4)
-"""Numbers of effects that are estimated after the screening: as single effects, as second ones and
-as third ones of a set."""
+ROUGH_COUNTS = (10, 4, 4)
+"""Numbers of screened effects that are estimated roughly: as single effects, and as the second and
+third ones of a set."""
 BEAM_WIDTHS = (4, 2, 2)
-"""Numbers of the rough estimates of each length that are estimated in full, the best first."""
+"""Numbers of these rough estimates that are then estimated in full."""
 ESTIMATED_RANGE = 60.0
-"""Difference to the best score above which no hypothesis is estimated in full [nat]."""
+"""Difference to the best score above which a hypothesis is not estimated in full [nat]."""
 LEADING_RANGE = 12.0
 """Difference to the best score of the first round above which a hypothesis is dropped [nat]. In all
 samples the difference is larger by about the factor of the thinning."""
@@ -53,7 +53,8 @@ def rank_by_missing_force(
 ) -> list[Estimate]:
     """Return estimates of hypotheses on the missing force, the most probable first.
 
-    Of long records, only the leading hypotheses and the one without effects are returned.
+    If the records are long, all hypotheses are ranked in thinned records. Only the leading ones and
+    the one without effects are then estimated in all samples, and returned.
 
     Parameters
     ----------
@@ -86,7 +87,8 @@ def rank_hypotheses(
     """Return estimates of hypotheses, the most probable first.
 
     Effects are added to the best hypothesis one at a time, as long as its score rises. Each time,
-    simpler forms of the best hypothesis are estimated, too.
+    simpler forms of the best hypothesis are estimated, too. A force of free shape is estimated
+    after the first effect. The ranking ends there if that is more probable and leaves no force.
 
     Parameters
     ----------
@@ -97,14 +99,13 @@ def rank_hypotheses(
     on_progress : callable
         The function that receives a line for the progress display, such as the estimate that runs.
     largest_set : int, optional
-        The largest number of effects in a set; by default that of `FOLLOWED_COUNTS`.
+        The largest number of effects in a set; by default the length of `ROUGH_COUNTS`.
     """
     ranking = _Ranking(search, effects, on_progress)
     best_estimate = search.estimate_without_effects
-    for followed_count, beam_width in list(zip(FOLLOWED_COUNTS, BEAM_WIDTHS, strict=True))[
-        :largest_set
-    ]:
-        rough_estimates = ranking.rough_estimates(best_estimate, followed_count)
+    counts_by_length = list(zip(ROUGH_COUNTS, BEAM_WIDTHS, strict=True))
+    for rough_count, beam_width in counts_by_length[:largest_set]:
+        rough_estimates = ranking.rough_estimates(best_estimate, rough_count)
         ranking.estimate_in_full(best_estimate, rough_estimates, beam_width)
         ranking.estimate_simpler_forms()
         if ranking.best is best_estimate:
@@ -113,7 +114,6 @@ def rank_hypotheses(
         best_estimate = ranking.best
         if is_first_effect:
             curve = ranking.estimate_curve()
-            # effects are added to a named law, unless the curve leaves nothing to explain
             if (
                 curve is not None
                 and curve.leaves_no_force
@@ -170,16 +170,11 @@ class _Ranking:
         if earlier is None or estimate.log_evidence > earlier.log_evidence:
             self.by_effects[key] = estimate
 
-    def rough_estimates(self, base: Estimate, followed_count: int) -> list[Estimate]:
+    def rough_estimates(self, base: Estimate, rough_count: int) -> list[Estimate]:
         """Return rough estimates of a base with one more effect, the most probable first.
 
-        Parameters
-        ----------
-        base : Estimate
-            The estimate to which an effect is added. Its motion and missing forces are those to
-            begin with.
-        followed_count : int
-            The number of effects that are estimated, the most promising of the screen first.
+        The `rough_count` most promising effects of the screen are estimated, from the motion and
+        the missing forces of the base. Sets that have an estimate already are left out.
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         self.on_progress(f"comparing all effects{base_in_words} with the missing force")
@@ -187,7 +182,7 @@ class _Ranking:
         if base.leaves_no_force:
             # the screen is exact for effects that are small, as any further one is
             screened_effects = [effect for effect in screened_effects if effect.rise > 0.0]
-        promising_effects = screened_effects[:followed_count]
+        promising_effects = screened_effects[:rough_count]
         rough_estimates = []
         for number, screened_effect in enumerate(promising_effects):
             candidate = base.candidate.with_term(screened_effect.term)
@@ -213,16 +208,10 @@ class _Ranking:
     def estimate_in_full(
         self, base: Estimate, rough_estimates: Sequence[Estimate], beam_width: int
     ) -> None:
-        """Estimate the best of some hypotheses in full, each from its rough estimate.
+        """Estimate the best hypotheses in full, given their rough estimates, the best first.
 
-        Parameters
-        ----------
-        base : Estimate
-            The estimate whose motion and missing forces are those to begin with.
-        rough_estimates : sequence of Estimate
-            The rough estimates, the most probable first.
-        beam_width : int
-            The largest number of estimates in full.
+        At most `beam_width` are estimated. They begin with the effects of the rough estimate, and
+        with the motion and the missing forces of `base`.
         """
         for rough_estimate in rough_estimates[:beam_width]:
             if self.score(rough_estimate) < self.score(rough_estimates[0]) - ESTIMATED_RANGE:
@@ -239,8 +228,8 @@ class _Ranking:
             estimate = self.search.estimate_effects(base, candidate, rough_estimate.effect)
             if estimate is not None:
                 self.record(estimate)
-            # A missing force that is large at first may take the place of a law whose force hardly
-            # changes: the estimate also begins at the smaller one of the rough estimate.
+            # With the large missing force of the base, a law whose force hardly changes may be lost
+            # to it: begin also with the smaller missing force of the rough estimate.
             if self.by_effects[candidate.key] is rough_estimate:
                 self.record(self.search.estimate_about_own_values(rough_estimate))
             self.estimated_in_full.add(candidate.key)
@@ -251,7 +240,8 @@ class _Ranking:
         A set may lead only because its estimate reached the right values of one effect, and the
         estimate of that effect alone did not. The same holds for a law of free shape and the named
         laws of its family, such as dry friction. Each simpler form is therefore estimated from the
-        motion of the best hypothesis.
+        motion of the best hypothesis. A form that stays more than `ESTIMATED_RANGE` below the best
+        one is not tried again.
         """
         best_estimate = self.best
         while best_estimate.candidate.terms:
@@ -259,7 +249,7 @@ class _Ranking:
                 *self._named_laws_of_family(best_estimate.candidate),
                 *_simpler_forms(best_estimate.candidate, best_estimate.effect),
             ]
-            # the values of the best hypothesis are preferred where both have the same effects
+            # if both lists have the same effects, those with the values of the best hypothesis stay
             form_by_effects = {form.candidate.key: form for form in simpler_forms}
             for key, form in form_by_effects.items():
                 if key in self.hopeless_forms:
@@ -281,11 +271,13 @@ class _Ranking:
             best_estimate = self.best
 
     def estimate_curve(self) -> Estimate | None:
-        """Estimate a force of free shape over the motion where no named law is enough.
+        """Estimate a force of free shape over the motion, unless a named law is enough.
 
         A named law is enough if it leaves no force, and no exponent of it had to be fitted. The
-        curve acts at the port that shows most of the missing force, and runs over what explains
-        more of that force: displacement or velocity. A port of a state has neither.
+        curve acts at the port where most force is missing, and is a function of displacement or
+        velocity, whichever explains more of that force. A port of a state has neither. Curves with
+        ever sharper bends are tried, until one leaves no force or is less probable than the best
+        named law. Of those that leave no force, or else of all, the most probable one is kept.
         """
         if self.best.leaves_no_force and not self.best.candidate.has_free_shape:
             return None
@@ -297,16 +289,14 @@ class _Ranking:
         if scale is not None and scale.of_state:
             return None
         force = np.concatenate([trial.missing_forces[port] for trial in base.trials])
-        values_of = {
+        motion = {
             "displacement": np.concatenate(
                 [trial.trajectory.positions[:, port] for trial in base.trials]
             ),
             "velocity": np.concatenate([trial.trajectory.speeds[:, port] for trial in base.trials]),
         }
-        variable = max(
-            VARIABLES, key=lambda name: variance_along_curve(name, values_of[name], force)
-        )
-        values = values_of[variable]
+        variable = max(VARIABLES, key=lambda name: variance_along_curve(name, motion[name], force))
+        values = motion[variable]
         estimates = []
         for correlation_length in CORRELATION_LENGTHS:
             curve = force_curve(
@@ -321,7 +311,6 @@ class _Ranking:
             estimate = self.search.estimate_effects(base, candidate, candidate.start_values())
             if estimate is not None:
                 estimates.append(estimate)
-                # a sharper bend is tried only of a curve that leads and leaves a force
                 if estimate.leaves_no_force or self.score(estimate) < self.score(self.best):
                     break
         if not estimates:
@@ -330,9 +319,9 @@ class _Ranking:
         return self.curve
 
     def _named_laws_of_family(self, candidate: Candidate) -> list[_ValuedCandidate]:
-        """Return the sets in which named laws stand in place of the laws of free shape of a set.
+        """Return sets with named laws of the same families instead of laws of free shape.
 
-        They are taken from the rough estimates, with the values that these have.
+        They are those with a rough estimate but none in full, with the values of that estimate.
         """
         if not candidate.has_free_shape:
             return []
@@ -356,26 +345,22 @@ def _families_at_places(candidate: Candidate) -> list[tuple[str, str]]:
 def _simpler_forms(candidate: Candidate, parameters: FloatArray) -> list[_ValuedCandidate]:
     """Return the simpler forms of a set: without one effect, or with one law in canonical shape.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        The set of effects. The only effect of a set is never left out.
-    parameters : (E,) array
-        The scaled parameters of the set, which the forms inherit.
+    They inherit the scaled parameters (E,) of the set. The only effect of a set is not left out.
     """
     forms = []
     numbers = range(len(candidate.terms))
     if len(numbers) > 1:
-        for left_out in numbers:
-            kept = [number for number in numbers if number != left_out]
-            forms.append(_ValuedCandidate(*candidate.subset_of_terms(kept, parameters)))
+        for dropped_number in numbers:
+            remaining_numbers = [number for number in numbers if number != dropped_number]
+            smaller_set, values = candidate.subset_of_terms(remaining_numbers, parameters)
+            forms.append(_ValuedCandidate(smaller_set, values))
     for number, term in enumerate(candidate.terms):
         if not term.free_shape:
             continue
         canonical_term = replace(term, free_shape=False)
         terms = list(candidate.terms)
         terms[number] = canonical_term
-        parameters_by_term = [of_term for _, of_term in candidate.split_by_term(parameters)]
+        parameters_by_term = [values for _, values in candidate.split_by_term(parameters)]
         # the parameters of the shape follow those of the canonical law
         canonical_count = len(canonical_term.parameters)
         parameters_by_term[number] = parameters_by_term[number][:canonical_count]
@@ -386,19 +371,10 @@ def _simpler_forms(candidate: Candidate, parameters: FloatArray) -> list[_Valued
 def _leading_estimates(
     search: ForceSearch, ranked_estimates: Sequence[Estimate], effect_count: int
 ) -> list[Estimate]:
-    """Return the estimates with effects that are repeated in all samples, the best first.
+    """Return the estimates with effects in thinned records that are repeated in all samples.
 
-    These are the most probable ones, and the law of the best one with the other kind of shape: the
-    verdict compares a law of canonical shape with that of free shape.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search in thinned records.
-    ranked_estimates : sequence of Estimate
-        Its estimates, the most probable first.
-    effect_count : int
-        The number of effects that were compared.
+    They are the most probable ones, within `LEADING_RANGE` of the best score. If fewer than
+    `MOST_LEADING` are, estimates with the effects of the best one at other places follow.
     """
     with_effects = [estimate for estimate in ranked_estimates if estimate.candidate.terms]
     if not with_effects:

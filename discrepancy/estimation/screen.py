@@ -1,7 +1,7 @@
 """The screen of effects: how well each, added alone to an estimate, explains the missing force.
 
-The motion of the estimate is taken as known. An effect is then a column of a linear model, whose
-factor is one more unknown, and one pass of the filter weighs the columns of all effects.
+The motion of the estimate is taken as known. An effect is then a column of a linear model, and the
+factor on it is one more unknown. One pass of a filter serves the columns of all effects.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -46,24 +46,24 @@ MAGNITUDE_VALUE = 0.5
 signs, the effect would do nothing."""
 FACTOR_DEVIATION = 3.0
 """Prior standard deviation of the factor on an effect, over the factor with which the effect would
-be as large as the gap. It is wide, so that the screen prefers no size."""
+be as large as the gap. It is wide, so that the screen prefers no magnitude."""
 SCREENED_DEVIATIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 """Standard deviations of the missing forces with which effects are screened, over those of the
-estimate: an effect leaves only a part of the force."""
+estimate. They are smaller, since beside an effect only a part of the force is missing."""
 SCREENED_TIMES = (0.5, 1.5)
 """Correlation times of these forces, over those of the estimate."""
 LARGEST_RATIO = 1e100
 """Ratio of an effect to the gap that stands for infinity, if the gap is zero."""
 CREEP_SHARE = 0.02
-"""Share of the rms speed below which a body creeps before it slides, so that no law of the speed is
-valid."""
+"""Fraction of the rms speed below which a body creeps and does not slide, so that its friction is
+not a function of the speed."""
 TIED_EVIDENCE = 1.0
 """Difference to the log evidence of the best values of an effect up to which estimates begin at its
 other values, too [nat]."""
 
 
 class EffectColumn(NamedTuple):
-    """The change of a trial by an effect along a motion that is taken as known.
+    """What an effect adds to a trial along a motion that is taken as known: forces or readings.
 
     Attributes
     ----------
@@ -114,8 +114,8 @@ class ScreenedEffect(NamedTuple):
     Attributes
     ----------
     rise : float
-        The largest log evidence of the screening, at the best of the tried values, minus that
-        without the effect [nat].
+        The log evidence with the effect, at the best of the values that were tried, minus that
+        without it [nat].
     term : EffectTerm
         The effect at its place.
     starts : list of ScreenedStart
@@ -135,8 +135,8 @@ def screen_effects(
 
     Each effect is tried at each of its places, with several values of its parameters. All values
     whose evidence is within `TIED_EVIDENCE` of the best are starts of later estimates. For example,
-    dead zones of different stiffness act alike if only their amplitude is fitted, but estimates
-    that begin with them lead to different ends.
+    dead zones of different widths look alike as long as only a factor on them is fitted, but
+    estimates that begin with them end in different optima.
 
     Parameters
     ----------
@@ -165,13 +165,13 @@ def screen_effects(
 def values_to_try(term: EffectTerm) -> list[FloatArray]:
     """Return sets of standard normal parameter values (E,) at which an effect is tried.
 
-    Of several magnitudes that may have both signs, such as the rate and the zero of a clock, each
-    is also tried alone, with the others at zero: their ratio is not known.
+    Parameters that are no magnitudes are tried at `SHAPE_VALUES`; if there are several, only at the
+    lowest and highest of these. Several magnitudes that may have both signs, such as the rate and
+    the zero of a clock, are tried all together, and each alone: their ratio is not known.
     """
     shape_indices = [
         number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
     ]
-    # with several such parameters, only the lowest and the highest value of each
     levels = SHAPE_VALUES if len(shape_indices) < 2 else SHAPE_VALUES[::3]
     combinations = []
     for shape_values in list(product(levels, repeat=len(shape_indices)))[:MOST_COMBINATIONS]:
@@ -186,10 +186,10 @@ def values_to_try(term: EffectTerm) -> list[FloatArray]:
     if len(signed_magnitudes) > 1:
         for values in list(combinations):
             for number in signed_magnitudes:
-                alone = values.copy()
-                alone[signed_magnitudes] = 0.0
-                alone[number] = MAGNITUDE_VALUE
-                combinations.append(alone)
+                single_magnitude = values.copy()
+                single_magnitude[signed_magnitudes] = 0.0
+                single_magnitude[number] = MAGNITUDE_VALUE
+                combinations.append(single_magnitude)
     return combinations
 
 
@@ -198,8 +198,8 @@ def _terms_to_add(
 ) -> Iterator[EffectTerm]:
     """Yield the effects at places where an estimate lacks them, also with a free shape.
 
-    With free exponents, dry friction and quadratic damping are the same law: of the effects of a
-    family whose shapes have the same parameters, one stands for all.
+    With free exponents, dry friction and quadratic damping are the same law. So a free shape is
+    tried of only one of the effects of a family whose shapes have the same parameters.
     """
     in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
     families: set[tuple[str, str, tuple[str, ...]]] = set()
@@ -221,8 +221,8 @@ def _try_effects(
 ) -> list[TriedEffect]:
     """Return the columns of all effects that may be added, at several values of each.
 
-    Effects that change nothing are left out, and those that are not possible along the motion, for
-    which the problem records why.
+    Effects that change nothing are left out. So are those that are not possible along the motion;
+    the reason is recorded in the problem.
     """
     trials = base.ported_trials
     tried_effects = []
@@ -250,10 +250,10 @@ def _try_effects(
 def _column_in_trial(
     laws: EffectLaws, trial_index: int, smoothed_trial: SmoothedTrial, values: FloatArray
 ) -> EffectColumn:
-    """Return the change of a trial by a single effect along its smoothed motion.
+    """Return what a single effect adds to a trial along its smoothed motion.
 
-    Sensors measure the explained motion. The motion by missing forces is left out: as these may
-    have any size, they would fit any gain of a sensor.
+    An error of a sensor is computed for the explained motion, without that by missing forces: as
+    these may have any magnitude, they would fit any gain of a sensor.
     """
     (term,) = laws.candidate.terms
     window = NARROWEST_WINDOW if laws.hold_at_rest else WIDE_WINDOW
@@ -276,27 +276,20 @@ def _column_in_trial(
 def _force_that_holds(
     sliding_force: FloatArray, smoothed_trial: SmoothedTrial, port: int
 ) -> FloatArray:
-    """Return the force (F,) of a law that holds its port while the speed is zero.
+    """Return the force (F,) of a law that can hold its port at rest, such as dry friction.
 
-    Where the port is at rest within its uncertainty, the force is the one that keeps it there, at
-    most as large as that of the law: it is known from the missing force.
-
-    Parameters
-    ----------
-    sliding_force : (F,) array
-        The force of the law at the smoothed speed.
-    smoothed_trial : SmoothedTrial
-        The trial with its smoothed motion and missing force.
-    port : int
-        The number of the port.
+    While the port slides it is the force of the law at the smoothed speed. While the port is at
+    rest it is the force that is lacking there, at most as large as that of the law. In between it
+    is the mean of both, weighted by the probability that the port moves, which falls with the speed
+    below `CREEP_SHARE` of the rms speed.
     """
     speeds = smoothed_trial.trajectory.speeds[:, port]
     slow_speed = max(CREEP_SHARE * float(np.sqrt(np.mean(speeds**2))), LEAST_DIVISOR)
     # probability that a normal error of deviation `slow_speed` is smaller than the speed
     probability_of_motion = erf(np.abs(speeds) / (np.sqrt(2.0) * slow_speed))
     lacking_force = smoothed_trial.lacking_forces.get(port, np.zeros_like(speeds))
-    size = np.abs(sliding_force)
-    holding_force = np.clip(lacking_force, -size, size)
+    largest_holding_force = np.abs(sliding_force)
+    holding_force = np.clip(lacking_force, -largest_holding_force, largest_holding_force)
     return np.asarray(
         probability_of_motion * sliding_force + (1.0 - probability_of_motion) * holding_force
     )
@@ -305,17 +298,17 @@ def _force_that_holds(
 def _weigh_effects(
     base: Estimate, tried_effects: Sequence[TriedEffect]
 ) -> tuple[float, list[tuple[TriedEffect, ScreenedStart]]]:
-    """Return effects with their best evidence and values, each added alone to an estimate.
+    """Return the best evidence and values of each tried effect, added alone to an estimate.
 
-    The best is taken over several deviations and times of the remaining missing forces. An effect
-    is left out if its factor always has a sign that the effect cannot have.
+    The best is taken over several amplitudes and correlation times of the remaining missing forces.
+    An effect is left out if its factor always has a sign that the effect cannot have.
 
     Returns
     -------
     evidence_of_base : float
         The best log evidence without any of the effects [nat].
     starts : list of (TriedEffect, ScreenedStart)
-        The effects, with the values from which an estimate may begin.
+        The effects, each with its best start.
     """
     evidence_of_base = -inf
     if not tried_effects:
@@ -325,10 +318,10 @@ def _weigh_effects(
     best_starts: dict[int, ScreenedStart] = {}
     factors = list(product(SCREENED_DEVIATIONS, SCREENED_TIMES))
     if base.leaves_no_force:
-        factors = [(1.0, 1.0)]  # where hardly any force is missing, its size does not matter
-    for size_factor, time_factor in factors:
+        factors = [(1.0, 1.0)]  # hardly any force is missing, so its amplitude does not matter
+    for amplitude_factor, time_factor in factors:
         processes = processes_within_range(
-            scale_processes(base.processes, size_factor, time_factor),
+            scale_processes(base.processes, amplitude_factor, time_factor),
             with_columns.correlation_time_range,
         )
         normal_equations = with_columns.regression(with_columns.filter(processes))
@@ -371,18 +364,10 @@ def _trial_with_columns(
     first_factor: int,
     effect: FloatArray,
 ) -> LinearisedTrial:
-    """Return a linear trial with the columns of effects, whose factors are unknowns of value zero.
+    """Return a linear trial with the columns of effects, whose factors are further unknowns.
 
-    Parameters
-    ----------
-    linear_trial : LinearisedTrial
-        The trial with the laws of the estimate.
-    columns : sequence of EffectColumn
-        The column of each effect in this trial.
-    first_factor : int
-        The number of the first factor among the unknowns.
-    effect : (E,) array
-        The effect parameters of the estimate, then the factors.
+    `first_factor` is the number of the first factor among the unknowns. `effect` are the effect
+    parameters of the estimate, then the factors, which are zero.
     """
     no_force = np.zeros(len(linear_trial.trial.fine_time))
     forces_by_port = {
@@ -410,11 +395,11 @@ def _trial_with_columns(
 
 
 def _precisions_of_factors(base: Estimate, tried_effects: Sequence[TriedEffect]) -> FloatArray:
-    """Return the prior precisions (number of effects,) of the factors on effects.
+    """Return the prior precision of the factor on each effect, (number of effects,).
 
     The prior standard deviation of a factor is `FACTOR_DEVIATION` times the factor with which the
-    effect would be as large as the gap: of forces for an effect with a force, of readings for
-    another one.
+    effect would be as large as the gap: the lacking forces if the effect is a force, else the
+    residuals of the readings.
     """
     gap_of_readings = _rms([trial.trial.residual for trial in base.trials])
     gap_of_forces = _rms(

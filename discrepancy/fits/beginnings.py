@@ -31,8 +31,9 @@ def refit_from_first_readings(
 ) -> CandidateFit:
     """Repeat a fit from initial states that are fitted to the first readings.
 
-    The better of both fits is returned. The fit is not repeated if it explains the readings
-    already, or if no trial has an unknown initial state.
+    The better of both fits is returned. The second one also begins at the prior means of the shared
+    unknowns, unless these are fixed. The fit is not repeated if it explains the readings already,
+    or if no trial in motion has an unknown initial state.
 
     Parameters
     ----------
@@ -72,10 +73,10 @@ def has_unknown_initial_state(problem: Problem) -> bool:
 
 
 def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Point:
-    """Return a point whose local unknowns are fitted to the first readings of the trials.
+    """Return the point with local unknowns that were fitted to the first readings of the trials.
 
-    They are fitted once, with the model without effect, and kept in `Problem.initial_states` by the
-    name of the trial, since the initial state of a trial is nearly the same under all hypotheses.
+    They are fitted once for each trial, by the model without effect, and kept in
+    `Problem.initial_states`: the initial state of a trial is nearly the same under all hypotheses.
     """
     unknowns_by_trial = problem.initial_states
     if any(data.trial.name not in unknowns_by_trial for data in problem.trials):
@@ -89,11 +90,11 @@ def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Poi
 
 
 def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
-    """Return a point whose local unknowns are fitted to the first readings of each record.
+    """Fit the local unknowns to the first readings of each record, then to longer and longer parts.
 
     The number of readings is doubled from fit to fit, up to whole records, and each fit begins at
-    the point of the one before. The shared unknowns are fixed. If a fit fails, the point of the
-    last one that succeeded is returned.
+    the point of the one before. The shared unknowns are fixed. The point of the last fit that
+    succeeded is returned.
     """
     longest_record = max(len(data.trial.time) for data in problem.trials)
     sample_count = FIRST_SAMPLES

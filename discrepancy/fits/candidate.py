@@ -79,9 +79,9 @@ class EffectTerm:
         return self.effect.patch(setting, self.physical_values(scaled_values), self.place)
 
     def depends_on(self, setting: Setting, scaled_values: FloatArray, number: int) -> bool:
-        """Return whether the change of the model at scaled parameters (E,) depends on one of them.
+        """Return whether the change of the model depends on one of the scaled parameters (E,).
 
-        A distance from the place does not act at a set of nodes, for example.
+        At a set of nodes, for example, nothing depends on a distance from the place.
         """
         stepped = with_step(scaled_values, number)
         return self.patch(setting, stepped) != self.patch(setting, scaled_values)
@@ -126,7 +126,10 @@ class EffectTerm:
     def multiply_magnitudes_within_range(
         self, scaled_values: FloatArray, factor: float
     ) -> FloatArray:
-        """Return the same, but no magnitude beyond `largest_scaled_values`, to begin a fit with."""
+        """Return scaled parameters (E,) with multiplied magnitudes, at which a fit may begin.
+
+        They are those of `multiply_magnitudes`, but no magnitude is beyond `largest_scaled_values`.
+        """
         rescaled = scaled_values.copy()
         for number, parameter in enumerate(self.parameters):
             if parameter.magnitude:
@@ -201,7 +204,7 @@ class Candidate:
         return effects[parameter_index].acts_on
 
     def split_by_term(self, scaled_values: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
-        """Split the scaled parameters (E,) of all effects, and return each effect with its own."""
+        """Return each effect together with its own scaled parameters, given those of all (E,)."""
         if not self.terms:
             return []
         ends = np.cumsum([len(term.parameters) for term in self.terms])
@@ -239,7 +242,7 @@ class Candidate:
         return sum(self.patches(setting, scaled_values), ModelPatch())
 
     def start_values(self) -> FloatArray:
-        """Return the standard normal variables (E,) from which a fit may begin."""
+        """Return the scaled effect parameters (E,) at which a fit may begin."""
         if not self.terms:
             return np.empty(0)
         return np.concatenate([term.start_values() for term in self.terms])
@@ -281,12 +284,14 @@ thousandth."""
 
 @dataclass(frozen=True)
 class TrialDerivatives:
-    """The prediction of one trial and its derivatives, without gains and zeros of the channels.
+    """The response of the model in one trial, and its derivatives.
+
+    The response is the prediction of the readings without gains and zeros of the channels.
 
     Attributes
     ----------
     response : (N, C) array
-        The prediction at N times in C channels [unit of the channel].
+        The response at N times in C channels [unit of the channel].
     by_parameters : (P, N, C) array
         The derivatives with respect to the scaled calibrated parameters.
     by_local : (I, N, C) array
@@ -295,8 +300,8 @@ class TrialDerivatives:
     by_effect : (E, N, C) array
         The derivatives with respect to the scaled effect parameters.
     jumps : (N, C) array
-        What a jump of the prediction adds, where it jumps within a step of an unknown, such as an
-        acceleration at a reversal of dry friction; zero elsewhere.
+        The jump of the response where it jumps within a step of an unknown, as an acceleration does
+        at a reversal of dry friction; zero elsewhere.
     """
 
     response: FloatArray
@@ -340,7 +345,7 @@ class FitState:
     squares_by_channel : (channels,) array
         The sum of squared standardised residuals of each channel.
     trial_derivatives : tuple of TrialDerivatives
-        The prediction of each trial and its derivatives at the point, or near it.
+        The response of each trial at the point; its derivatives are those at the point, or near it.
     """
 
     point: Point
@@ -351,7 +356,7 @@ class FitState:
 
     @property
     def responses(self) -> tuple[FloatArray, ...]:
-        """The prediction (N, C) of each trial, without gains and zeros of the channels."""
+        """The response (N, C) of the model in each trial, without gains and zeros of channels."""
         return tuple(derivatives.response for derivatives in self.trial_derivatives)
 
 
@@ -366,9 +371,8 @@ def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> F
 class ResidualProcess:
     """The random process in the residuals of each channel besides white noise.
 
-    The residuals of a model of a real structure are never white noise alone. Hypotheses are then
-    compared under a noise that is as large as the residuals of the best of them (Kennedy and
-    O'Hagan 2001, J. R. Stat. Soc. B 63, 425-464).
+    Hypotheses that all leave more than noise are compared under a noise that is as large as the
+    residuals of the best of them (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63, 425-464).
 
     Attributes
     ----------
@@ -376,8 +380,8 @@ class ResidualProcess:
         The standard deviation of the process over that of the noise; 0 if the residuals are noise
         alone.
     noise_factor : (channels,) array
-        The factor on the recorded noise deviation with which correlated samples, taken as
-        independent, have the right weight; 1 if the residuals are white noise.
+        The factor on the recorded noise deviation with which the residuals, taken as independent
+        noise, have the right weight; 1 if they are white noise of the recorded level.
     correlation_time : (channels,) array
         The correlation time of the process [s].
     frequency : (channels,) array

@@ -52,10 +52,10 @@ class TruncatedGaussian:
         # the mode minimises (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2 within the range
         mode = lsq_linear(inverse_factor, inverse_factor @ self.mean, bounds, method="bvls").x
         normal_at_mode = inverse_factor @ (mode - self.mean)
-        # The ends of the range push the mode away from the mean: with their Lagrange multipliers l
-        # the normal variables there are L^T l, of which variable i has the part L_ii l_i from its
-        # own end. A draw within its own range has this part without a shift. The shift is the rest,
-        # which comes from the ends of the parameters that are drawn later.
+        # At the mode the normal variables are L^T l, with the Lagrange multipliers l of the ends of
+        # the range. The part L_ii l_i of variable i comes from its own end, and draws within its
+        # own range have it without a shift. The remaining part comes from the ends of parameters
+        # that are drawn later: that is the shift.
         multipliers = inverse_factor.T @ normal_at_mode
         part_of_own_end = np.diag(self.factor) * multipliers
         return np.asarray(normal_at_mode - part_of_own_end)

@@ -32,7 +32,7 @@ class NuisanceDerivatives(NamedTuple):
     by_local : (I, N, C) ndarray
         The derivatives with respect to the I unknowns of the trial that are not zeros of channels.
     jumps : (N, C) ndarray
-        What a jump within a step of an unknown adds to the response; zero where there is none.
+        The jump of the response within a step of an unknown; zero where there is none.
     """
 
     by_parameters: FloatArray
@@ -115,10 +115,9 @@ def nuisance_derivatives(
 ) -> NuisanceDerivatives:
     """Return the derivatives of a trial's response with respect to its nuisances.
 
-    They are difference quotients, except that a shift of time zero uses the time derivative of the
-    response if the model gives it. Each has two steps: one to either side, or two to the side on
-    which an unknown may move. In trials at rest the response is nearly linear, and one step is
-    enough.
+    They are difference quotients; only that by time zero is the time derivative of the response, if
+    the model gives it. In trials in motion the unknown makes two steps: one to either side, or both
+    to the side on which it may move. At rest the response is nearly linear, and one step is enough.
 
     Parameters
     ----------
@@ -208,8 +207,8 @@ def _health_derivatives(
     shape : tuple of int
         The shape (N, C) of the response.
     slope : callable
-        Returns the derivative of the response (N, C) along a change of the unknowns of the trial
-        (L,), per change that is as long as this one over `PARAMETER_STEP`.
+        Returns the change of the response (N, C) for a step of the trial's unknowns (L,), divided
+        by `PARAMETER_STEP`.
     """
     unknowns = data.unknowns
     derivatives = np.zeros((len(unknowns.health_rows), *shape))

@@ -1,4 +1,4 @@
-"""Difference quotients of a response by an unknown, exact where the response curves or jumps."""
+"""Difference quotients of a response with respect to an unknown, where it is curved or jumps."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,11 +8,11 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 
 LEAST_JUMP = 0.5
-"""Difference of the quotients of both sides, divided by the rms quotient of the channel, above
-which a reading may have jumped between them."""
+"""Difference of the quotients of both sides above which a reading may have jumped, divided by the
+rms quotient of the channel."""
 OUTSTANDING_JUMP = 4.0
-"""This difference divided by its own rms in the channel, above which a reading stands out. A kink
-of the response changes all readings instead."""
+"""Difference above which a reading stands out from the others of its channel, divided by the rms
+difference of the channel. A kink of the response changes all readings instead."""
 
 
 class DifferenceQuotient(NamedTuple):
@@ -23,7 +23,7 @@ class DifferenceQuotient(NamedTuple):
     slope : (N, C) ndarray
         The derivative on the branch on which the response is now.
     jumps : (N, C) ndarray
-        What a jump within one step adds to the response; zero where the response does not jump.
+        The jump of the response within one step; zero where it does not jump.
     """
 
     slope: FloatArray
@@ -33,16 +33,15 @@ class DifferenceQuotient(NamedTuple):
 def two_sided_quotient(
     below: FloatArray, response: FloatArray, above: FloatArray, step: float
 ) -> DifferenceQuotient:
-    """Return the derivative of a response by an unknown, from one step to either side.
+    """Return the derivative of a response with respect to an unknown, from a step to either side.
 
-    The response to a change of frequency curves within a small part of the prior of a stiffness or
-    a mass. The error of a one-sided quotient is half of this curvature times the step, and it would
-    count as information: on a mass, for example, where only its ratio to the stiffness can be
-    known. The central quotient has no such error.
+    It is the central quotient. A one-sided quotient has an error of half the curvature times the
+    step, which would count as information: for example on a mass, where the readings determine only
+    its ratio to the stiffness.
 
-    Some readings jump, such as an acceleration at a reversal of dry friction. If a jump passes a
-    sample within a step, the quotient of this side is the jump over the step: far too large, and
-    the larger the smaller the step is. The derivative is then that of the other side.
+    Some readings jump, such as an acceleration at a reversal of dry friction. If the jump passes a
+    sample within a step, the quotient of that side is the jump over the step, which is far too
+    large. The derivative is then the quotient of the other side.
 
     Parameters
     ----------
@@ -68,12 +67,12 @@ def two_sided_quotient(
 
 
 def largest_jumps(jumps_by_unknown: Sequence[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    """Return the largest jump (N, C) of each reading, of those by all unknowns.
+    """Return for each reading the largest of its jumps within the steps of all unknowns.
 
     Parameters
     ----------
     jumps_by_unknown : sequence of (N, C) array
-        The jumps within a step of each unknown; there may be none.
+        The jumps within a step of each unknown; may be empty.
     shape : tuple of int
         The shape (N, C) of the response.
     """
@@ -86,9 +85,9 @@ def largest_jumps(jumps_by_unknown: Sequence[FloatArray], shape: tuple[int, ...]
 def one_sided_quotient(
     response: FloatArray, stepped: FloatArray, stepped_twice: FloatArray, step: float
 ) -> FloatArray:
-    """Return the derivative of a response by an unknown that may move to one side only.
+    """Return the derivative with respect to an unknown that may move to one side only.
 
-    The parabola through three responses is exact where the response has a constant curvature.
+    It is that of the parabola through three responses.
 
     Parameters
     ----------

@@ -249,7 +249,7 @@ def objective(
     point : Point
         The values of all unknowns.
     jumps : sequence of (N, C) array, optional
-        What the response of each trial jumps by for small changes of the unknowns, see
+        The jumps of the response of each trial for small changes of the unknowns, see
         `Problem.standardised_residual`.
 
     Raises
@@ -275,13 +275,13 @@ class _Misfit(NamedTuple):
         The negative log posterior; infinite if the model gives values that are not finite [nat].
     residuals : tuple of (N, C) array
         The standardised residuals of each trial.
-    sums : (channels,) array
+    squares_by_channel : (channels,) array
         The sum of squared standardised residuals of each channel.
     """
 
     objective: float
     residuals: tuple[FloatArray, ...]
-    sums: FloatArray
+    squares_by_channel: FloatArray
 
 
 def _misfit_at(
@@ -292,16 +292,7 @@ def _misfit_at(
 ) -> _Misfit:
     """Return the negative log posterior and the residuals at a point.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    point : Point
-        The values of all unknowns.
-    responses : sequence of (N, C) array
-        The response of the model in each trial at the point.
-    jumps : sequence of (N, C) array or None
-        What jumps near the point add to these responses.
+    `responses` and their `jumps` are (N, C) for each trial, see `Problem.standardised_residual`.
     """
     jumps_of_trials = [None] * len(responses) if jumps is None else jumps
     residuals = tuple(
@@ -310,15 +301,15 @@ def _misfit_at(
             zip(responses, jumps_of_trials, strict=True)
         )
     )
-    sums = problem.squares_by_channel(residuals)
+    squares_by_channel = problem.squares_by_channel(residuals)
     minus_log_prior = 0.5 * float(problem.shared.precision @ point.shared**2)
     minus_log_prior += 0.5 * float(point.effect @ point.effect)
     for data, scaled_values in zip(problem.trials, point.local, strict=True):
         minus_log_prior += 0.5 * float(data.unknowns.precision @ scaled_values**2)
-    negative_log_posterior = problem.misfit(sums) + minus_log_prior
+    negative_log_posterior = problem.misfit(squares_by_channel) + minus_log_prior
     if not np.isfinite(negative_log_posterior):
         negative_log_posterior = np.inf
-    return _Misfit(negative_log_posterior, residuals, sums)
+    return _Misfit(negative_log_posterior, residuals, squares_by_channel)
 
 
 @dataclass
@@ -379,7 +370,7 @@ class _Descent:
             point=point,
             objective=misfit.objective,
             residuals=misfit.residuals,
-            squares_by_channel=misfit.sums,
+            squares_by_channel=misfit.squares_by_channel,
             trial_derivatives=all_derivatives,
         )
 
@@ -402,8 +393,8 @@ class _Descent:
         step : Point
             The change of each unknown.
         predicted_decrease : float
-            The decrease of the objective that its quadratic model predicts for an undamped step,
-            g^T s / 2, with the negative gradient g and the step s [nat].
+            The predicted decrease of the objective, g^T s / 2, with the negative gradient g and
+            the step s [nat]. It is that of the quadratic model if the step is not damped.
         """
         problem = self.problem
         first_effect = problem.shared.unknown_count
@@ -456,9 +447,10 @@ class _Descent:
         )
 
     def descend(self, state: FitState, step: Point) -> FitState | None:
-        """Return the state after a step or a fraction of it, with old derivatives by nuisances.
+        """Return the state after the largest fraction of a step that lowers the objective.
 
-        None if no fraction in `STEP_FRACTIONS` lowers the objective.
+        The fractions are `STEP_FRACTIONS`; None if all of them fail. The derivatives with respect
+        to nuisances remain those before the step.
         """
         jumps = [derivatives.jumps for derivatives in state.trial_derivatives]
         for fraction in STEP_FRACTIONS:
@@ -477,8 +469,8 @@ def _with_evidence(
     """Return the fit at a state, with its Laplace evidence, covariance and degrees of freedom.
 
     The log evidence is -objective - ln(det H) / 2 with the Hessian H = U^T U, up to a constant:
-    ln(det H) / 2 is the sum of the logarithms of the diagonal of U. The integral is limited to
-    possible stiffness losses by their probability under the Gaussian density.
+    ln(det H) / 2 is the sum of the logarithms of the diagonal of U. The log probability that all
+    stiffness losses are possible is added, so that the evidence does not count impossible ones.
     """
     precision = problem.noise_precisions(state.squares_by_channel)
     equations = normal_equations(problem, state, candidate, precision)

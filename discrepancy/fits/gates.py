@@ -87,8 +87,9 @@ def _lacking_for_variance(problem: Problem) -> str:
 def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     """Return the p-values of all tests of absolute fit: variances, priors and whiteness.
 
-    The residual variance of each channel is compared with its noise record by an F test, and that
-    of all channels together by one more test.
+    The residual variance of each channel is compared with its noise record by an F test, and those
+    of all channels together by one more test. A channel without a noise record, or with less than
+    one degree of freedom left, is not tested.
 
     Parameters
     ----------
@@ -139,12 +140,13 @@ def _recorded_colour_factor(problem: Problem, fit: CandidateFit) -> FloatArray:
 
 
 def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return χ² tests of whether the unknowns of a fit are consistent with their priors.
+    """Return the tests of whether the unknowns of a fit are consistent with their priors.
 
     A wrong model can fit the readings if calibrated parameters move far from their priors. A wrong
     law can fit them with extreme parameters, which make it another law: a joint that slips at zero
-    force is a soft joint. The magnitude of an effect is not tested, as it may have any value. The
-    tests are conservative, since estimates scatter less than the prior.
+    force is a soft joint. These are χ² tests, and conservative, since estimates scatter less than
+    the prior. A calibrated parameter at the end of its range fails in any case. Magnitudes, free
+    shapes and parameters with a uniform prior are not tested, as they may have any value.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     layout = problem.shared
@@ -157,7 +159,8 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
             chi2.sf(parameter_deviations @ parameter_deviations, parameter_deviations.size)
         )
         tests.append(NamedTest("calibrated parameters outside their priors", p_value))
-        # at the end of its range a parameter would go on, and the evidence is that of a slope
+        # beyond the end of its range a parameter would fit better: the point is no maximum, and
+        # Laplace's approximation of the evidence is wrong
         low, high = layout.bounds
         is_at_end = (fit.point.shared <= low) | (fit.point.shared >= high)
         if is_at_end[: layout.parameter_count].any():
@@ -178,11 +181,11 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
 
 
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return for each channel the test whether its residuals are uncorrelated in time (Ljung-Box).
+    """Return for each channel the test of whether its residuals are white (Ljung-Box).
 
     The records of a channel in all trials in motion are tested together. A channel is left out if
-    its noise record is correlated in time, or if its residuals are fitted by a process that has the
-    correlation of the noise record.
+    its noise record is not white, or if the process in its residuals has the correlation of the
+    noise record.
     """
     tests = []
     # the factor differs from 1 if the residuals are fitted with the correlation of the noise record
@@ -210,8 +213,8 @@ class ResidualRecord(NamedTuple):
     is_used : (N,) array of bool
         Whether a sample is compared with the model.
     steps : (N - 1,) or (1,) array
-        The time steps between the samples [s]; only their median, (1,), if the noise is white after
-        standardising, as the single steps do not matter then.
+        The time steps between the samples [s]; only their median, (1,), if the standardised noise
+        is white.
     """
 
     values: FloatArray
@@ -263,14 +266,10 @@ def whiteness_p_value(records: Sequence[ResidualRecord]) -> float:
 
 
 def check_shape(canonical_fit: CandidateFit, free_fit: CandidateFit | None) -> Gate:
-    """Test whether a fit with a free shape parameter explains more than the fit without one.
+    """Test whether an effect explains as much as the same effect with a free shape.
 
-    Parameters
-    ----------
-    canonical_fit : CandidateFit
-        The fit with the canonical shape.
-    free_fit : CandidateFit or None
-        The fit with the free shape; None if the effect has no shape parameters.
+    The test passes if the free shape gains at most `LEAST_SHAPE_GAIN`, or if there is no fit with a
+    free shape (None).
     """
     if free_fit is None:
         reason = "The effect has no shape that could be free."
@@ -287,9 +286,9 @@ def check_shape(canonical_fit: CandidateFit, free_fit: CandidateFit | None) -> G
 def time_step_error(problem: Problem, fit: CandidateFit) -> float:
     """Return the error of the time integration in a fit, in standard deviations of the noise.
 
-    Every dynamic trial, which is one recorded experiment with motion, is simulated again with time
-    steps of half the length. The rms change of each channel is divided by the standard deviation of
-    its noise. The largest of these ratios is returned; it is 0 if no trial is dynamic.
+    Every trial in motion is simulated again with time steps of half the length. The rms change of
+    each channel is divided by the standard deviation of its noise. The largest of these ratios is
+    returned; it is 0 without trials in motion.
 
     Parameters
     ----------

@@ -45,9 +45,9 @@ def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = T
 
     Notes
     -----
-    A fit may have a residual process, which describes by how much the model is wrong. The
-    uncertainty of the shared unknowns is part of it then, so that only the trials' own unknowns
-    enter the leverage: a χ² against the noise shall show how wrong the model is.
+    A fit may have a residual process, which describes by how much the model is wrong. It then also
+    stands for the uncertainty of the shared unknowns, so only the trials' own unknowns enter the
+    leverage: a χ² test against the noise is to show how wrong the model is.
 
     The noise of a channel without a record is estimated from the residuals of the fitted trials.
     """
@@ -95,15 +95,15 @@ def fit_held_out(
 
 
 RELEASE_AMPLITUDES = tuple(np.linspace(-2.0, 2.0, 17).tolist())
-"""Amplitudes of a release from which the fit of a held-out trial may begin, about the nominal one:
-in prior deviations, of a free initial state in tenths of the nominal one."""
+"""Amplitudes of a release from which the fit of a held-out trial may begin, relative to the nominal
+one: in prior deviations, or for a free initial state in tenths of the nominal amplitude."""
 
 
 def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start: Point) -> Point:
-    """Return the start with the release amplitude of each trial that gives the least objective.
+    """Return the start with the best release amplitude of each trial, from a grid.
 
-    If friction ends a motion, there is one optimum for each number of half swings, and a descent
-    finds only the nearest. So a grid of amplitudes, `RELEASE_AMPLITUDES`, is tried.
+    The best amplitude has the least objective. If friction ends a motion, there is one optimum for
+    each number of half swings, and a descent finds only the nearest one.
     """
     best_local = list(start.local)
     for trial_index, data in enumerate(held_out.trials):
@@ -165,12 +165,11 @@ class _TrialPredictions:
     Parameters
     ----------
     problem : Problem
-        The trials and the model.
+        The trials that are predicted, and the model.
     fit : CandidateFit
-        The fit to the fitted trials; its covariance is that of the shared unknowns.
+        The fit to the fitted trials, with the covariance of shared unknowns and effects.
     local_fit : CandidateFit, optional
-        The fit of held-out trials, which gives their own unknowns. Without it the trials are those
-        of `fit`.
+        If the trials are held out, the fit of their own unknowns.
     precision : (channels,) array
         The noise precision of each channel in the fitted trials, relative to the recorded one.
     """
@@ -252,7 +251,8 @@ class _TrialPredictions:
         """
         shape = self.local_fit.residuals[trial_index].shape
         process = self.fitted.residual_process
-        shared_weight = float(process is None)  # 0: the residual process stands for shared unknowns
+        # a residual process stands for the uncertainty of shared unknowns, too
+        shared_weight = 1.0 if process is None else 0.0
         local_variance = factors.local_variance()
         shared_variance = factors.shared_variance()
         if self.is_held_out:
@@ -379,9 +379,9 @@ def importance_draws(
 
     In each round points are drawn from a Cauchy density, whose heavy tails cover those of the
     target. Its location and scale are the weighted mean and covariance of all earlier points. Each
-    point is weighted by the mixture of the proposals of all rounds (Cornuet, Marin, Mira and Robert
-    2012, Scand. J. Statist. 39, 798-812). If the density is a bent ridge that is a hundred times
-    longer than wide, the draws cover only a part of it.
+    point is weighted by the target over the mixture of the proposals of all rounds (Cornuet, Marin,
+    Mira and Robert 2012, Scand. J. Statist. 39, 798-812). If the density is a bent ridge that is a
+    hundred times longer than wide, the draws cover only a part of it.
 
     Parameters
     ----------

@@ -45,7 +45,8 @@ LARGEST_CACHE = 24e6
 FEWEST_CACHED_RESPONSES = 40
 """Number of responses that are kept in any case: those of the derivatives of one fit."""
 LEAST_VARIANCE = 1e-12
-"""Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
+"""Least variance of an unrecorded noise over that of its stand-in: rounding to a billionth of the
+range."""
 
 
 def channel_misfits(
@@ -143,7 +144,7 @@ class Problem:
         self.shared = shared_unknowns(campaign, model, campaign.fitted, self._gain_estimates())
 
     def _prepare_trials(self, trials: Sequence[Trial]) -> None:
-        """Set the trials that are compared, the number of their samples, and an empty cache."""
+        """Set the trials that are compared, count their samples, and empty the cache."""
         self.trials = tuple(
             TrialData.prepare(self.campaign, trial, self.noise_models, self.model)
             for trial in trials
@@ -171,11 +172,11 @@ class Problem:
             self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
     def _gain_estimates(self) -> dict[str, float]:
-        """Return first estimates of unknown gains: the ratio of readings to the model's response.
+        """Return first estimates of unknown gains, by channel.
 
-        It is the ratio of their largest amplitudes in the first trial in which the channel moves in
-        the model. It is negative if readings and response have opposite signs, except after a
-        release.
+        A gain is the ratio of the largest amplitudes of readings (about their median) and response,
+        in the first trial in which the channel moves in the model. It is negative if readings and
+        response have opposite signs, except after a release.
         """
         estimates: dict[str, float] = {}
         point = self.prior_mean_point(Candidate())
@@ -313,9 +314,10 @@ class Problem:
         response : (N, C) array
             The response of the model in the trial at the point.
         jumps : (N, C) array, optional
-            What jumps near the point add to the response, or have just added to it. A reading is
-            then compared with the nearest branch: at which side of a reversal it was taken can
-            depend on microseconds, which neither the clock nor the time steps give.
+            The jumps of the response near the point. A reading is then compared with the nearest of
+            three branches: the response, and the response plus and minus the jump. On which side of
+            a reversal a reading was taken can depend on microseconds, which neither the clock nor
+            the time steps resolve.
         """
         data = self.trials[trial_index]
 
@@ -359,14 +361,14 @@ class Problem:
         effect_steps : (E,) array, optional
             The posterior standard deviations of the effect parameters, used as steps of their
             finite differences, at least `LEAST_EFFECT_STEP` and at most `PARAMETER_STEP`. Such a
-            step averages over the kinks of friction and hysteresis, and stays where the parameters
-            may lie.
+            step averages over the kinks of friction and hysteresis. If left out, all steps are
+            `PARAMETER_STEP`.
 
         Notes
         -----
-        Differences by effect parameters are two-sided. The part of such a derivative that nuisances
-        cannot compensate is small: a ten-thousandth if the effect moves frequencies. The error of a
-        one-sided difference by curvature is larger, and would count as information.
+        Differences by effect parameters are two-sided. Nuisances can compensate nearly all of such
+        a derivative: if the effect moves frequencies, a ten-thousandth remains. A one-sided
+        difference has a larger error from the curvature, which would count as information.
         """
         kind = self.trials[trial_index].trial.kind
         response = self.response_of_candidate(trial_index, point, candidate)
@@ -491,16 +493,9 @@ class Problem:
         return problem
 
     def with_second_sensor(self, channel_name: str, second_name: str) -> "Problem":
-        """Return a problem in which a further channel measures what a channel measures.
+        """Return a problem with a second sensor beside that of a channel, under a name of its own.
 
-        The further channel has the same noise, and no gain error. The trials do not have it.
-
-        Parameters
-        ----------
-        channel_name : str
-            The name of the channel.
-        second_name : str
-            The name of the further channel.
+        It has the same noise, and no gain error. The trials of the problem do not have it.
         """
         channel = self.campaign.channels[channel_name]
         second_channel = replace(channel, name=second_name, gain_deviation=0.0)
@@ -517,13 +512,7 @@ class Problem:
         return problem
 
     def with_first_samples(self, count: int) -> "Problem":
-        """Return the problem in which only the first samples of each trial in motion are compared.
-
-        Parameters
-        ----------
-        count : int
-            The number of samples.
-        """
+        """Return the problem in which only `count` samples of each trial in motion are compared."""
         shortened_problem = copy(self)
         shorter_trials = []
         for data in self.trials:

@@ -44,8 +44,9 @@ class ScreenedChange:
     effect_values : (E,) array
         The scaled parameters of the effect.
     vector : (D,) array
-        The change d of all readings, then its projections H^(-1/2) J d on the nuisances, such that
-        G(c, d) = sum(sign * c.vector * d.vector) with `Screen.inner_product_signs`.
+        The change d of all readings, then its projections U^-T J d on the nuisances, with
+        H = U^T U, such that G(c, d) = sum(signs * c.vector * d.vector) with
+        `Screen.inner_product_signs`.
     overlap : float
         b(d): the overlap of the change with the residuals [nat].
     squared_size : float
@@ -161,16 +162,9 @@ class Screen:
     def _project_change(
         self, candidate: Candidate, effect: FloatArray, kinds: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
-        """Return vector, overlap b and squared size G of the change to another candidate.
+        """Return what `project` returns for the change from the fit to another candidate.
 
-        Parameters
-        ----------
-        candidate : Candidate
-            The effects after the change.
-        effect : (E,) array
-            The E parameters of the effects, on the scale on which their priors are standard normal.
-        kinds : frozenset of TrialKind
-            The kinds of trials whose prediction changes.
+        `effect` (E,) are the scaled parameters of the candidate. Only trials of `kinds` change.
         """
         problem = self.problem
         point = self.fit.point
@@ -226,9 +220,9 @@ class Screen:
     def shrink_change(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
         """Return the change at a magnitude so small that the readings respond linearly to it.
 
-        This matters because an effect that moves a frequency may shift phases by many radians at
-        the median of its prior. Such a change of the readings points in another direction than that
-        of a small effect, so a scale or an overlap computed from it would be wrong for a small one.
+        An effect that moves a frequency may shift phases by many radians at the median of its
+        prior. Such a change of the readings points in another direction than that of a small
+        effect, so its scale and overlap would be wrong for a small one.
 
         Returns
         -------
@@ -283,9 +277,9 @@ class Screen:
     def _spectral_peaks(self, term: EffectTerm) -> tuple[float, ...]:
         """Return the peak frequencies of the residuals in the channel of an effect.
 
-        They are relative to the first natural frequency of the structure, and empty if the effect
-        has no parameter that is a frequency. The spectra of records of the same length and sampling
-        interval are added first.
+        They are relative to the first natural frequency of the structure. There are none if the
+        effect has no parameter that is a frequency. Before peaks are looked for, the spectra of
+        records with the same length and sampling interval are added.
         """
         if not term.effect.spectral:
             return ()
@@ -309,10 +303,10 @@ class Screen:
 
 
 def _largest_peaks(power: FloatArray) -> list[int]:
-    """Return the indices of the largest separate peaks of a power spectrum.
+    """Return the indices of the largest separate peaks of a power spectrum, the largest first.
 
     With zero padding one spectral line has several local maxima, so peaks must be more than two
-    lines of the unpadded spectrum apart.
+    lines of the unpadded spectrum apart. At most `SEARCH.most_peaks` are returned.
     """
     is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
     peaks = np.flatnonzero(is_peak) + 1
@@ -335,8 +329,9 @@ def parameter_grid(
 ) -> Iterator[FloatArray]:
     """Yield the points of a grid of an effect's scaled parameters (E,), for a screen.
 
-    The first magnitude needs few values, since to first order the change is proportional to it. A
-    parameter that is a frequency is tried at the given peaks.
+    The values of magnitudes are those of `_magnitude_levels`. A parameter that is a frequency is
+    tried at the given peaks, one with a number of levels in the catalogue at as many quantiles of
+    its prior, a free shape at its canonical value, and any other at `SEARCH.grid_levels`.
 
     Parameters
     ----------
@@ -408,9 +403,6 @@ def _magnitude_levels(
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:
-    """Return the scaled values at which a parameter with `levels` is tried, as many as it says.
-
-    They are the medians of intervals of equal prior probability.
-    """
+    """Return the medians of `parameter.levels` intervals of equal prior probability, scaled."""
     count = parameter.levels
     return tuple(float(ndtri((k + 0.5) / count)) for k in range(count))

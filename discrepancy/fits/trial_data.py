@@ -302,7 +302,8 @@ def shared_unknowns(
 def _is_scale_of_releases(campaign: Campaign, name: str, trials: tuple[Trial, ...]) -> bool:
     """Return whether nothing but the unknown amplitudes of releases sets the scale of a signal.
 
-    A recorded load sets the scale of the readings, and so does a channel of known gain beside it.
+    It is so if the channel is a signal, all its trials are releases, and no channel of these trials
+    has a known gain.
     """
     if campaign.channels[name].quantity is not Quantity.SIGNAL:
         return False
@@ -330,7 +331,7 @@ def local_unknowns(
     deviation : (C,) array
         The noise deviation of each channel, which scales a zero with a flat prior.
     model : Model
-        The model, which gives the sizes of an unknown initial state.
+        The model, which gives the magnitudes of an unknown initial state.
     """
     # zeros
     zero_deviations = np.array(
@@ -352,9 +353,9 @@ def local_unknowns(
         if release.time_zero_deviation > 0.0:
             time_zero_scale = np.full(1, release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
-        sizes = model.initial_state_magnitudes(campaign, trial)
-        initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
-        initial_scale = FREE_STATE_DEVIATION * np.pad(sizes, (0, len(sizes) % 2))
+        magnitudes = model.initial_state_magnitudes(campaign, trial)
+        initial_shape = (-(-len(magnitudes) // 2), 2)  # rounded up
+        initial_scale = FREE_STATE_DEVIATION * np.pad(magnitudes, (0, len(magnitudes) % 2))
     # constants of inputs
     offset_deviations = np.array(
         [recorded_input.offset_deviation for recorded_input in trial.inputs]

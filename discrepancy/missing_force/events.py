@@ -1,9 +1,10 @@
-"""Events: the stretches of a record in which a force acts that does not act in the others.
+"""Events: the stretches of a record in which a force acts that does not act elsewhere.
 
-Besides a small force that may be missing throughout, a second and larger one is on or off. Whether
-it is on in a stretch is decided by the evidence, with all unknowns of the records integrated out.
-Stretches are turned on or off one after the other, as long as that raises the log evidence by more
-than the price of the changes. A path (N,) says for each sample whether the force is on.
+Two forces may be missing: a small one throughout, and a larger one, the force of events, that is on
+or off. A path (N,) says for each sample whether the force of events is on, and a stretch is a run
+of samples between two of its changes. Stretches are turned on or off one after the other, as long
+as that raises the log evidence, with all unknowns of the records integrated out, by more than the
+price of the changes.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from discrepancy.estimation.estimate import LEAST_EVIDENCE
 from discrepancy.estimation.force_states import Process
 from discrepancy.estimation.linearisation import Linearisation
 from discrepancy.estimation.process_search import (
-    PRIOR_LOG_DEVIATION_OF_SIZE,
+    PRIOR_LOG_DEVIATION_OF_AMPLITUDE,
     PRIOR_LOG_DEVIATION_OF_TIME,
 )
 
@@ -32,16 +33,16 @@ from .switched_record import (
 )
 
 CHANGE_GRID_SIZE = 4000
-"""Least number of points of a record at which a change is looked for, when its time is determined.
-In a shorter record some of them lie between samples."""
+"""Number of points of a record at which a change is looked for when its time is determined. The
+intervals of a record with at most half as many samples are divided to reach about this number."""
 MOST_SAMPLES = 4000
 """Largest number of samples of all records together in which events are looked for. Of longer
 records only every k-th sample is used, except in the last step."""
 MOST_EVENTS = 6
 """Largest number of stretches of a record; more of them are a force that varies, not events."""
 INITIAL_EVENT_DEVIATION, INITIAL_STEADY_DEVIATION = 3.0, 0.003
-"""Initial standard deviations of the force of events and of the force throughout, over that of the
-given process."""
+"""Standard deviations with which the search for events begins, of the force of events and of the
+force throughout, over that of the given process."""
 NEGLIGIBLE_DEVIATION = 1e-3
 """Standard deviation that stands for no force, over that of the given process."""
 FIRST_EVALUATIONS, LATER_EVALUATIONS = 30, 60
@@ -51,13 +52,18 @@ MOST_ROUNDS = 5
 LEAST_GAIN = 0.5
 """Least gain of log evidence in a round after which another one follows [nat]."""
 SIMPLEX_STEPS = np.array([0.9, 0.7, 0.9, 0.7])
-"""Initial steps of the simplex search in the logarithms of the forces: size and time of the event,
-size and time of the force throughout."""
+"""First steps of the simplex search in four logarithms: amplitude and correlation time of the force
+of events, then of the force throughout."""
 PRIOR_DEVIATIONS = np.array(
-    [PRIOR_LOG_DEVIATION_OF_SIZE, 3.0, PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME]
+    [
+        PRIOR_LOG_DEVIATION_OF_AMPLITUDE,
+        3.0,
+        PRIOR_LOG_DEVIATION_OF_AMPLITUDE,
+        PRIOR_LOG_DEVIATION_OF_TIME,
+    ]
 )
-"""Prior standard deviations of these logarithms. That of the event's time is wide, as an event may
-be a force that stays constant."""
+"""Prior standard deviations of these logarithms. That of the first correlation time is wide, as the
+force of events may stay constant."""
 LARGEST_LOGARITHM = 14.0
 """Bound of these logarithms, which are relative to the given process."""
 
@@ -72,7 +78,8 @@ class EventSearch(EventTrials):
     port : int
         The number of the port.
     process : Process
-        A force that acts throughout; its size and time are the prior medians of both forces.
+        A force that acts throughout. Its amplitude (standard deviation) and correlation time are
+        the prior medians of both forces.
     stride : int
         The step between samples that are used; 1 uses all.
     """
@@ -85,7 +92,7 @@ class EventSearch(EventTrials):
 
     @property
     def paths_without_force(self) -> list[BoolArray]:
-        """The path (N,) of each trial, without the force of events at any sample."""
+        """For each trial the path (N,) on which the force of events is never on."""
         return [np.zeros(len(trial.time), dtype=bool) for trial in self.trials]
 
     def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
@@ -129,14 +136,14 @@ class EventSearch(EventTrials):
             logs = np.clip(
                 initial_logarithms + moves * SIMPLEX_STEPS, -LARGEST_LOGARITHM, LARGEST_LOGARITHM
             )
-            event_size, event_time, steady_size, steady_time = (
+            event_amplitude, event_time, steady_amplitude, steady_time = (
                 np.exp(logs) * prior_medians
             ).tolist()
             event = replace(
-                self.process, standard_deviation=event_size, correlation_time=event_time
+                self.process, standard_deviation=event_amplitude, correlation_time=event_time
             )
             return event, replace(
-                self.process, standard_deviation=steady_size, correlation_time=steady_time
+                self.process, standard_deviation=steady_amplitude, correlation_time=steady_time
             )
 
         def objective(moves: FloatArray) -> float:
@@ -145,24 +152,17 @@ class EventSearch(EventTrials):
             )
             return minus_log_prior - float(self.log_evidence(self.products(forces(moves), paths)))
 
-        # Nelder-Mead search over four moves, one unit of which is the initial step of a logarithm
+        # Nelder-Mead search; a move of one is the first step of a logarithm
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": evaluations, "initial_simplex": simplex}
         fit = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
         return forces(fit.x), -float(fit.fun) - price_of_changes(paths)
 
     def improve_paths(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[BoolArray]:
-        """Return more probable paths, by inverting one stretch of a path after the other.
+        """Return more probable paths, by inverting one stretch after the other.
 
-        A path tells at which samples of a trial the force of events is on; a stretch is a run of
-        samples between two of its changes.
-
-        Parameters
-        ----------
-        forces : (Process, Process)
-            The force of events, and the force throughout.
-        paths : sequence of (N,) array of bool
-            The path of each trial to begin with.
+        `paths` are those to begin with, one (N,) for each trial. The trials are treated in turn,
+        each given the new paths of those before it.
         """
         new_paths = list(paths)
         products = self.products(forces, paths)
@@ -175,21 +175,15 @@ class EventSearch(EventTrials):
 
 
 def _improved_path(record: SwitchedRecord, path: BoolArray) -> BoolArray:
-    """Return a path that neither moving its changes nor inverting a stretch makes more probable.
+    """Return a path (N,) improved in turn by moving its changes and by inverting a stretch.
 
-    The number of inversions is limited, as each one may be undone later.
-
-    Parameters
-    ----------
-    record : SwitchedRecord
-        A trial with its filters.
-    path : (N,) array of bool
-        The path to begin with.
+    It ends when no inversion makes it more probable. The number of inversions is limited, as one
+    may undo another.
     """
     path = record.place_changes(path)
     for _ in range(2 * MOST_EVENTS - 1):
         path_with_inverted_stretch = record.invert_best_stretch(path)
-        if path_with_inverted_stretch is None:  # no inversion makes the path more probable
+        if path_with_inverted_stretch is None:
             break
         path = record.place_changes(path_with_inverted_stretch)
     return path
@@ -208,7 +202,8 @@ class Events:
     paths : sequence of (N,) ndarray of bool
         Whether the force of events is on at each sample, for each trial.
     score : float
-        The log evidence with the priors of the forces, minus the price of all changes [nat].
+        The log evidence minus the price of all changes [nat]. It includes the log prior of the
+        forces unless the records had to be thinned.
     """
 
     search: EventSearch
@@ -217,23 +212,18 @@ class Events:
     score: float
 
     def switched_record(self, trial_index: int, substeps: int) -> SwitchedRecord:
-        """Return a trial with its filters, in which changes may lie between samples.
+        """Return a trial with its filters, given the events of the other trials.
 
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        substeps : int
-            The number of steps into which an interval between samples is divided.
+        Each interval between samples is divided into `substeps`, at whose ends a change may lie.
         """
         products = self.search.products(self.forces, self.paths)
         products_of_others = products[:trial_index] + products[trial_index + 1 :]
         return SwitchedRecord(self.search, trial_index, self.forces, products_of_others, substeps)
 
     def change_times(self, trial_index: int) -> FloatArray:
-        """Return the times (C, 3) of the C changes in a trial: median and 90 % interval [s].
+        """Return the times (C, 3) at which the force of events begins or ends in a trial [s].
 
-        A change is the moment at which the force of events begins or ends.
+        Each row has the median and the ends of the 90 % interval.
         """
         is_on = self.paths[trial_index]
         time = self.search.trials[trial_index].time
@@ -259,7 +249,7 @@ class Events:
 def find_events(
     linearisation: Linearisation, port: int, process: Process, least_score: float = -np.inf
 ) -> Events:
-    """Return the most probable events at a port, or a force throughout if that is more probable.
+    """Return the most probable events at a port, or a steady force if that is more probable.
 
     Parameters
     ----------
@@ -275,8 +265,8 @@ def find_events(
     Returns
     -------
     Events
-        The events with changes if these are more probable than `least_score` and than a force that
-        acts throughout the records that have one; otherwise such a force.
+        The events, if they have changes and a higher score than `least_score` and than the steady
+        force of `force_in_records`; otherwise this force.
     """
     search = _search_in_thinned_records(linearisation, port, process)
     steady = _steady_force_where_needed(search)
@@ -304,7 +294,7 @@ def find_events(
 
 
 def force_in_records(linearisation: Linearisation, port: int, process: Process) -> Events:
-    """Return a force that acts throughout the records that have one.
+    """Return a steady force: it acts throughout each record whose evidence is larger with it.
 
     Parameters
     ----------
@@ -313,7 +303,7 @@ def force_in_records(linearisation: Linearisation, port: int, process: Process) 
     port : int
         The number of the port.
     process : Process
-        A force that acts throughout.
+        The force with which the search for the most probable one begins.
     """
     search = _search_in_thinned_records(linearisation, port, process)
     return _refine_to_all_samples(_steady_force_where_needed(search))
@@ -322,19 +312,19 @@ def force_in_records(linearisation: Linearisation, port: int, process: Process) 
 def _search_in_thinned_records(
     linearisation: Linearisation, port: int, process: Process
 ) -> EventSearch:
-    """Return the search in every k-th sample, so that there are `MOST_SAMPLES` at most."""
+    """Return the search in every k-th sample, such that about `MOST_SAMPLES` are used at most."""
     sample_count = sum(len(trial.trial.time) for trial in linearisation.trials)
     return EventSearch(linearisation, port, process, stride=ceil(sample_count / MOST_SAMPLES))
 
 
 def events_throughout(linearisation: Linearisation, port: int, process: Process) -> Events:
-    """Return a force that acts in all records from the first sample to the last, as events."""
+    """Return events that are on in all records from the first sample to the last."""
     always = [np.ones(len(trial.trial.time), dtype=bool) for trial in linearisation.trials]
     return Events(EventSearch(linearisation, port, process), (process, process), always, -np.inf)
 
 
 def _refine_to_all_samples(coarse_events: Events) -> Events:
-    """Return events that were found in every k-th sample, with changes among all samples."""
+    """Return events of thinned records in all samples, with their changes placed again."""
     stride = coarse_events.search.stride
     if stride == 1:
         return coarse_events
@@ -346,8 +336,8 @@ def _refine_to_all_samples(coarse_events: Events) -> Events:
         for is_on, trial in zip(coarse_events.paths, search.trials, strict=True)
     ]
     events_in_all_samples = Events(search, coarse_events.forces, paths, -np.inf)
-    # `events_in_all_samples` refers to `paths`, which is changed here: the changes of each trial
-    # are placed given the refined paths of the trials before it
+    # the events refer to this list of paths: the changes of each trial are placed given the refined
+    # paths of the trials before it
     for trial_index in range(len(paths)):
         record = events_in_all_samples.switched_record(trial_index, 1)
         paths[trial_index] = record.place_changes(paths[trial_index])
@@ -356,11 +346,15 @@ def _refine_to_all_samples(coarse_events: Events) -> Events:
 
 
 def _steady_force_where_needed(search: EventSearch) -> Events:
-    """Return a force that acts throughout those records whose evidence is larger with it."""
+    """Return a force that acts throughout those records whose evidence is larger with it.
+
+    It must be larger by `LEAST_EVIDENCE`, and records are tested one after the other. The force is
+    fitted to all records; its score is that before records are left out.
+    """
     negligible_force = replace(
         search.process, standard_deviation=NEGLIGIBLE_DEVIATION * search.process.standard_deviation
     )
-    # the force of events, which is on in whole records, stands for the steady force
+    # here the steady force is a force of events that is on in whole records
     paths = [~off for off in search.paths_without_force]
     (steady_force, _), score = search.fit_forces(
         (search.process, negligible_force), paths, FIRST_EVALUATIONS
@@ -378,18 +372,9 @@ def _steady_force_where_needed(search: EventSearch) -> Events:
 def _search_round(
     search: EventSearch, forces: ForcePair, paths: Sequence[BoolArray], evaluations: int
 ) -> Events:
-    """Return the events after one round: first new stretches of time, then forces fitted to them.
+    """Return the events after one round: first the paths are improved, then the forces are fitted.
 
-    Parameters
-    ----------
-    search : EventSearch
-        The search for events, with its trials.
-    forces : (Process, Process)
-        The force of events, and the force throughout.
-    paths : sequence of (N,) array of bool
-        For each trial the present stretches: true at samples within an event.
-    evaluations : int
-        The largest number of evaluations of the evidence in the fit.
+    `evaluations` is the largest number of evaluations of the evidence in the fit.
     """
     new_paths = search.improve_paths(forces, paths)
     new_forces, score = search.fit_forces(forces, new_paths, evaluations)

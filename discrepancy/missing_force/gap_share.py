@@ -37,9 +37,9 @@ class GapShare:
         force is missing [N, N m or the port's flow]; or that of the gap between readings and
         simulation.
     kind : str
-        The gap, one of `OF_FORCE` (forces, weighted by what they do to the state), `OF_PREDICTIONS`
-        (changes of the readings by the forces in a block, from its start) and `OF_READINGS`
-        (differences between readings and simulation).
+        The gap: `OF_FORCE` (missing forces, weighted by their influence on state and readings),
+        `OF_PREDICTIONS` (changes of the readings within a block by the missing forces in it), or
+        `OF_READINGS` (differences between readings and simulation).
     is_tested : bool
         Whether the force of the law is so large in these trials that they test it.
     """
@@ -62,10 +62,10 @@ class GapShare:
         )
 
     def bootstrap_draws(self) -> FloatArray:
-        """Return the share (DRAWS,) of random sets of blocks, drawn with replacement.
+        """Return the shares (DRAWS,) in random sets of blocks, drawn with replacement.
 
-        A block bootstrap (Kuensch 1989, Ann. Statist. 17, 1217-1241). The seed is fixed, so that
-        all shares of the same number of blocks draw the same ones and can be compared draw by draw.
+        This is a block bootstrap (Kuensch 1989, Ann. Statist. 17, 1217-1241). The seed is fixed, so
+        that two shares with the same number of blocks can be compared draw by draw.
         """
         block_count = len(self.squares_before)
         generator = np.random.default_rng(SEED)

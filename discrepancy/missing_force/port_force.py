@@ -37,10 +37,10 @@ LARGEST_SINGLE_SHARE = 0.6
 follows the two together. On simulated rigs it is at most 0.5 for impacts with loss, and at least
 0.68 for forces of one of the two."""
 NEIGHBOURS, CANDIDATE_NEIGHBOURS = 3, 100
-"""Number of neighbours whose mean force predicts that of a sample, and of samples among which they
-are looked for."""
+"""Number of neighbours whose mean force predicts that of a sample, and number of nearest samples
+among which they are looked for."""
 RELAXED_DISPLACEMENT = "the displacement relaxed"
-"""How the names of variables begin that remember the motion."""
+"""Beginning of the names of variables that depend on the history of the motion."""
 RELAXATION_TIMES = np.geomspace(2.0, 200.0, 12)
 """Relaxation times with which the displacement is tried as a variable, in sampling intervals."""
 
@@ -76,14 +76,10 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
     """Return the share of a force's variance that displacement and velocity explain together.
 
-    The force at each sample is predicted by its mean at the nearest states of the port, of all
-    trials together. States half a period before and after the sample do not count: there the force
-    is similar whatever it follows (Theiler 1986, Phys. Rev. A 34, 2427-2432).
-
-    Parameters
-    ----------
-    trial_forces : sequence of TrialForce
-        The force and the motion of the port in each trial.
+    The force at each sample is predicted by its mean at the nearest states of the port, in all
+    trials. States within half a period of the sample do not count: there the force is similar
+    whatever it depends on (Theiler 1986, Phys. Rev. A 34, 2427-2432). The share is 0 if there are
+    too few samples, or if the motion hardly comes back to a state.
     """
     force = np.concatenate([trial.force for trial in trial_forces])
     position = np.concatenate([trial.position for trial in trial_forces])
@@ -103,11 +99,11 @@ def variance_explained_by_state(trial_forces: Sequence["TrialForce"]) -> float:
     _, candidates = KDTree(scaled_state).query(scaled_state, CANDIDATE_NEIGHBOURS)
     is_other_trial = trial_of_sample[candidates] != trial_of_sample[:, np.newaxis]
     distance_in_time = np.abs(candidates - np.arange(sample_count)[:, np.newaxis])
-    counts = is_other_trial | (distance_in_time > half_period)
-    is_neighbour = counts & (np.cumsum(counts, axis=1) <= NEIGHBOURS)
+    is_admitted = is_other_trial | (distance_in_time > half_period)
+    is_neighbour = is_admitted & (np.cumsum(is_admitted, axis=1) <= NEIGHBOURS)
     is_predicted = is_neighbour.sum(axis=1) == NEIGHBOURS
     if np.count_nonzero(is_predicted) < sample_count / 2:
-        return 0.0  # the motion hardly comes back to a state
+        return 0.0
     neighbours = candidates[is_predicted][is_neighbour[is_predicted]].reshape(-1, NEIGHBOURS)
     errors = force[is_predicted] - force[neighbours].mean(axis=1)
     # the mean of n independent neighbours has an n-th of the variance around the function
@@ -123,7 +119,7 @@ def explanatory_variables(
     time: FloatArray,
     other_variables: Mapping[str, FloatArray],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the variables that a force depends on: it is nearly a function of one of them alone.
+    """Return the variables of which a force is nearly a function, each of one alone.
 
     Displacement, velocity, amplitude of the vibration and time are always tried.
 
@@ -163,10 +159,10 @@ def explanatory_variables(
 
 
 def relaxed_displacement(time: FloatArray, speed: FloatArray, relaxation_time: float) -> FloatArray:
-    """Return the elongation (N,) of a spring in series with a damper, z' = v - z / relaxation_time.
+    """Return the elongation (N,) of a spring in series with a damper: z' = v - z / relaxation_time.
 
-    It is the displacement for a long relaxation time, and proportional to the speed for a short
-    one. In between it depends on the history of the motion.
+    For a long relaxation time it is the displacement since the first sample, and for a short one it
+    is proportional to the speed. In between it depends on the history of the motion.
 
     Parameters
     ----------
@@ -214,11 +210,6 @@ class TrialForce:
     deviation: FloatArray
     law: FloatArray | None
 
-    @property
-    def left(self) -> FloatArray:
-        """The part (N,) of the force that the law does not explain; all of it without a law."""
-        return self.force if self.law is None else self.force - self.law
-
 
 @dataclass(frozen=True, eq=False)
 class MissingForce:
@@ -228,14 +219,14 @@ class MissingForce:
     ----------
     at_port : ForceAtPort
         The record of the force in the verdict.
-    courses : sequence of TrialForce
+    trial_forces : sequence of TrialForce
         The force in each fitted trial.
     law : str
         The name of the effect at the port whose force is drawn with it; empty if there is none.
     """
 
     at_port: ForceAtPort
-    courses: Sequence[TrialForce]
+    trial_forces: Sequence[TrialForce]
     law: str = ""
 
 
@@ -293,17 +284,8 @@ def _forces_by_trial(
 ) -> list[TrialForce]:
     """Return the force that the model lacks at a port in each trial, with the motion of the port.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        The estimate of a hypothesis, with the motion and the forces of each trial.
-    port : int
-        The index of the port among the ports of the model.
-    recorded : mapping of str to Trial
-        The trials as they were recorded, by name.
-    has_law : bool
-        Whether a law of the hypothesis acts at the port. The result then also tells how much of the
-        force the law explains.
+    `port` is the number of the port, and `recorded` has the trials as they were recorded, by name.
+    With `has_law`, the result has the force of the hypothesis' law at the port, too.
     """
     trial_forces = []
     for smoothed_trial in estimate.trials:
@@ -326,9 +308,9 @@ def _forces_by_trial(
 
 
 def _inputs_and_rates(trial: Trial, stride: int) -> dict[str, FloatArray]:
-    """Return what acted on a trial as it was recorded, and its rates, at every `stride`-th sample.
+    """Return the recorded inputs of a trial and their rates, at every `stride`-th sample.
 
-    It is empty if nothing was recorded.
+    Without inputs they are the applied force and its rate, or nothing if that is zero.
     """
     inputs = {f"the input {item.name!r}": item.values for item in trial.inputs}
     if not inputs and np.any(trial.force):
@@ -350,32 +332,21 @@ def _force_at_port(
 ) -> ForceAtPort:
     """Return the record of the missing force at a port for the verdict.
 
-    Parameters
-    ----------
-    trial_forces : sequence of TrialForce
-        The force in each trial.
-    port, unit : str
-        The name of the port, and the unit of its force.
-    evidence : mapping of str to float
-        The log evidence of a missing force over none, by the name of the port [nat].
-    correlation_time : float
-        The correlation time of the force [s].
-    law_name : str
-        The name of the law at the port; empty if there is none.
+    `evidence` is the log evidence of a missing force over none, by the name of the port [nat].
     """
     force = np.concatenate([trial_force.force for trial_force in trial_forces])
     position = np.concatenate([trial_force.position for trial_force in trial_forces])
     speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
     shares, ordered_by = _explanatory_variables_of_trials(trial_forces)
     # the trial and the sample with the largest force
-    trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
-    sample_of_largest = int(np.abs(trial_force.force).argmax())
+    trial = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
+    sample_of_largest = int(np.abs(trial.force).argmax())
     largest = ForceMoment(
-        trial=trial_force.trial,
-        time=float(trial_force.time[sample_of_largest]),
-        force=float(trial_force.force[sample_of_largest]),
-        displacement=float(trial_force.position[sample_of_largest]),
-        speed=float(trial_force.speed[sample_of_largest]),
+        trial=trial.trial,
+        time=float(trial.time[sample_of_largest]),
+        force=float(trial.force[sample_of_largest]),
+        displacement=float(trial.position[sample_of_largest]),
+        speed=float(trial.speed[sample_of_largest]),
     )
     return ForceAtPort(
         port=port,
@@ -431,8 +402,9 @@ def _explanatory_variables_of_trials(
 def _with_history_of_motion(trial_forces: Sequence[TrialForce]) -> list[TrialForce]:
     """Add to each trial's variables the relaxed displacement that explains the force best.
 
-    It is added only if it explains more of the force than all variables without memory: with
-    a short or long relaxation time it is nearly one of these, velocity or displacement.
+    It is added only if it explains more of the force's variance than each of the other variables,
+    by at least `TIED_SHARE`: with a short or long relaxation time it is nearly velocity or
+    displacement.
     """
     shares, _ = _explanatory_variables_of_trials(trial_forces)
     force = np.concatenate([trial.force for trial in trial_forces])
@@ -483,14 +455,13 @@ def missing_force_of_verdict(
     fit : CandidateFit
         The fit of the verdict.
     is_named : bool
-        Whether the effects of the fit are named. Errors of sensors that are named leave no force
-        missing; as a best hypothesis without a name they do.
+        Whether the verdict names the effects of the fit.
 
     Returns
     -------
     MissingForce or None
-        The missing force; None if no force can be estimated, or if effects are named of which none
-        acts at a port.
+        The missing force; None if no force is missing or can be estimated, or if the verdict names
+        effects none of which acts at a port, such as errors of sensors.
     """
     terms = fit.candidate.terms
     try:

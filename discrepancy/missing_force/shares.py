@@ -57,7 +57,7 @@ class ForceShares:
     Parameters
     ----------
     search : ForceSearch
-        The search for the missing force that made the hypotheses.
+        The search for the missing force in which the hypotheses were estimated.
     """
 
     def __init__(self, search: ForceSearch) -> None:
@@ -82,8 +82,8 @@ class ForceShares:
         """Return the share of the missing force that a hypothesis explains.
 
         Two shares are computed: that of the forces, and that of the changes of the readings by
-        these forces. The one with the larger lower end of its interval is returned. Each of them
-        may miss a part: fast forces hardly move a free mass, and slow forces are small compared
+        these forces. The one whose interval has the higher lower end is returned. Each may overlook
+        a part of the force: fast forces hardly move a free mass, and slow forces are small compared
         with fast ones.
 
         Parameters
@@ -167,7 +167,7 @@ class ForceShares:
             trials, trials_without, filters, strict=True
         ):
             trial = smoothed_trial.trial
-            # the missing forces that are estimated from noise alone
+            # missing forces as they would be estimated from noise alone
             noise_states, _ = filtered_trial.smooth_residual(_simulated_noise(trial))
             noise_forces = filtered_trial.missing_forces(noise_states)
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
@@ -191,14 +191,14 @@ class ForceShares:
         return of_forces, of_predictions
 
     def _large_processes(self, estimate: Estimate) -> Processes:
-        """Return missing forces as large as without any effect, at the ports of an estimate.
+        """Return the missing forces without any effect, and those of an estimate at further ports.
 
-        They can describe all that the hypothesis does not explain.
+        They are large enough to describe all that the hypothesis does not explain.
         """
         return {**estimate.processes, **self.search.estimate_without_effects.processes}
 
     def _trials_without_effect(self, held_out: bool) -> tuple[SmoothedTrial, ...]:
-        """Return the trials with the motion and missing force of each without any effect.
+        """Return the smoothed trials without any effect, in which the whole force is missing.
 
         Shared unknowns are kept within `SHARED_BOUND` prior deviations, as they would otherwise
         explain a part of the missing force.
@@ -217,17 +217,11 @@ class ForceShares:
     def smooth_trials(
         self, estimate: Estimate, *, held_out: bool
     ) -> tuple[Linearisation, tuple[SmoothedTrial, ...]]:
-        """Return the trials, with the motion and unexplained force of each with a hypothesis.
+        """Return trials under a hypothesis, smoothed with the force that it leaves unexplained.
 
-        The unexplained force has the standard deviation of the force that is missing without any
-        effect.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            The estimate of the hypothesis, whose shared unknowns and effects are not changed.
-        held_out : bool
-            Whether the held-out trials are returned. Otherwise the fitted trials are returned.
+        This force has the prior standard deviation of the force that is missing without any effect.
+        Shared unknowns and effects are those of the estimate. Held-out trials are linearised along
+        their own motion, in a few rounds; fitted trials as in the estimate.
         """
         processes = self._large_processes(estimate)
         if not held_out:
@@ -289,16 +283,9 @@ def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
 def _squares_of_weighted_forces(
     forces: PortForces, weights: Mapping[int, float], samples: slice
 ) -> float:
-    """Return the sum of the squares of the weighted forces, over the samples and all ports.
+    """Return the sum of squares of weighted forces over all ports, and over a slice of fine stamps.
 
-    Parameters
-    ----------
-    forces : mapping of int to (F,) array
-        The forces at the fine stamps, by the number of the port.
-    weights : mapping of int to float
-        The weight of each port.
-    samples : slice
-        The fine stamps over which is summed.
+    Forces (F,) and weights are given by the number of the port.
     """
     total = 0.0
     for port, force in forces.items():
@@ -308,7 +295,7 @@ def _squares_of_weighted_forces(
 
 
 def _largest_rms(forces_by_trial: Sequence[PortForces], ports: Iterable[int]) -> float:
-    """Return the largest rms among some ports, of the forces of all trials together."""
+    """Return the rms force in all trials together, at the port where it is largest."""
     rms_of_ports = []
     for port in ports:
         forces = [trial_forces[port] for trial_forces in forces_by_trial if port in trial_forces]

@@ -1,9 +1,9 @@
 """A trial in which a force is on or off: the evidence of every stretch in which it may be on.
 
 A path (N,) says for each sample whether the force of events is on; a stretch is a range of samples
-in which it stays on, or off. The filter of the readings before a moment and the backward filter of
-those after it are joined, so that the evidence of a stretch with any start and any end needs no
-further pass over the record.
+in which it stays on, or off. A filter runs forwards up to the start of a stretch, and from there to
+all its possible ends, where it is joined with a backward filter. So one pass over the record gives
+the evidence of all stretches with the same start.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ MOST_GRID_INTERVALS = 40
 MOST_FILTER_STEPS = 400_000
 """Largest number of steps of the filter for one such grid; a long record has fewer intervals."""
 COMPARED_SAMPLES = 80
-"""Number of samples that are compared at once as the place of a change."""
+"""Number of samples at which a change is tried at once."""
 EVIDENCE_RANGE = 12.0
-"""Difference to the largest log evidence above which a sample is taken as impossible [nat]."""
+"""Difference to the largest log evidence above which a change at a sample is impossible [nat]."""
 
 ForcePair = tuple[Process, Process]
 """The force of events, and the force that may be missing throughout."""
@@ -172,9 +172,10 @@ class SwitchedRecord:
         return self._step_kind(was_on, is_on, self.length_of_sample)
 
     def _step_kind(self, was_on: BoolArray, is_on: BoolArray, length: IntArray) -> IntArray:
-        """Return the kind of steps between samples at which the force was, and is, on or off.
+        """Return the kinds of steps, given whether the force was on before and is on after them.
 
-        The four cases follow each other: off, begins, ends, on. Each has one kind for each length.
+        The four cases are off, begins, ends and on, in this order, each with one kind for each
+        length of a step.
         """
         return np.asarray((2 * was_on + is_on) * self.length_count + length)
 
@@ -196,16 +197,18 @@ class SwitchedRecord:
     def evidence_of_stretches(
         self, is_on: BoolArray, starts: IntArray, ends: IntArray
     ) -> FloatArray:
-        """Return the log evidence of all trials if a path is inverted in one more stretch.
+        """Return the log evidence of all trials if a path is inverted in one stretch.
+
+        All stretches from one of A starts to one of B ends are tried.
 
         Parameters
         ----------
         is_on : (N,) array of bool
             The path: whether the force is on at each sample.
         starts : (A,) array of int
-            The first samples of the stretches in which the path is inverted.
+            The first samples of the stretches, ascending.
         ends : (B,) array of int
-            The sample after the last sample of each stretch.
+            The samples after the last one of the stretches, ascending.
 
         Returns
         -------
@@ -225,9 +228,7 @@ class SwitchedRecord:
         information_at_ends = self.record_filter.information_after(kinds, ends)
         transitions, noises = self._steps_at_ends(is_on, ends)
         for k, start in enumerate(starts.tolist()):
-            # a stretch from the first sample on: the force begins off instead of on, or on instead
-            # of off
-            if start == 0:
+            if start == 0:  # the first sample is inverted, too
                 state = self._initial_state(not is_on[0])
             else:
                 state = FilterState(*(array[k] for array in states_at_starts))
@@ -258,15 +259,15 @@ class SwitchedRecord:
     def _steps_at_ends(self, is_on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (B, n, n) of the steps that lead out of inverted stretches.
 
-        Where a force that was off is tried as on, for example, the step at the end turns it off.
+        For example, if a force that was off is tried as on, this step turns it off.
 
         Parameters
         ----------
         is_on : (N,) array of bool
             The path before a stretch is inverted.
         ends : (B,) array of int
-            The sample after the last sample of each stretch. No step follows the end of the
-            record: its transition is the identity, without noise.
+            The sample after the last one of each stretch. No step leads out of the record: there
+            the transition is the identity, without noise.
         """
         # the path is inverted up to the sample before the end, and not at the end
         is_last = ends == len(is_on)
@@ -283,7 +284,7 @@ class SwitchedRecord:
         return transitions, noises
 
     def invert_best_stretch(self, is_on: BoolArray) -> BoolArray | None:
-        """Return the path after the most probable inversion of one stretch.
+        """Return the path with the one stretch inverted that makes it most probable.
 
         An inversion turns the force on where it was off, and off where it was on. The stretch
         begins and ends at samples of a grid over the record, or at changes of the path.
@@ -405,8 +406,8 @@ def switched_step_matrices(
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and noises (4 J, n, n) of steps in which the force of events is switched.
 
-    The first J have the force off; in the next J it begins at the end of the step; in the next J it
-    acts during the step and ends there; in the last J it is on.
+    In the first J steps the force is off, and in the last J it is on. In the second J it is off and
+    begins at the end of the step. In the third J it is on and ends at the end of the step.
 
     Parameters
     ----------
@@ -423,8 +424,8 @@ def switched_step_matrices(
     )
     transitions = np.stack((off_transition, off_transition, on_transition, on_transition))
     noises = np.stack((off_noise, off_noise, on_noise, on_noise))
-    # After all steps but the last kind, the force does not continue the one before: it is zero, or
-    # (second kind) begins with its stationary variance of one.
+    # Only after the last kind of step does the force continue. After the others it is zero, or
+    # begins with its stationary variance of one (second kind).
     transitions[:3, :, event] = 0.0
     noises[:3, :, event] = 0.0
     noises[:3, :, :, event] = 0.0

@@ -1,7 +1,7 @@
-"""A record filtered forwards and backwards in time, and how both are joined at a moment.
+"""A record filtered forwards and backwards in time, and both filters joined at one time.
 
-The forward filter gives the state at a moment by the readings before it, the backward filter the
-information on that state by the readings after it (Fraser and Potter 1969, IEEE Transactions on
+The forward filter gives the state at that time from the readings before it, the backward filter the
+information on the state from the readings after it (Fraser and Potter 1969, IEEE Transactions on
 Automatic Control 14, 387-390). Together they give the evidence of all readings.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
@@ -21,7 +21,7 @@ from discrepancy.estimation.kernel import filter_record, is_steady
 from fe.compilation import compiled
 
 NO_STEP = -1
-"""Kind of the step that leads to the first sample of a record: there is none."""
+"""Kind of step that stands for none, before the first sample of a record."""
 
 
 @compiled
@@ -131,7 +131,7 @@ def filter_backward(
 
 
 class FilterState(NamedTuple):
-    """The state given the readings before a moment, and the contribution of these to the evidence.
+    """The state given the readings before a time, and their contribution to the evidence.
 
     Attributes
     ----------
@@ -152,9 +152,9 @@ class FilterState(NamedTuple):
 
 
 class StateInformation(NamedTuple):
-    """The information on the state at a moment from the readings since then.
+    """The information on the state at a time from the readings since then.
 
-    `filter_backward` gives the density.
+    The docstring of `filter_backward` has the log density of which these are the coefficients.
 
     Attributes
     ----------
@@ -304,17 +304,17 @@ def _covariance_roots(covariances: FloatArray) -> FloatArray:
 
 
 def join_filters(before: FilterState, after: StateInformation) -> tuple[FloatArray, FloatArray]:
-    """Return the products and half log determinants of records that were filtered in two parts.
+    """Return the products and half log determinants of a record that was filtered in two parts.
 
-    The state z at the moment between both parts is integrated out. Given the readings before, it is
-    Gaussian; the readings after have the log density that `filter_backward` gives.
+    The state z between both parts is integrated out. Given the readings before, it is Gaussian; the
+    readings after have the log density that `filter_backward` gives.
 
     Parameters
     ----------
     before : FilterState
-        The state z by the readings before the moment.
+        The state z given the readings of the first part.
     after : StateInformation
-        The information on z by the readings after the moment.
+        The information on z from the readings of the second part.
 
     Returns
     -------

@@ -2,9 +2,9 @@
 
 The windows are found as events: stretches of time in which a force acts. The force is the missing
 one at the port with the most evidence or, if that is more probable, an error of one channel. All
-unknowns of the records are integrated out. If the model does not describe how its ports move,
-events are looked for in the residuals of a fit: in the amplitude of their strongest pattern over
-the channels (the first singular vector) over time.
+unknowns of the records are integrated out. If a missing force cannot be estimated, events are
+looked for in the residuals of a fit: in the amplitude over time of their strongest pattern over the
+channels (the first singular vector).
 """
 
 from collections.abc import Sequence
@@ -64,8 +64,8 @@ def gap_windows(
         The residuals of the unchanged model. They alone are examined if missing forces cannot be
         estimated, or if the model has laws of its own, which are exact only in a simulation.
     leaves_no_force : bool
-        Whether no force is missing beside the effects of this fit, which act throughout: events
-        need not be looked for then.
+        Whether no force is missing beside the effects of this fit, which act throughout. A window
+        is then a whole record, and no events are looked for.
     seed : int
         The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
         the noise that the fit has absorbed.
@@ -73,8 +73,8 @@ def gap_windows(
     dynamic_trials = tuple(
         fitted_trial.trial for fitted_trial in residuals.trials if fitted_trial.trial.is_dynamic
     )
-    _, own_laws = problem.model.without_laws()
-    if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
+    _, laws_of_model = problem.model.without_laws()
+    if not dynamic_trials or not problem.model.shows_ports or len(laws_of_model):
         return windows_of_residuals(residuals, seed=seed)
     try:
         windows = _windows_of_missing_force(
@@ -118,7 +118,7 @@ def _windows_of_missing_force(
     else:
         evidence_of_law = _evidence_of_law(search, port, fit)
         best_events = find_events(estimate.linearisation, port_number, process, evidence_of_law)
-    # the part of the readings that the force causes gives the size of each window
+    # the size of a window is that of the readings that the force causes in it
     readings_by_force = []
     for smoothed_trial in estimate.trials:
         trial = smoothed_trial.trial
@@ -135,16 +135,7 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     """Return the log evidence of those laws of a fit that act at a port [nat].
 
     These laws alone are fitted to the missing force at the port. The evidence is -inf if the fit
-    has no law there.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search for the missing force.
-    port : str
-        The name of the port.
-    fit : CandidateFit
-        The fit of a hypothesis to all trials.
+    has no law there, or if they cannot be fitted.
     """
     terms_at_port = [index for index, term in enumerate(fit.candidate.terms) if term.place == port]
     if not terms_at_port:
@@ -163,7 +154,7 @@ def windows_of_residuals(
 ) -> tuple[GapWindow, ...]:
     """Return the windows in which the residuals of a fit are more than noise.
 
-    A flight whose turns have no times has no windows.
+    Trials whose samples all have the same time, such as flights without times, have no windows.
 
     Parameters
     ----------
@@ -253,16 +244,9 @@ def _used_in_window(window: GapWindow, fitted_trial: FittedTrial) -> BoolArray:
 def _rms_by_channel(
     is_selected: BoolArray, fitted_trial: FittedTrial, noise: FloatArray
 ) -> FloatArray:
-    """Return the rms residual (C,) of each channel divided by its noise, over selected readings.
+    """Return the rms over selected readings (N, C) of each channel's residual over its noise (C,).
 
-    Parameters
-    ----------
-    is_selected : (N, C) array of bool
-        Whether each reading is selected.
-    fitted_trial : FittedTrial
-        The residuals of the trial.
-    noise : (C,) array
-        The standard deviation of the noise of each channel [unit of the channel].
+    The noise is a standard deviation [unit of the channel]. The rms is 0 without a reading.
     """
     squares = np.where(is_selected, (fitted_trial.residual / noise) ** 2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(is_selected.sum(axis=0), 1)))
@@ -287,7 +271,7 @@ def _port_or_channel_error(
     port : int
         The number of the port.
     at_port : Estimate
-        The estimate of a missing force at that port.
+        The estimate of a missing force at that port alone.
     channels : sequence of tuple of str
         The channels of each trial.
 
@@ -404,7 +388,9 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
 def strongest_pattern(
     name: str, time: FloatArray, series: FloatArray, is_used: BoolArray
 ) -> tuple[Estimate, FloatArray]:
-    """Return the strongest pattern of residuals over channels, and its amplitude as a force.
+    """Return the amplitude over time of the strongest pattern of residuals, and the pattern.
+
+    The pattern is the first right singular vector of the residuals.
 
     Parameters
     ----------
@@ -459,8 +445,8 @@ def strongest_pattern(
         port_speeds=no_motion,
         begins_at_rest=False,
     )
-    size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
-    processes = {0: Process(size, 0.1 * float(np.ptp(time)), may_jump=True)}
+    rms_amplitude = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
+    processes = {0: Process(rms_amplitude, 0.1 * float(np.ptp(time)), may_jump=True)}
     linearisation = plain_linearisation([trial], Priors.without_ranges(np.zeros(0)))
     return estimate_of_processes(linearisation, processes, processes), pattern[0]
 
@@ -510,18 +496,8 @@ def _windows_in_trial(
 ) -> list[GapWindow]:
     """Return the windows of events in one trial: the stretches in which the force is on.
 
-    Parameters
-    ----------
-    events : Events
-        The events in all trials.
-    trial_index : int
-        The index of the trial.
-    channels : sequence of str
-        The channels of the trial.
-    readings_by_force : (N, C) array
-        The part of its readings that the force makes, divided by the noise.
-    with_effect : bool
-        Whether the gap is that of the best hypothesis, not of the unchanged model.
+    If the path has more than twice `MOST_EVENTS` changes, the window is the whole record.
+    The other arguments are those of `_windows_of_events`, for this trial.
     """
     trial = events.search.trials[trial_index]
     is_on = events.paths[trial_index]
