@@ -53,7 +53,7 @@ def plot_missing_force(
             "This investigation has no missing force: nothing is missing, or the trials do not "
             "move. See `verdict.sentence` of the investigation."
         )
-    courses = missing.trial_forces[:MOST_TRIALS]
+    courses = missing.courses[:MOST_TRIALS]
     panels = new_panels(len(courses), axes)
     for panel, course in zip(panels, courses, strict=True):
         low = course.force - 2.0 * course.deviation

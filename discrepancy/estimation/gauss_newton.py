@@ -180,17 +180,11 @@ def linearise_trials(
 
     Parameters
     ----------
-    laws : HypothesisLaws
-        The laws and sensor errors of the hypothesis.
-    trials : sequence of PortedTrial
-        The trials as linear systems with ports.
     start : EstimatorStart
         The trajectories and the values of unknowns.
     speed_window : float
         The half width of the window of speeds over which laws of the speed are averaged, divided by
         the rms speed.
-    shared_priors : Priors
-        The priors of the K shared unknowns.
 
     Returns
     -------
@@ -231,16 +225,10 @@ def linearise_along_laws(
 
     Parameters
     ----------
-    laws : HypothesisLaws
-        The laws and sensor errors of the hypothesis.
-    trials : sequence of PortedTrial
-        The trials as linear systems with ports.
     start : EstimatorStart
         The values of unknowns, and trajectories that begin in the same states.
     speed_window : float
         The half width of the window of speeds, see `LawArguments`.
-    shared_priors : Priors
-        The priors of the K shared unknowns.
 
     Returns
     -------
@@ -353,8 +341,6 @@ class GaussNewton:
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with, and the missing forces.
         speed_window : float
@@ -416,8 +402,6 @@ class GaussNewton:
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The unknowns to begin with, trajectories that begin in the same states, and the missing
             forces, which are small.
@@ -481,8 +465,6 @@ class GaussNewton:
 
         Parameters
         ----------
-        candidate : Candidate
-            The effects of the hypothesis.
         linearisation : Linearisation
             The trials, linear about the start.
         start : EstimatorStart
@@ -538,26 +520,9 @@ class GaussNewton:
         At the end of a step the linear laws differ from the true ones. This difference acts like a
         further missing force, which is not part of the smoother's model. A fraction is admissible
         if the rms difference is at most the largest standard deviation of the missing forces. If no
-        fraction of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
-
-        Parameters
-        ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
-        current_start : EstimatorStart
-            The values and trajectories before the step.
-        estimate : Estimate
-            The values and trajectories at the end of the whole step.
-        linearisation : Linearisation
-            The trials, linear about `current_start`.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
-
-        Returns
-        -------
-        EstimatorStart or None
-            The next start; None if the laws are not possible after any of the fractions.
+        fraction of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken;
+        None if there is none. The whole step leads from `current_start`, about which the trials
+        are linear, to the estimate.
         """
         next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
@@ -583,25 +548,9 @@ class GaussNewton:
     ) -> float | None:
         """Return the rms error of the linear laws after a step, relative to the missing forces.
 
-        It is divided by the largest standard deviation of the missing forces at all ports.
-
-        Parameters
-        ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
-        current_start, stepped_start : EstimatorStart
-            The values and trajectories before and after a step.
-        linearisation : Linearisation
-            The trials, linear about `current_start`.
-        speed_window : float
-            The half width of the window of speeds over which laws of the speed are averaged,
-            divided by the rms speed.
-
-        Returns
-        -------
-        float or None
-            The largest ratio of all trials and ports; None if the laws are not possible after the
-            step.
+        It is the error at the port and in the trial where it is largest, divided by the largest
+        standard deviation of the missing forces. The trials are linear about `current_start`. None
+        if the laws are not possible at `stepped_start`, after the step.
         """
         unknowns_change = np.concatenate(
             (

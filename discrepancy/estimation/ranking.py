@@ -58,10 +58,6 @@ def rank_by_missing_force(
 
     Parameters
     ----------
-    search : ForceSearch
-        The search for the missing force in all samples.
-    effects : sequence of Effect
-        The effects that may be missing in the model.
     on_progress : callable
         The function that receives a line for the progress display, such as the estimate that runs.
     """
@@ -92,10 +88,6 @@ def rank_hypotheses(
 
     Parameters
     ----------
-    search : ForceSearch
-        The search for the missing force.
-    effects : sequence of Effect
-        The effects that may be missing in the model.
     on_progress : callable
         The function that receives a line for the progress display, such as the estimate that runs.
     largest_set : int, optional

@@ -140,12 +140,8 @@ def screen_effects(
 
     Parameters
     ----------
-    search : ForceSearch
-        The search for the missing force.
     base : Estimate
         The estimate to which an effect is added.
-    effects : iterable of Effect
-        The effects that may be missing in the model.
     """
     tried_effects = _try_effects(search, base, effects)
     evidence_of_base, weighed_effects = _weigh_effects(base, tried_effects)

@@ -37,10 +37,6 @@ def refit_from_first_readings(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model that were fitted.
-    fit : CandidateFit
-        The fit that is improved.
     iterations : int
         The largest number of steps.
     local_only : bool

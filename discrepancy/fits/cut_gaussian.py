@@ -133,15 +133,7 @@ class TruncatedGaussian:
         return float(self.log_integral + logsumexp(log_weight) - np.log(MOMENT_DRAWS))
 
     def draws(self, count: int, generator: np.random.Generator) -> FloatArray:
-        """Return equally weighted draws (count, P), resampled from weighted candidates.
-
-        Parameters
-        ----------
-        count : int
-            The number of draws.
-        generator : Generator
-            The source of random numbers.
-        """
+        """Return equally weighted draws (count, P), resampled from weighted candidates."""
         uniform = generator.random((CANDIDATES_PER_DRAW * count, len(self.mean)))
         candidates, log_weight = self.weighted_draws(self.mean, uniform)
         cumulative_weights = np.cumsum(softmax(log_weight))
@@ -162,8 +154,6 @@ class TruncatedGaussian:
         ----------
         means : (N, P) ndarray
             The means that are used instead of `mean`.
-        generator : Generator
-            The source of random numbers.
         """
         shape = (CANDIDATES_PER_DRAW, *means.shape)
         candidates, log_weight = self.weighted_draws(

@@ -121,10 +121,6 @@ def nuisance_derivatives(
 
     Parameters
     ----------
-    data : TrialData
-        The trial and its unknowns.
-    shared_unknowns : SharedUnknowns
-        The layout of the shared unknowns.
     shared_point, local_point : (Q,), (L,) array
         The scaled values of the Q shared unknowns, and of the L unknowns of the trial, at which the
         derivatives are computed.
@@ -198,8 +194,6 @@ def _health_derivatives(
 
     Parameters
     ----------
-    data : TrialData
-        The trial and its unknowns.
     local_values : (L,) array
         The scaled unknowns of the trial.
     first_health : int
@@ -247,16 +241,8 @@ def prediction_derivatives(
 
     Parameters
     ----------
-    data : TrialData
-        The trial and its unknowns.
-    shared_unknowns : SharedUnknowns
-        The layout of the shared unknowns.
     shared_values : (Q,) array
         The scaled values of the Q unknowns that all trials share.
-    derivatives : TrialDerivatives
-        The response and its derivatives.
-    candidate : Candidate
-        The effects whose parameters are unknowns.
 
     Returns
     -------

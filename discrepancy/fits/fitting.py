@@ -127,12 +127,6 @@ def fit(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    candidate : Candidate
-        The effects whose parameters are fitted.
-    start : Point
-        The point from which the fit begins.
     nearby_derivatives : tuple of TrialDerivatives, optional
         The derivatives of each trial with respect to nuisances at a nearby point, used for the
         first steps instead of new ones.
@@ -242,12 +236,6 @@ def objective(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    candidate : Candidate
-        The effects of the hypothesis, each at its place.
-    point : Point
-        The values of all unknowns.
     jumps : sequence of (N, C) array, optional
         The jumps of the response of each trial for small changes of the unknowns, see
         `Problem.standardised_residual`.
@@ -341,8 +329,6 @@ class _Descent:
 
         Parameters
         ----------
-        point : Point
-            The values of all unknowns.
         nearby_derivatives : tuple of TrialDerivatives, optional
             The derivatives of each trial with respect to nuisances at a nearby point, which are
             reused here; only the response and the derivatives with respect to effect parameters are
@@ -382,8 +368,6 @@ class _Descent:
 
         Parameters
         ----------
-        state : FitState
-            The point with its residuals and derivatives.
         damping : float
             The Levenberg-Marquardt factor d: the matrix H of the normal equations is replaced by
             H + d diag(H).
@@ -422,12 +406,7 @@ class _Descent:
     def _is_held_at_bound(self, shared_values: FloatArray, downhill: FloatArray) -> BoolArray:
         """Return which shared unknowns (Q,) are at an end of their range and would leave it.
 
-        Parameters
-        ----------
-        shared_values : (Q,) array
-            The scaled values of the Q unknowns that all trials share.
-        downhill : (Q,) array
-            The direction in which the objective decreases.
+        `downhill` (Q,) is the direction in which the objective decreases.
         """
         low, high = self.problem.shared.bounds
         is_held_low = (shared_values <= low) & (downhill < 0.0)
@@ -508,16 +487,7 @@ def _log_probability_of_losses(
     A loss below zero has no physical meaning. Fits may pass through such losses (see `LEAST_LOSS`),
     but the evidence must not count them: else a hypothesis under which readings determine the
     losses less well gains by each further sample. Trials in motion are left out, as the evidence
-    with a missing force has no such limit.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    equations : NormalEquations
-        The normal equations at the maximum of the posterior.
-    covariance : (n, n) array
-        The posterior covariance of all scaled unknowns.
+    with a missing force has no such limit. `covariance` (n, n) is that of all scaled unknowns.
     """
     mean_losses, scales, unknown_indices = [], [], []
     for data, (trial_jacobian, indices_of_trial) in zip(
@@ -580,8 +550,6 @@ def fit_free_shape(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     canonical_fit : CandidateFit
         The fit in which all shapes have their canonical values.
     term_index : int

@@ -41,13 +41,6 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     number of tests (Bonferroni's correction, the first step of Holm 1979, Scand. J. Statist. 6,
     65-70), is compared with `ABSOLUTE_FIT_LEVEL`.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    fit : CandidateFit
-        The fit whose residuals are tested.
-
     Returns
     -------
     Gate
@@ -90,13 +83,6 @@ def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     The residual variance of each channel is compared with its noise record by an F test, and those
     of all channels together by one more test. A channel without a noise record, or with less than
     one degree of freedom left, is not tested.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    fit : CandidateFit
-        The fit whose residuals are tested.
     """
     # correlated residuals count as fewer independent ones: all degrees of freedom are divided
     samples_per_independent = _recorded_colour_factor(problem, fit) ** 2
@@ -229,10 +215,6 @@ def residual_records(problem: Problem, fit: CandidateFit, channel: int) -> list[
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    fit : CandidateFit
-        The fit of a hypothesis to all trials.
     channel : int
         The index of the channel among those of the campaign.
     """
@@ -292,8 +274,6 @@ def time_step_error(problem: Problem, fit: CandidateFit) -> float:
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model.
     fit : CandidateFit
         The fit, with the responses that were simulated with the usual time steps.
     """

@@ -132,14 +132,6 @@ def trial_jacobian(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    trial_index : int
-        The index of the trial.
-    state : FitState
-        The point, its residuals and derivatives.
-    candidate : Candidate
-        The effects whose parameters are unknowns.
     precision : (channels,) array
         The estimated noise precision (inverse variance) of each channel over the recorded one.
     """
@@ -197,12 +189,6 @@ def normal_equations(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    state : FitState
-        The point, its residuals and derivatives.
-    candidate : Candidate
-        The effects whose parameters are unknowns.
     precision : (channels,) array
         The estimated noise precision (inverse variance) of each channel over the recorded one.
     effect_precision : (E,) array, optional

@@ -35,10 +35,6 @@ def residual_set(problem: Problem, fit: CandidateFit, *, sensitivities: bool = T
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model that were fitted.
-    fit : CandidateFit
-        The fit with its covariance.
     sensitivities : bool
         Whether the factor of the exact covariance of the residuals is computed (P columns for each
         sample), or only its diagonal, the leverage.
@@ -278,19 +274,7 @@ class _TrialPredictions:
         factors: _CovarianceFactors,
         sensitivity: FloatArray | None,
     ) -> FittedTrial:
-        """Return a trial with its prediction, its residuals and their expected variance.
-
-        Parameters
-        ----------
-        trial_index : int
-            The index of the trial.
-        data : TrialData
-            The trial with its noise models and unknowns.
-        factors : _CovarianceFactors
-            The factors of the covariance of its prediction.
-        sensitivity : (N, C, P) array or None
-            The factor of the exact covariance of its residuals, if that is asked for.
-        """
+        """Return a trial with its prediction, its residuals and their expected variance."""
         point = self.local_fit.point
         response = self.local_fit.responses[trial_index]
         prediction = self.problem.prediction(trial_index, point, response)
@@ -331,13 +315,6 @@ RETURNED_DRAWS = 1000
 
 def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     """Return a fit with posterior draws of its effects if their posterior is not nearly Gaussian.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and model that were fitted.
-    fit : CandidateFit
-        The fit with its covariance.
 
     Returns
     -------

@@ -224,10 +224,6 @@ class Problem:
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The E parameters of the effects, on the scale on which their priors are standard normal.
         """
@@ -249,8 +245,6 @@ class Problem:
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
         shared_values : (Q,) array
             The scaled values of the Q unknowns that all trials share.
         local_values : (L,) array
@@ -307,10 +301,6 @@ class Problem:
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
-        point : Point
-            The values of all unknowns.
         response : (N, C) array
             The response of the model in the trial at the point.
         jumps : (N, C) array, optional
@@ -349,12 +339,6 @@ class Problem:
 
         Parameters
         ----------
-        trial_index : int
-            The index of the trial.
-        point : Point
-            The values of all unknowns.
-        candidate : Candidate
-            The effects that act, each at its place.
         nearby_derivatives : TrialDerivatives, optional
             The derivatives with respect to nuisances at a nearby point, which are not computed
             again.
@@ -481,8 +465,6 @@ class Problem:
 
         Parameters
         ----------
-        trials : sequence of Trial
-            The trials that are compared with the model.
         model : Model, optional
             Another model; that of this problem if left out.
         """

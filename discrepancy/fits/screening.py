@@ -251,8 +251,6 @@ class Screen:
 
         Parameters
         ----------
-        term : EffectTerm
-            The effect at its place.
         with_small_magnitude : bool
             Whether a magnitude that may be negative is tried at a small value too. One value is
             enough for an effect that is linear in its magnitude.
@@ -335,8 +333,6 @@ def parameter_grid(
 
     Parameters
     ----------
-    term : EffectTerm
-        The effect at its place.
     peaks : sequence of float
         The frequencies of peaks in the residuals, over the first natural frequency.
     with_small_magnitude : bool

@@ -206,8 +206,6 @@ class LocalUnknowns:
 
         Parameters
         ----------
-        trial : Trial
-            The trial with its readings, inputs and sample times.
         parameters : (P,) array
             The calibrated parameters.
         scaled_values : (L,) array
@@ -257,8 +255,6 @@ def shared_unknowns(
     ----------
     campaign : Campaign
         The campaign, whose `parameters` replace priors of the model.
-    model : Model
-        The model with its calibrated parameters.
     trials : tuple of Trial
         The trials that are fitted; only gains of channels in them are unknowns.
     gain_estimates : dict of str to float
@@ -324,10 +320,6 @@ def local_unknowns(
 
     Parameters
     ----------
-    campaign : Campaign
-        The campaign of the trial.
-    trial : Trial
-        The trial with its readings, inputs and sample times.
     deviation : (C,) array
         The noise deviation of each channel, which scales a zero with a flat prior.
     model : Model
@@ -444,19 +436,7 @@ class TrialData:
         models_by_channel: Mapping[str, NoiseModel],
         model: Model,
     ) -> "TrialData":
-        """Return a trial with its noise, its unknowns, and the samples that are compared.
-
-        Parameters
-        ----------
-        campaign : Campaign
-            The campaign of the trial.
-        trial : Trial
-            The trial with its readings, inputs and sample times.
-        models_by_channel : mapping of str to NoiseModel
-            The noise model of each channel.
-        model : Model
-            The model that the trial is compared with.
-        """
+        """Return a trial with its noise, its unknowns, and the samples that are compared."""
         channel_names = list(campaign.channels)
         noise_models = tuple(models_by_channel[name] for name in trial.channels)
         # a coloured noise is whitened if its coefficients hold for the sampling interval of the

@@ -193,8 +193,6 @@ def rms_errors_text(
 
     Parameters
     ----------
-    channels : mapping of str to Channel
-        The channels of the campaign by name.
     rms_before, rms_after : mapping of str to float
         The rms error of each channel without and with the hypothesis [unit of the channel].
     """
@@ -228,8 +226,6 @@ def closed_share_text(channels: Mapping[str, Channel], errors: ErrorComparison) 
 
     Parameters
     ----------
-    channels : mapping of str to Channel
-        The channels of the campaign by name.
     errors : ErrorComparison
         The errors without and with the hypothesis; they must have a share.
     """

@@ -97,14 +97,9 @@ class Comparison(ABC, Generic[HypothesisT]):
 
     @abstractmethod
     def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> HypothesisT | None:
-        """Return the fit of a further candidate; None if it cannot be fitted.
+        """Return the fit of a further candidate, from scaled effect parameters (E,).
 
-        Parameters
-        ----------
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
-        effect : (E,) array
-            The scaled effect parameters from which the fit begins.
+        None if it cannot be fitted.
         """
 
     @abstractmethod

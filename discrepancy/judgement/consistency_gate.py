@@ -75,8 +75,6 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit of the effects that would be named.
 
@@ -117,8 +115,6 @@ def score_tests(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit, converged, with its derivatives.
     groups : mapping of str to mapping of str to Direction
@@ -237,15 +233,7 @@ def _score_test(
     """Return the score test of a group of directions; None if nothing can be tested.
 
     The statistic is g^T I^+ g, with the gradient g and the pseudo-inverse I^+ of the information.
-
-    Parameters
-    ----------
-    name : str
-        The name of the group.
-    directions : _ProjectedDirections
-        The directions of the group, after projection.
-    noise : _NoiseFreedom
-        The degrees of freedom of the noise of the channels that they change.
+    `noise` is that of the channels which the directions change.
     """
     gradient = directions.gradient
     eigenvalues, eigenvectors = np.linalg.eigh(directions.information)
@@ -272,17 +260,7 @@ def _score_test(
 
 
 def _p_value(statistic: float, direction_count: int, noise: _NoiseFreedom) -> float:
-    """Return the p-value of a score statistic: by χ² if the noise is known, else by an F test.
-
-    Parameters
-    ----------
-    statistic : float
-        The score statistic, see `_score_test`.
-    direction_count : int
-        The number of independent directions.
-    noise : _NoiseFreedom
-        The degrees of freedom of the noise estimate.
-    """
+    """Return the p-value of a score statistic: by χ² if the noise is known, else by an F test."""
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, direction_count))
     # The statistic is in units of the noise variance estimated by all degrees of freedom. In units
@@ -314,8 +292,6 @@ class _DirectionGroups:
         ----------
         group, label : str
             The name of the test, and that of the direction in it.
-        trial_index : int
-            The index of the trial.
         change : (N, C) array
             The change of its prediction [unit of the channel].
         """

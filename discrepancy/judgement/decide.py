@@ -49,10 +49,6 @@ def reach_verdict(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    effects : sequence of Effect
-        The effects of the catalogue.
     on_progress : callable
         The function that receives a line for the progress display: the fit that runs, and how many
         remain.

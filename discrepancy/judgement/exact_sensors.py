@@ -57,13 +57,6 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
     decrease are then fitted with a free zero, each alone and then all together, as other unknowns
     may compensate for it. The first of these fits that removes at least `LEAST_REMOVED_SHARE` of
     the misfit of all channels is reported, for each of its channels.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model.
-    no_effect : CandidateFit
-        The fit of the model without any effect.
     """
     for nuisance in (_ZERO_NUISANCE, _GAIN_NUISANCE):
         drop_by_channel: dict[str, float] = {}

@@ -66,8 +66,6 @@ def outcome_with_hypotheses(
     ----------
     verdict : Verdict
         The verdict without hypotheses.
-    search : Search
-        The search whose hypotheses they are.
     fit : CandidateFit
         The fit that represents the verdict.
     hypotheses : sequence of WeightedHypothesis
@@ -96,12 +94,8 @@ def curve_sentence(problem: Problem, effects: Sequence[NamedEffect], probability
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model.
     effects : sequence of NamedEffect
         The effects of a hypothesis at their most probable values.
-    probability : float
-        The probability of the hypothesis.
     """
     curve = curve_of(effects)
     if curve is None:
@@ -190,16 +184,8 @@ def _forces_of_table(
 ) -> list[ParameterEstimate]:
     """Return the forces of a curve of free shape at some of its points, with 90 % intervals.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model.
-    port : str
-        The port of the curve.
-    hypothesis : ComparedHypothesis
-        The hypothesis; the curve is its only effect.
-    table : ForceTable
-        The curve as a sum of functions, whose amplitudes are the parameters of the hypothesis.
+    The curve is the only effect of the hypothesis. It is a sum of functions, and the effect
+    parameters of the hypothesis are their amplitudes.
     """
     functions = table.functions[::POINT_STRIDE]
     forces = functions @ hypothesis.effect
@@ -250,17 +236,7 @@ def _estimate(
     scaled_value: float,
     scaled_ends: tuple[float, float],
 ) -> ParameterEstimate:
-    """Return the estimate of a parameter in its unit.
-
-    Parameters
-    ----------
-    parameter : EffectParameter or ShapeParameter
-        The parameter, whose prior maps scaled to physical values.
-    scaled_value : float
-        The value on the scale on which the prior is standard normal.
-    scaled_ends : tuple of float
-        The ends of its scaled 90 % interval.
-    """
+    """Return the estimate of a parameter in its unit, given its value and interval as scaled."""
     ends = [parameter.prior.value(scaled_end) for scaled_end in scaled_ends]
     return ParameterEstimate(
         name=parameter.name,

@@ -54,8 +54,6 @@ def is_negligible_instrument_error(
     ----------
     problem : Problem
         The campaign and model, whose scales make the sizes relative.
-    patch : ModelPatch
-        The change of the model by an effect.
     least_unstated_gain : float
         The least size of a gain of a channel without a stated deviation.
     """

@@ -42,8 +42,6 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit, usually that of the model without effect.
     """
@@ -56,15 +54,7 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
 
 
 def moved_sensors(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, ...]:
-    """Return the gains and zeros among `moved_unknowns`.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model.
-    fit : CandidateFit
-        The fit.
-    """
+    """Return the gains and zeros among `moved_unknowns`."""
     return tuple(
         unknown
         for unknown in moved_unknowns(problem, fit)
@@ -90,8 +80,6 @@ def unknowns_moved_within_prior(problem: Problem, fit: CandidateFit) -> tuple[Mo
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model.
     fit : CandidateFit
         The fit, usually that of the model without effect.
     """

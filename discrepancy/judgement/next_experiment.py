@@ -78,8 +78,6 @@ def next_experiments(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model of the fits.
     open_fits : sequence of (CandidateFit, float)
         The hypotheses that are still open with their probabilities, the most probable first.
     """
@@ -119,8 +117,6 @@ def mutual_information(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model of the fits.
     proposal : Proposal
         The proposal with the new trial.
     fits : sequence of CandidateFit
@@ -190,8 +186,6 @@ def _predicted_trial(
     ----------
     trial_problem : Problem
         The problem of the new trial alone.
-    fit : CandidateFit
-        The fit of the hypothesis.
     recorded_over_actual_noise : (channels,) array
         The recorded noise deviation of each channel, divided by the actual one.
     """
@@ -437,16 +431,8 @@ def _changed_trial(
 ) -> _ChangedTrial | None:
     """Return a trial with one thing changed; None if the trial or the model does not allow it.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
-    trial : Trial
-        The trial that is varied.
-    change : str
-        The kind of change: `change` of a [[proposal]] table in `sentences.toml`.
-    amount : float
-        The size of the change: a factor, a fraction of the span, or a temperature difference [K].
+    `change` is the kind of change, as in a [[proposal]] table of `sentences.toml`. `amount` is a
+    factor, a fraction of the span or of the modal mass, or a temperature difference [K].
     """
     model = problem.model
     stations = model.stations

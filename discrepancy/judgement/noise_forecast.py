@@ -61,8 +61,6 @@ class NoiseForecast:
 
         Parameters
         ----------
-        change : ScreenedChange
-            The change of the readings by the effect.
         squared_detection_distance : float
             The squared distance at which an effect is detected.
 

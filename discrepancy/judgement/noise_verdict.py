@@ -149,8 +149,6 @@ def failed_test_verdict(case: NoiseCase[HypothesisT], checked_fit: CheckedFit) -
 
     Parameters
     ----------
-    case : NoiseCase
-        The hypotheses.
     checked_fit : CheckedFit
         The leading set, or the set with a free shape.
     """
@@ -286,16 +284,10 @@ def _below_limit_verdict(case: NoiseCase[HypothesisT]) -> VerdictOutcome:
 def _group_verdict(
     case: NoiseCase[HypothesisT], members: Sequence[_Member], probability: float
 ) -> VerdictOutcome:
-    """Return the verdict that one of several sets is missing and the data do not tell which.
+    """Return the verdict that one of several sets is missing, and the data do not show which.
 
-    Parameters
-    ----------
-    case : NoiseCase
-        The hypotheses.
-    members : sequence of _Member
-        The sets of effects that the group consists of.
-    probability : float
-        The probability that one of them is missing.
+    The probability is that one of the members is missing. A single member is a group if its
+    probability is too low for a name.
     """
     fits = [with_draws(case.problem, member.fit) for member in members]
     effects_by_member = [named_effects(case.problem, fit) for fit in fits]

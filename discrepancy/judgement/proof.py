@@ -171,7 +171,7 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     return ChiSquare(float(np.concatenate(squares).mean()), expected_chi_square, deviation)
 
 
-def correlation_time(series: FloatArray) -> float:
+def samples_per_independent_sample(series: FloatArray) -> float:
     """Return how many samples of a correlated series (N,) count as one independent sample.
 
     The number is 1 + 2 sum rho_k, with the autocorrelation rho_k at the lag of k samples, and at
@@ -196,16 +196,9 @@ def _uniformity_p_value(
 ) -> float:
     """Return the p-value of Pearson's χ² test that a histogram is uniform over its bins.
 
-    Samples that depend on each other count as fewer independent samples.
-
-    Parameters
-    ----------
-    standardised : sequence of (N, C) array
-        The residuals of each trial over their predictive deviation.
-    used_by_trial : sequence of (N, C) array of bool
-        For each trial, whether a sample counts.
-    counts : (bins,) array of int
-        The number of samples in each bin.
+    Correlated samples count as fewer independent ones. How many is estimated from the standardised
+    residuals (N, C) of each trial, where they are used. The p-value is nan with fewer independent
+    samples than bins.
     """
     sample_count = 0
     independent_count = 0.0
@@ -214,7 +207,8 @@ def _uniformity_p_value(
             series = values[is_used[:, column], column]
             if series.size:
                 samples_per_independent = max(
-                    correlation_time(series), correlation_time(np.abs(series))
+                    samples_per_independent_sample(series),
+                    samples_per_independent_sample(np.abs(series)),
                 )
                 sample_count += series.size
                 independent_count += series.size / samples_per_independent
@@ -476,19 +470,12 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
 
 
 def _remaining_sentence(residuals: ResidualSet, scores: Scores) -> str:
-    """Return a sentence on the residuals of a model that contains the effect.
+    """Return a sentence on what remains after the effect, given the residuals and their scores.
 
-    Parameters
-    ----------
-    residuals : ResidualSet
-        The residuals with the effect: either all of held-out trials, or, if no trial is held out,
-        all of fitted trials.
-    scores : Scores
-        The scores of these residuals.
+    The trials must be either all held out, or all fitted.
     """
     if not isfinite(scores.chi_square_per_sample):
         return "Without a noise record it is not known what remains."
-    # the trials are all of one kind, so the first one shows which
     trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
     chi_square_phrase = f"χ² per sample {scores.chi_square_per_sample:.3g} on {trials}"
     channels = residuals.recorded_channels

@@ -39,8 +39,6 @@ def decide_on_remainder(
 
     Parameters
     ----------
-    comparison : Comparison
-        The comparison of all hypotheses.
     noise_verdict : Verdict
         The verdict if only noise may remain, with the tests that the simulations failed.
     """
@@ -90,12 +88,8 @@ def named_in_part_outcome(
 
     Parameters
     ----------
-    comparison : Comparison
-        The comparison of all hypotheses.
     best_hypothesis : HypothesisT
         The hypothesis that is named.
-    probability : float
-        The probability of that hypothesis.
     """
     effects = named_effects(comparison.problem, comparison.record_values(best_hypothesis))
     share = comparison.held_out_or_fitted_share(best_hypothesis)
@@ -212,18 +206,10 @@ def _unproved_addition_sentence(
 def _group_outcome(
     comparison: Comparison[HypothesisT], members: Sequence[HypothesisT], probability: float
 ) -> VerdictOutcome:
-    """Return the verdict that one of several hypotheses is true, and the data do not tell which.
+    """Return the verdict that one of several hypotheses is true, and the data do not show which.
 
-    The sentence begins with the effects that all of them have in common.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison of all hypotheses.
-    members : sequence of HypothesisT
-        The hypotheses of the group, the best one first.
-    probability : float
-        The probability that one of them is true.
+    The members are given the best one first, with the probability that one of them is true. The
+    sentence begins with the effects that all of them have in common.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
     sentence = _group_sentence(comparison, members, effects_by_member, probability)
@@ -300,8 +286,6 @@ def unexplained_outcome(
 
     Parameters
     ----------
-    comparison : Comparison
-        The comparison of all hypotheses.
     noise_verdict : Verdict
         The verdict on the simulations.
     considered_hypothesis : HypothesisT, optional
@@ -425,8 +409,6 @@ def _outcome(
 
     Parameters
     ----------
-    comparison : Comparison
-        The comparison of all hypotheses.
     kind, sentence, probability
         What is concluded, see `Verdict`.
     judged_hypothesis : HypothesisT or None

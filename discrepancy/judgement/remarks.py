@@ -50,12 +50,7 @@ def window_text(window: GapWindow) -> str:
 def gap_times_sentence(windows: Sequence[GapWindow]) -> str:
     """Return a sentence on when model and readings disagree; empty if no window shows a gap.
 
-    The model is the one without effect: a gap of the best hypothesis is told elsewhere.
-
-    Parameters
-    ----------
-    windows : sequence of GapWindow
-        The windows of gaps, of the model without effect and of the best hypothesis.
+    Only the windows of the model without effect count, not those of the best hypothesis.
     """
     without_effect = [window for window in windows if not window.with_effect]
     if not without_effect:
@@ -80,15 +75,7 @@ def _gap_window_text(window: GapWindow) -> str:
 
 
 def sentence_with_times(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
-    """Return the sentence of a verdict, with the times of its gap or effects if informative.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        The verdict on the campaign.
-    windows : sequence of GapWindow
-        The windows in time in which there is a gap.
-    """
+    """Return the sentence of a verdict, with the times of its gap or effects if informative."""
     times_sentence = active_windows_sentence(verdict.effects)
     is_informative = has_gap_beginning_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
     if not times_sentence and verdict.kind not in KINDS_WITHOUT_GAP and is_informative:
@@ -134,12 +121,8 @@ def verdict_with_untested_effects(
 
     Parameters
     ----------
-    verdict : Verdict
-        The verdict on the campaign.
     setting : Setting
         The campaign and the model, for which the effects may be available.
-    effects : sequence of Effect
-        The effects of the catalogue.
     """
     if verdict.kind not in (*KINDS_WITH_NAME, VerdictKind.GROUP):
         return verdict
@@ -166,8 +149,6 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
 
     Parameters
     ----------
-    verdict : Verdict
-        The verdict with its effects.
     compared : iterable of Effect
         The effects that can act in the campaign and were compared with the named effects.
 

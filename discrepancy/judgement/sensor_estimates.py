@@ -22,15 +22,7 @@ PERCENT = (100.0, "%")
 def sensor_fits(
     estimates: Sequence[SensorEstimate], channels: Mapping[str, Channel]
 ) -> tuple[SensorFit, ...]:
-    """Return fitted gains and zeros with the units in which they are shown.
-
-    Parameters
-    ----------
-    estimates : sequence of SensorEstimate
-        The fitted gains and zeros.
-    channels : mapping of str to Channel
-        The channels of the campaign by name.
-    """
+    """Return fitted gains and zeros with the units in which they are shown."""
     fits = []
     for estimate in estimates:
         is_gain = estimate.kind is SensorValue.GAIN
@@ -57,8 +49,6 @@ def sensor_estimates(problem: Problem, fit: CandidateFit) -> tuple[SensorEstimat
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and model.
     fit : CandidateFit
         The fit, with the posterior covariance of what the trials share.
     """
@@ -94,18 +84,9 @@ def _gain_estimates(problem: Problem, fit: CandidateFit) -> list[SensorEstimate]
 def _zero_offset_estimates(
     problem: Problem, fit: CandidateFit, trial_index: int, precision_ratios: FloatArray
 ) -> list[SensorEstimate]:
-    """Return the zero offsets of the sensors that were fitted in a trial; they are stated as zero.
+    """Return the zero offsets of sensors that were fitted in a trial; the stated value is zero.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and model.
-    fit : CandidateFit
-        The fit whose unknowns and covariance are read.
-    trial_index : int
-        The index of the trial.
-    precision_ratios : (channels,) array
-        The ratio of the estimated to the recorded noise precision of each channel.
+    `precision_ratios` (channels,) are the estimated over the recorded noise precisions.
     """
     data = problem.trials[trial_index]
     layout = data.unknowns

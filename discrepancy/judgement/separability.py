@@ -118,10 +118,6 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
 
     Parameters
     ----------
-    campaign : Campaign
-        The campaign with its readings as measured.
-    model : Model
-        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
     """
@@ -187,12 +183,8 @@ def compute_separability(
     campaign : Campaign
         The campaign with its inputs, channels and noise records. The readings are used only to
         determine unknown initial states, see `campaign_as_predicted`.
-    model : Model
-        The unchanged model.
     setting : Setting
         The scales by which the catalogue states its priors.
-    effects : sequence of Effect
-        The effects of the catalogue.
     """
     problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
@@ -320,17 +312,9 @@ def _has_reference_magnitude(change: ScreenedChange) -> bool:
 def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> Detectability:
     """Return how well an effect can be detected.
 
-    The squared distance grows with the square of the magnitude, so the least detectable magnitude
-    is typical * sqrt(DETECTION_DISTANCE / distance).
-
-    Parameters
-    ----------
-    effect : Effect
-        The effect of the catalogue.
-    change : ScreenedChange
-        The change of the readings by the effect at its reference magnitude.
-    distance : float
-        The squared distance of that change from the model [sigma^2].
+    `distance` is the squared distance of the effect at its reference magnitude from the model
+    without it [sigma^2]. It grows with the square of the magnitude, so the least detectable
+    magnitude is typical * sqrt(DETECTION_DISTANCE / distance).
     """
     for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:

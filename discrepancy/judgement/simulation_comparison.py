@@ -118,15 +118,9 @@ class SimulationComparison(Comparison[CandidateFit]):
         )
 
     def _block_sums(self, trial_before: FittedTrial, trial_after: FittedTrial) -> list[_BlockSums]:
-        """Return squared residuals before and after, and counts, summed over blocks of samples.
+        """Return sums over blocks of a trial, given its residuals without effect and with effects.
 
-        Residuals are divided by the deviation of their noise. Both trials use the same readings.
-
-        Parameters
-        ----------
-        trial_before, trial_after : FittedTrial
-            The trial with the residuals of the model without effect, and with the residuals of a
-            hypothesis.
+        Both residuals are divided by the same noise deviation. A static trial is one block.
         """
         is_used = trial_before.used
         noise_scales = np.array([self._noise_scales[name] for name in trial_before.trial.channels])
@@ -293,11 +287,7 @@ def _trials_in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[Fi
 def _rms_beyond_noise(sums: FloatArray, noise_sums: FloatArray) -> float:
     """Return the rms residual beyond the noise, in noise deviations.
 
-    Parameters
-    ----------
-    sums : (B,) array
-        The sum of squared residuals of each block, over the noise variance.
-    noise_sums : (B,) array
-        The expected part of the noise in these sums: the number of samples.
+    It is computed from the sums of squared residuals of blocks (B,), and from the part that the
+    noise is expected to have in them (B,).
     """
     return float(np.sqrt(max(sums.sum() / noise_sums.sum() - 1.0, 0.0)))

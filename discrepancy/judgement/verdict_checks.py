@@ -91,12 +91,7 @@ def _verdict_without_name(verdict: Verdict, sentence: str) -> Verdict:
 def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
     """Return the sentence on a hypothesis that would be named, but makes the error larger.
 
-    Parameters
-    ----------
-    verdict : Verdict
-        The verdict that names it.
-    clause : str
-        The clause on how much the error grows, from `closed_share_text`.
+    `clause` is that of `closed_share_text` on how much the error grows.
     """
     effects = effects_text(verdict.effects) or "the best hypothesis"
     return (

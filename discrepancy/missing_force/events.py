@@ -253,10 +253,6 @@ def find_events(
 
     Parameters
     ----------
-    linearisation : Linearisation
-        The trials with the columns of all unknowns, without laws.
-    port : int
-        The number of the port.
     process : Process
         A force that acts throughout.
     least_score : float
@@ -298,10 +294,6 @@ def force_in_records(linearisation: Linearisation, port: int, process: Process) 
 
     Parameters
     ----------
-    linearisation : Linearisation
-        The trials with the columns of all unknowns, without laws.
-    port : int
-        The number of the port.
     process : Process
         The force with which the search for the most probable one begins.
     """

@@ -98,13 +98,6 @@ def _share_of(
     The share is 1 - (squares_after - noise) / (squares_before - noise), with a numerator of at
     least zero. It is zero if `squares_before` is not larger than `noise`, as there is then no gap
     that could be explained.
-
-    Parameters
-    ----------
-    squares_before, squares_after : array
-        The sums of squares of the gap without and with the hypothesis.
-    noise : array
-        The sums of squares that noise alone gives.
     """
     gap_squares = squares_before - noise
     remaining_ratio = np.divide(

@@ -219,14 +219,14 @@ class MissingForce:
     ----------
     at_port : ForceAtPort
         The record of the force in the verdict.
-    trial_forces : sequence of TrialForce
+    courses : sequence of TrialForce
         The force in each fitted trial.
     law : str
         The name of the effect at the port whose force is drawn with it; empty if there is none.
     """
 
     at_port: ForceAtPort
-    trial_forces: Sequence[TrialForce]
+    courses: Sequence[TrialForce]
     law: str = ""
 
 
@@ -235,13 +235,6 @@ def missing_force(search: ForceSearch, estimate: Estimate) -> MissingForce | Non
 
     The port is that of the law of the hypothesis if it has laws at one port only, otherwise the
     port with the most evidence. The share that the law explains is not computed here.
-
-    Parameters
-    ----------
-    search : ForceSearch
-        The search for the missing force.
-    estimate : Estimate
-        The estimate of a hypothesis, with the motion and the forces of each trial.
 
     Returns
     -------
@@ -446,8 +439,6 @@ def missing_force_of_verdict(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     search : ForceSearch or None
         The search for the missing force, if there was one.
     estimate : Estimate or None

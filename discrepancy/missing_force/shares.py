@@ -88,8 +88,6 @@ class ForceShares:
 
         Parameters
         ----------
-        estimate : Estimate
-            The estimate of the hypothesis.
         held_out : bool
             Whether the share is computed in the held-out trials, and not in the fitted trials.
         """
@@ -141,8 +139,6 @@ class ForceShares:
 
         Parameters
         ----------
-        estimate : Estimate
-            The estimate of the hypothesis.
         linearisation : Linearisation
             The trials, linear along their motion with the hypothesis.
         trials, trials_without : sequence of SmoothedTrial

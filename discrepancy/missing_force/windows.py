@@ -55,11 +55,9 @@ def gap_windows(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     fit : CandidateFit
         The fit of the verdict. If its law at a port, acting throughout, has more evidence than
-        events, there are no windows.
+        events, each window is a whole record.
     residuals : ResidualSet
         The residuals of the unchanged model. They alone are examined if missing forces cannot be
         estimated, or if the model has laws of its own, which are exact only in a simulation.
@@ -92,16 +90,8 @@ def _windows_of_missing_force(
 ) -> tuple[GapWindow, ...]:
     """Return the windows in which a force is missing at the port with the most evidence.
 
-    If an error of a channel is more probable, they are the windows of that error.
-
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and model, with the dynamic trials.
-    fit : CandidateFit
-        The fit of the verdict.
-    leaves_no_force : bool
-        Whether no force is missing beside its effects.
+    If an error of a channel is more probable, they are the windows of that error. The problem must
+    have trials in motion only.
     """
     search = ForceSearch(problem)
     port = max(search.estimate_by_port, key=lambda name: search.estimate_by_port[name].log_evidence)
@@ -158,15 +148,11 @@ def windows_of_residuals(
 
     Parameters
     ----------
-    residuals : ResidualSet
-        The residuals of the trials to examine.
     seed : int
         The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
         the noise that the fit has absorbed.
     with_effect : bool
         Whether the residuals are those of the best hypothesis, not of the unchanged model.
-    kinds : frozenset of TrialKind
-        The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
     white_residuals_of_trials = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
@@ -268,12 +254,8 @@ def _port_or_channel_error(
 
     Parameters
     ----------
-    port : int
-        The number of the port.
     at_port : Estimate
         The estimate of a missing force at that port alone.
-    channels : sequence of tuple of str
-        The channels of each trial.
 
     Returns
     -------
@@ -351,16 +333,7 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
 
     The ports of the model, at which forces act on the structure, are replaced by a single port
     that acts on the readings alone. A force of one there raises the reading of the channel by one
-    standard deviation of its noise.
-
-    Parameters
-    ----------
-    trial : PortedTrial
-        The trial, with N samples of C channels and n states.
-    channels : sequence of str
-        The names of the C channels.
-    channel : str
-        The name of the channel with the error.
+    standard deviation of its noise. `channels` are the names of all channels of the trial.
     """
     # The readings (C,) are C s - e f, with state s and force f; `through` is e, an array (1, C).
     # It has a minus sign, so that a positive force raises the reading.
@@ -394,8 +367,6 @@ def strongest_pattern(
 
     Parameters
     ----------
-    name : str
-        The name of the trial.
     time : (N,) array
         The times of the samples [s].
     series : (N, C) array
@@ -465,10 +436,6 @@ def _windows_of_events(
 
     Parameters
     ----------
-    events : Events
-        The events in all trials.
-    channels : sequence of tuple of str
-        The channels of each trial.
     readings_by_force : sequence of (N, C) array
         The part of the readings of each trial that the force makes, divided by the noise.
     with_effect : bool

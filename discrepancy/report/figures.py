@@ -189,10 +189,10 @@ def missing_force_figure(missing: MissingForce) -> Figure:
     else:
         motions = {"position": "integral of the state", "speed": f"state, {speed_unit}"}
     followed = missing.at_port.ordered_by[:1]
-    if followed and any(followed[0] in course.variables for course in missing.trial_forces):
+    if followed and any(followed[0] in course.variables for course in missing.courses):
         del motions["speed"]
         motions[followed[0]] = followed[0].removeprefix("the ")
-    sample_count = sum(len(course.time) for course in missing.trial_forces)
+    sample_count = sum(len(course.time) for course in missing.courses)
     drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
     figure, rows = residual_figures.new_panels(
         len(row_titles), 3, 1.6 * len(row_titles) + 0.5, sharey=True
@@ -229,7 +229,7 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
     has_law : bool
         True to draw the law as well.
     """
-    strongest = max(missing.trial_forces, key=lambda course: float(np.max(np.abs(course.force))))
+    strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
     # the samples around the largest force, within the record
     first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
     first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
@@ -261,9 +261,9 @@ def _draw_over_motion(
     samples : slice
         Samples that are drawn.
     """
-    is_variable = any(motion in course.variables for course in missing.trial_forces)
+    is_variable = any(motion in course.variables for course in missing.courses)
     courses = [
-        course for course in missing.trial_forces if not is_variable or motion in course.variables
+        course for course in missing.courses if not is_variable or motion in course.variables
     ]
 
     def joined(name: str) -> FloatArray:

@@ -13,11 +13,6 @@ def fits_of_free_shape(candidates: FittedCandidates) -> list[CandidateFit]:
     A fit is returned if the free shape gains more than `LEAST_SHAPE_GAIN` and the test of absolute
     fit does not fail. Effects of one family at one place become the same law when their shape is
     free, so only the fit with the highest score is returned for each family and place.
-
-    Parameters
-    ----------
-    candidates : FittedCandidates
-        All candidates that were fitted so far, with the problem.
     """
     problem = candidates.problem
     best_by_family: dict[tuple[str, str], CandidateFit] = {}

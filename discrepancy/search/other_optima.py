@@ -17,7 +17,7 @@ from discrepancy.fits.fitting import CandidateFit, try_fit
 from .fitted_candidates import FittedCandidates
 
 LEAST_TAIL = 0.02
-"""Least prior probability on either side of the moved end of a stretch."""
+"""Least prior probability on either side of a changed parameter."""
 
 
 def refit_from_other_stretches(
@@ -33,8 +33,6 @@ def refit_from_other_stretches(
     ----------
     candidates : FittedCandidates
         All candidates and their fits, to which the new ones are added.
-    on_progress : callable
-        The function to which progress is reported, as a line of text.
     """
     best_fit = candidates.best()
     for point in points_at_other_stretches(best_fit):
@@ -45,20 +43,20 @@ def refit_from_other_stretches(
 
 
 def points_at_other_stretches(fit: CandidateFit) -> list[Point]:
-    """Return starting points at which one end of a stretch is moved to either side.
+    """Return starting points at which the start or the length of a stretch is changed.
 
     An effect covers a stretch if the catalogue gives a number of levels for more than one of its
-    parameters: these are the ends of the stretch. Each end is moved by half a level, which is 0.5 /
-    (number of levels) of its prior probability, while all other unknowns stay.
+    parameters, such as start and length. One of them at a time is changed to either side by half a
+    level, which is 0.5 / (number of levels) of its prior probability. All other unknowns stay.
     """
     points = []
     first_parameter = 0
     for term in fit.candidate.terms:
-        end_numbers = [
+        numbers_with_levels = [
             number for number, parameter in enumerate(term.parameters) if parameter.levels > 1
         ]
-        if len(end_numbers) > 1:
-            for number in end_numbers:
+        if len(numbers_with_levels) > 1:
+            for number in numbers_with_levels:
                 half_level = 0.5 / term.parameters[number].levels
                 index = first_parameter + number
                 for change in (-half_level, half_level):

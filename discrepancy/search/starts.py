@@ -48,10 +48,6 @@ def report_each(
 
     Parameters
     ----------
-    on_progress : callable
-        The function to which progress is reported, as a line of text.
-    items : sequence
-        The items to yield.
     describe : callable
         Returns a phrase on how an item is processed, such as "fitting gain".
     """
@@ -195,8 +191,6 @@ def best_pairs(
 
     Parameters
     ----------
-    changes : sequence of ScreenedChange
-        The changes by all effects.
     inner_product_signs : (D,) array
         The signs of the entries in the inner product of two changes, see
         `Screen.inner_product_signs`.
@@ -252,8 +246,6 @@ def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatA
     ----------
     base : CandidateFit
         The fit that the effect is added to.
-    term : EffectTerm
-        The effect at its place.
     values : (E,) array
         The E parameters of the effect, on the scale on which their priors are standard normal.
     """
@@ -276,8 +268,6 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     base : CandidateFit
         The fit that the effect is added to.
     effect : Effect

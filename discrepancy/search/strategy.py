@@ -99,13 +99,6 @@ class Search(FittedCandidates):
         is far only because it moves shared unknowns, they are fitted from the screen, too, and the
         grid is left out if one of these fits passes the test of absolute fit.
 
-        Parameters
-        ----------
-        base : CandidateFit
-            The fit that effects are added to.
-        effects : iterable of Effect
-            The effects to add, one at a time.
-
         Returns
         -------
         list of CandidateFit

@@ -36,8 +36,6 @@ def search(
 
     Parameters
     ----------
-    problem : Problem
-        The campaign and the model, with the layout of their unknowns.
     effects : sequence of Effect
         The catalogue. Effects that cannot act in the campaign are left out. If an event of the
         campaign may have begun or ended an effect, the effect is also tried in that form.

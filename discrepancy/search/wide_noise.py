@@ -69,8 +69,6 @@ def estimate_residual_process(problem: Problem, fit: CandidateFit) -> ResidualPr
     ----------
     problem : Problem
         The campaign and model under the recorded noise.
-    fit : CandidateFit
-        The fit of a hypothesis to all trials.
     """
     noise_levels = unrecorded_noise_levels(problem, fit)
     channels = []
@@ -90,16 +88,8 @@ def _channel_process(
 ) -> _ChannelProcess:
     """Return the random process in the residuals of one channel besides white noise.
 
-    Parameters
-    ----------
-    problem : Problem
-        The campaign and model under the recorded noise.
-    fit : CandidateFit
-        The fit of a hypothesis to all trials.
-    channel : int
-        The index of the channel.
-    noise_level : float
-        The variance of the noise over s0^2, with s0 its recorded deviation or a stand-in.
+    `noise_level` is the variance of the noise over s0^2, with s0 its recorded deviation or, without
+    a record, a stand-in.
     """
     records = residual_records(problem, fit, channel)
     if not records:
@@ -321,8 +311,6 @@ def refit_under_wide_noise(
         The problem under the recorded noise.
     wide_problem : Problem
         The problem under the wider noise.
-    fit : CandidateFit
-        The fit of the hypothesis.
     iterations : int
         The largest number of steps.
 

@@ -19,9 +19,9 @@ from discrepancy.judgement.decide import reach_verdict
 from discrepancy.judgement.proof import (
     check_held_out,
     compute_scores,
-    correlation_time,
     log_density,
     prove_effects,
+    samples_per_independent_sample,
 )
 from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
@@ -261,10 +261,10 @@ def test_standard_error_is_that_of_trials_not_of_samples():
 
 def test_correlation_time_of_an_autoregression():
     white = np.random.default_rng(10).standard_normal((40, 4000))
-    found = [correlation_time(series) for series in lfilter([1.0], [1.0, -0.8], white)]
+    found = [samples_per_independent_sample(series) for series in lfilter([1.0], [1.0, -0.8], white)]
     assert np.mean(found) == pytest.approx(1.8 / 0.2, rel=0.15)
-    assert correlation_time(np.ones(10)) == 1.0
-    assert correlation_time(np.array([1.0, -1.0] * 50)) == 1.0
+    assert samples_per_independent_sample(np.ones(10)) == 1.0
+    assert samples_per_independent_sample(np.array([1.0, -1.0] * 50)) == 1.0
 
 
 # ---------------------------------------------------------------- the gate of consistency

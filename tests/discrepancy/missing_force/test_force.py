@@ -70,8 +70,8 @@ CART, CART_IN_AIR, SHAKEN, SERVO, STORES, PLAY = 0, 5, 8, 12, 14, 16
 
 def share_of(missing):
     """Return the share that the law is of the force's mean square."""
-    force = np.concatenate([item.force for item in missing.trial_forces])
-    law = np.concatenate([item.law for item in missing.trial_forces if item.law is not None])
+    force = np.concatenate([item.force for item in missing.courses])
+    law = np.concatenate([item.law for item in missing.courses if item.law is not None])
     return 1.0 - float(np.mean((force - law) ** 2) / np.mean(force**2))
 
 
@@ -236,7 +236,7 @@ def test_the_missing_force_is_found_at_its_port_with_its_law(friction_on_rail):
 
 def test_the_course_of_dry_friction_is_a_step(friction_on_rail):
     """Its size hardly varies where the cart moves, and its sign is that of the speed."""
-    for course in friction_on_rail.missing.trial_forces:
+    for course in friction_on_rail.missing.courses:
         moving = np.abs(course.speed) > 0.2
         force = course.force[moving]
         assert np.std(np.abs(force)) < 0.2 * np.mean(np.abs(force))
@@ -252,7 +252,7 @@ def test_a_verdict_has_port_unit_and_law_of_the_missing_force(friction_on_rail):
 
 def test_a_verdict_has_the_size_of_the_missing_force_and_of_the_speed(friction_on_rail):
     told = friction_on_rail.verdict.force
-    courses = friction_on_rail.missing.trial_forces
+    courses = friction_on_rail.missing.courses
     force = np.concatenate([course.force for course in courses])
     speed = np.concatenate([course.speed for course in courses])
     assert told.rms == pytest.approx(np.sqrt(np.mean(force**2)))
@@ -263,7 +263,7 @@ def test_a_verdict_has_the_size_of_the_missing_force_and_of_the_speed(friction_o
 def course_of_largest_force(found):
     """Return the course of the trial in which the missing force is largest."""
     name = found.verdict.force.largest.trial
-    (course,) = (item for item in found.missing.trial_forces if item.trial == name)
+    (course,) = (item for item in found.missing.courses if item.trial == name)
     return course
 
 
@@ -439,7 +439,7 @@ def test_friction_that_holds_is_the_law_of_the_missing_force():
     missing = missing_force(search, drawn_through(search, FRICTION, "joint"))
     assert (missing.at_port.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95
-    for item in missing.trial_forces:
+    for item in missing.courses:
         slips = np.abs(item.speed) > 0.02
         np.testing.assert_allclose(np.abs(item.law[slips]), 0.528, rtol=0.06)
         assert np.abs(item.law).max() < 0.56  # where it sticks no more than that holds it

@@ -192,8 +192,8 @@ def test_an_investigation_shows_its_verdict_and_the_missing_force_in_a_notebook(
     assert drag.verdict.sentence in html.unescape(text)
     assert "quadratic aerodynamic damping" in text.lower()
     panels = drag.plot()
-    assert len(panels) == len(drag.missing.trial_forces[:6])
-    for panel, course in zip(panels, drag.missing.trial_forces, strict=False):
+    assert len(panels) == len(drag.missing.courses[:6])
+    for panel, course in zip(panels, drag.missing.courses, strict=False):
         force, law = panel.get_lines()
         np.testing.assert_array_equal(force.get_ydata(), course.force)
         np.testing.assert_array_equal(law.get_ydata(), course.law)
