@@ -38,3 +38,12 @@ def test_an_effect_that_grows_without_bound_is_left_out_with_the_reason(search):
     assert not screened
     reason = search.ported.problem_with_laws.refusals["explosive"]
     assert reason.endswith("is not a finite number at every time.")
+
+
+def test_laws_that_are_the_same_with_free_exponents_are_compared_once(search):
+    """Dry friction and structural damping are named apart; with free exponents they are one law."""
+    damping = kit.chosen("coulomb_friction", "structural_damping")
+    screened = screen_effects(search, search.best_port_estimate, damping)
+    named = [effect.term.effect.identifier for effect in screened if not effect.term.free_shape]
+    assert sorted(named) == ["coulomb_friction", "structural_damping"]
+    assert [effect.term.free_shape for effect in screened].count(True) == 1
