@@ -2,8 +2,8 @@
 
 The estimator is Gauss-Newton's method on the trajectory (see `gauss_newton`). It begins with a
 large missing force, with which the trajectory follows the readings whatever the law is, and lowers
-that force in steps (continuation). It also begins at the motion that the laws alone give, beside
-which little force is missing. The missing force with the largest evidence is returned.
+that force in steps (continuation). It also begins with a small missing force at the motion that the
+laws alone give. The estimate with the largest evidence is returned.
 """
 
 from collections.abc import Sequence
@@ -25,33 +25,33 @@ from .linearisation import Linearisation
 from .process_search import Processes, scale_processes
 
 DEVIATION_FRACTIONS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015, 0.007, 0.003, 0.001)
-"""Standard deviations of the missing force that are tried in turn, divided by the one at the
-start."""
+"""Standard deviations of the missing force that are tried in turn, over the one at the start."""
 USUAL_WINDOW = 0.005
 """Half width of the window of speeds over which laws of the speed are averaged, divided by the rms
 speed."""
 FIRST_WINDOWS = (0.5, 0.02)
-"""First half widths of this window for a law that holds a body at rest, such as dry friction. From
-there on the window becomes narrower together with the missing force: a narrow one leads the
-iteration astray as long as the missing force is large, and in a wide one a body that sticks
-creeps, which only a missing force can undo. Which beginning is better depends on the record."""
+"""First half widths of this window for a law that holds a body at rest, such as dry friction. The
+window becomes narrower together with the missing force. While the missing force is large, a narrow
+window leads the iteration astray. In a wide one a body that sticks creeps, which only a missing
+force can prevent. Which first width is better depends on the record, so both are tried."""
 NARROWEST_WINDOW = 2e-4
 """Narrowest half width of this window."""
 WINDOW_AT_REST = 1e-5
 """Half width of this window along the motion of the laws alone."""
 MOST_FOLLOWED_FORCES = 4
-"""Largest number of missing forces with which the motion of the laws is followed."""
+"""Largest number of missing forces that are tried along the motion of the laws alone."""
 SMALL_FRACTION = 0.03
-"""Standard deviation of the missing force beside laws whose motion is followed, divided by that
-without any law."""
-LARGEST_SHARE_BESIDE_LAWS = 0.5
-"""Standard deviation of the missing force beside laws, divided by that without any law, above which
-the laws do not make the motion."""
-FOLLOWED_SHARE = 0.1
-"""This ratio beside laws at their most probable values, above which the motion of the laws alone is
-not tried: without the missing force it is farther from the readings."""
+"""Standard deviation of the missing force with which an estimate along the motion of the laws alone
+begins, over that without any law."""
+LARGEST_RATIO_BESIDE_LAWS = 0.5
+"""Standard deviation of the missing force beside laws, over that without any law, above which the
+laws do not explain the motion."""
+FOLLOWED_RATIO = 0.1
+"""This ratio above which the motion of the laws alone is not tried: without the missing force it is
+too far from the readings."""
 ROUGH_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01)
-"""These standard deviations in a rough estimate."""
+"""Standard deviations of the missing force that are tried in a rough estimate, over the one at the
+start."""
 MOST_ROUGH_ITERATIONS = 3
 """Largest number of linearisations at each of them."""
 MOST_PASSING_ITERATIONS = 8
@@ -59,12 +59,11 @@ MOST_PASSING_ITERATIONS = 8
 MOST_LAST_ITERATIONS = 4
 """Largest number of linearisations where all values are nearly known."""
 PATTERN_FACTORS = (3.0, 1.7, 1.3)
-"""Factors on size and time of a missing force in the search for its most probable values, in
-turn."""
+"""Factors on amplitude and correlation time of a missing force that are tried in turn."""
 COARSE_FACTORS = (3.0,)
-"""These factors where the trials are linearised again, so that size and time will change."""
+"""These factors if the trials are linearised again later, so that both values will change."""
 LAST_FACTORS = (2.5, 1.5)
-"""These factors where size and time are nearly known; each is tried once."""
+"""These factors if both values are nearly known; each factor is tried once."""
 MOST_REPETITIONS = 4
 """Largest number of times in a row that one factor is tried, as long as the evidence rises."""
 LARGEST_DECLINE, MOST_DECLINES = 12.0, 2
@@ -92,10 +91,10 @@ class MotionEstimator:
         """The missing forces with which an estimate along the motion of the laws alone begins."""
         return scale_processes(self.processes_without_effects, SMALL_FRACTION, 1.0)
 
-    def share_of_missing_force(self, estimate: Estimate) -> float:
-        """Return the missing force beside a hypothesis over that without effects.
+    def missing_force_ratio(self, estimate: Estimate) -> float:
+        """Return the standard deviation of the missing force over that without effects.
 
-        It is the ratio of the standard deviations, the largest one of all ports.
+        It is the largest ratio of all ports.
         """
         return max(
             process.standard_deviation / self.processes_without_effects[port].standard_deviation
@@ -107,8 +106,6 @@ class MotionEstimator:
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with, and large missing forces.
 
@@ -131,24 +128,24 @@ class MotionEstimator:
     def estimate_roughly(
         self, laws: HypothesisLaws, start: EstimatorStart, small_processes: Processes
     ) -> Estimate | None:
-        """Return an estimate for a first comparison, after few steps and few missing forces.
+        """Return an estimate for a first comparison, after few steps.
+
+        One estimate is made with the small missing forces that may remain beside the effects, and
+        others with the large ones of `start`, which are lowered in steps.
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with, and large missing forces.
         small_processes : mapping of int to Process
-            The missing forces that may remain beside the effects, with which another estimate
-            begins.
+            The small missing forces, by the number of the port.
 
         Returns
         -------
         Estimate or None
-            The more probable estimate; None if the laws are not possible along the trajectories.
+            The most probable estimate; None if the laws are not possible along the trajectories.
         """
-        # a narrow window is as good as the small missing forces, a wide one as the large ones
+        # small missing forces need a narrow window, and large ones a wide one
         narrow_window = NARROWEST_WINDOW if laws.hold_at_rest else USUAL_WINDOW
         best_estimate = self.gauss_newton.iterate(
             laws, replace(start, processes=small_processes), narrow_window, MOST_ROUGH_ITERATIONS
@@ -174,10 +171,10 @@ class MotionEstimator:
     ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are near them.
 
+        If little force is missing beside it, it is also estimated along the motion of its laws.
+
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with. The missing forces need not be large.
         speed_window : float
@@ -192,7 +189,7 @@ class MotionEstimator:
         if estimate is None:
             return self.follow_laws(laws, replace(start, processes=self.small_processes))
         tuned_estimate = self.tune_processes(laws, estimate)
-        if self.share_of_missing_force(tuned_estimate) > FOLLOWED_SHARE:
+        if self.missing_force_ratio(tuned_estimate) > FOLLOWED_RATIO:
             return tuned_estimate
         next_start = replace(start_from_estimate(tuned_estimate), processes=self.small_processes)
         return _more_probable(tuned_estimate, self.follow_laws(laws, next_start))
@@ -204,8 +201,6 @@ class MotionEstimator:
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The unknowns to begin with, and small missing forces.
 
@@ -246,12 +241,12 @@ class MotionEstimator:
     ) -> Estimate | None:
         """Return a hypothesis at its most probable values, from values that are nearly these.
 
-        The search for the most probable missing forces is short.
+        It is first estimated along the motion of its laws, and returned if that leaves no force.
+        Otherwise it is also estimated along the given trajectories, with a short search for the
+        most probable missing forces, and the more probable of both estimates is returned.
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values, trajectories and missing forces to begin with.
         speed_window : float
@@ -291,8 +286,6 @@ class MotionEstimator:
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The unknowns, trajectories and missing forces of the first estimate.
         speed_window : float
@@ -317,7 +310,7 @@ class MotionEstimator:
             )
             if estimate is None:
                 break
-            # smaller forces will hardly raise an evidence this far below the best one above it
+            # with smaller forces the evidence will hardly rise again from this far below the best
             if (
                 best_estimate is not None
                 and estimate.log_evidence < best_estimate.log_evidence - LARGEST_DECLINE
@@ -340,19 +333,15 @@ class MotionEstimator:
         repetitions: int = MOST_REPETITIONS,
         most_iterations: int = MOST_ITERATIONS,
     ) -> Estimate:
-        """Return an estimate with the most probable sizes and times of its missing forces.
+        """Return an estimate with more probable amplitudes and times of its missing forces.
 
-        They are searched in trials that stay linear along one trajectory. The result is then
-        estimated anew, and returned if it is more probable.
+        They are searched in trials that stay linear along one trajectory. The hypothesis is then
+        estimated anew with them. The given estimate is returned if that is not more probable.
 
         Parameters
         ----------
-        laws : HypothesisLaws
-            The laws and sensor errors of the hypothesis.
-        estimate : Estimate
-            The estimate with the present sizes and times.
         factors : sequence of float
-            The factors on size and time that are tried in turn.
+            The factors on amplitude and correlation time that are tried in turn.
         repetitions : int
             The largest number of times in a row that one factor is tried.
         most_iterations : int
@@ -381,27 +370,10 @@ class MotionEstimator:
         factors: Sequence[float] = PATTERN_FACTORS,
         repetitions: int = MOST_REPETITIONS,
     ) -> tuple[dict[int, Process], float]:
-        """Return more probable sizes and times of missing forces in linear trials.
+        """Return more probable missing forces in linear trials, and the rise of the log evidence.
 
-        This is a pattern search with decreasing factors.
-
-        Parameters
-        ----------
-        linearisation : Linearisation
-            All trials, linear about an estimate.
-        first_processes : mapping of int to Process
-            The missing forces to begin with, by the number of the port.
-        factors : sequence of float
-            The factors on size and time that are tried in turn.
-        repetitions : int
-            The largest number of times in a row that one factor is tried.
-
-        Returns
-        -------
-        processes : dict of int to Process
-            The missing forces.
-        rise : float
-            The rise of the log evidence from the first ones [nat].
+        This is a pattern search with decreasing factors on amplitudes and correlation times. Each
+        factor is tried `repetitions` times at most, as long as the evidence rises.
         """
         processes = dict(first_processes)
         first_evidence = self.gauss_newton.log_evidence(linearisation, processes)
@@ -423,25 +395,10 @@ class MotionEstimator:
         largest_evidence: float,
         factor: float,
     ) -> tuple[dict[int, Process], float]:
-        """Multiply each size and time of missing forces by a factor if that is more probable.
+        """Return missing forces after trying a factor on each amplitude and correlation time.
 
-        Parameters
-        ----------
-        linearisation : Linearisation
-            All trials, linear about the present estimate.
-        processes : dict of int to Process
-            The missing forces, by the number of the port.
-        largest_evidence : float
-            Their log evidence [nat].
-        factor : float
-            The factor; each size and time is multiplied by the factor, or else by its inverse.
-
-        Returns
-        -------
-        processes : dict of int to Process
-            The more probable missing forces.
-        log_evidence : float
-            Their log evidence [nat].
+        Each of them is multiplied by the factor, or else by its inverse, if that raises the log
+        evidence, which is `largest_evidence` before. The log evidence is returned, too.
         """
         shortest_time, longest_time = linearisation.correlation_time_range
         for port, quantity in product(tuple(processes), ("standard_deviation", "correlation_time")):
@@ -462,7 +419,7 @@ class MotionEstimator:
 
 
 def _more_probable(estimate: Estimate | None, other_estimate: Estimate | None) -> Estimate | None:
-    """Return the more probable one of two estimates, or the one that there is."""
+    """Return the more probable of two estimates, or the only one; the first if they are equal."""
     if estimate is None or other_estimate is None:
         return estimate or other_estimate
     return max(estimate, other_estimate, key=lambda either: either.log_evidence)

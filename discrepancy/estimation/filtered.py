@@ -38,7 +38,7 @@ class FilteredTrial:
 
     @cached_property
     def force_states(self) -> ForceStates:
-        """The states of structure, missing forces and noises, scaled to size one."""
+        """The states of structure, missing forces and noises, scaled to magnitudes of about one."""
         return ForceStates(self.linear_trial.trial, tuple(self.processes.items()))
 
     @property
@@ -180,13 +180,7 @@ class FilteredTrial:
     # ------------------------------------------------------------ smoothing
 
     def smooth(self, unknowns: FloatArray) -> "SmoothedTrial":
-        """Return the smoothed trajectory and forces of the trial, given all readings.
-
-        Parameters
-        ----------
-        unknowns : (W - 1,) array
-            The values of all unknowns.
-        """
+        """Return the smoothed trajectory and forces of the trial, given all readings."""
         linear_trial = self.linear_trial
         trial = linear_trial.trial
         weights = np.concatenate(([1.0], unknowns))
@@ -218,12 +212,12 @@ class FilteredTrial:
         )
 
     def smooth_residual(self, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smoothed scaled state that a residual shows, and its variance.
+        """Return the smoothed scaled state, given a residual, and its variance.
 
         Parameters
         ----------
         residual : (N, C) array
-            The readings minus the part that is known, divided by the noise.
+            The readings minus their known part, divided by the noise.
 
         Returns
         -------
@@ -260,9 +254,10 @@ class FilteredTrial:
         )
 
     def missing_forces(self, states: FloatArray) -> dict[int, FloatArray]:
-        """Return the missing force (F,) at each port, or its deviation, from scaled states (F, n).
+        """Return the missing force (F,) at each port, given scaled states (F, n).
 
-        The unit is N, N m or the port's flow.
+        Given standard deviations of the states, it is the standard deviation of that force. The
+        unit is N, N m or the port's flow.
         """
         forces = {}
         for (port, process), index in zip(
@@ -289,8 +284,8 @@ class SmoothedTrial:
         The posterior standard deviation of `missing_forces`.
     effect_forces : mapping of int to (F,) ndarray
         The forces of the hypothesis' effects, by port, along the trajectory about which they are
-        linear. The smoothed motion differs little from it, but where dry friction changes its sign,
-        a linear law goes beyond the friction.
+        linear. They are not those along the smoothed motion, which differs little: where dry
+        friction changes its sign, its linear law exceeds the friction itself.
     local : (L,) ndarray
         The unknowns of this trial alone.
     """
@@ -312,7 +307,7 @@ class SmoothedTrial:
 
     @cached_property
     def explained_trajectory(self) -> Trajectory:
-        """The trajectory without what the missing forces, which no law explains, add to it."""
+        """The trajectory minus what the missing forces, which no law explains, add to it."""
         trajectory = self.trajectory
         missing_state = np.zeros_like(trajectory.added_state)
         forces = dict(trajectory.forces)

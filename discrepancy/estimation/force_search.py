@@ -1,7 +1,8 @@
-"""The missing forces of a problem at the ports of its model, and estimates of effects instead.
+"""The missing forces of a problem at the ports of its model, without effects and beside effects.
 
-A force is missing at one port, at several, or at one with jumps. An effect takes a part of it: the
-effects and the motion are estimated together, beginning at the estimate without them.
+Without effects, a force is estimated at one port, at several ports, or at one port with jumps. An
+effect explains a part of that force. It is estimated together with the motion, and the estimate
+begins at the one without effects.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +18,7 @@ from discrepancy.trials_in_motion.effects import EffectLaws
 from discrepancy.trials_in_motion.trial import PortedTrial
 
 from .estimate import NO_EFFECTS, Estimate, estimate_of_processes
-from .estimator import LARGEST_SHARE_BESIDE_LAWS, USUAL_WINDOW, MotionEstimator
+from .estimator import LARGEST_RATIO_BESIDE_LAWS, USUAL_WINDOW, MotionEstimator
 from .force_states import Process
 from .gauss_newton import EstimatorStart, GaussNewton, start_from_estimate
 from .linearisation import Linearisation, plain_linearisation
@@ -29,18 +30,18 @@ from .trial_set import start_in_other_trials, trajectory_in_all_samples
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
 FURTHER_PORT_FACTOR = 0.1
-"""Factor on the standard deviation of a missing force as estimated at its port alone. The search
-for the forces at all ports together begins with the product. At the best port the factor is one."""
+"""Standard deviation with which the search for the forces at all ports together begins, over that
+estimated at the port alone. At the best port it is one."""
 MOST_LINEARISATIONS = 3
 """Largest number of times that the trials are linearised about the unknowns of an estimate."""
 SAME_POINT = 0.1
 """Change of all shared unknowns, in prior standard deviations, below which the trials are not
 linearised again."""
 MOST_THINNED_SAMPLES = 3000
-"""Number of samples of all trials together to which records are thinned at first. It is enough to
-tell laws from each other, and records that are shorter are not thinned."""
+"""Number of samples of all trials together to which long records are thinned at first. It is enough
+to tell laws from each other."""
 THINNED_AT_LEAST = 2.0
-"""Ratio of the number of samples to that number above which records are thinned at first."""
+"""Ratio of all samples to this number from which on records are thinned."""
 
 
 def _best(estimates: Iterable[Estimate]) -> Estimate:
@@ -90,9 +91,9 @@ class ForceSearch:
     def _estimates_of_ports(self) -> dict[str, Estimate]:
         """Return the missing force at each port alone, by the name of the port.
 
-        It is estimated twice: first along the motion of the model, which gives the initial states
-        of the trials; then along the motion that was estimated first, with the model's own laws and
-        with the parameters linear about their first estimates.
+        It is estimated twice. The first estimate is along the motion of the linear model. The
+        second one is along the motion of the first, with the model's own laws, in trials that are
+        linear about the unknowns of the best first estimate.
         """
         start = self.ported.prior_means
         linearisation = plain_linearisation(
@@ -116,10 +117,10 @@ class ForceSearch:
         }
 
     def _estimates_of_ports_like(self, thinned: "ForceSearch") -> dict[str, Estimate]:
-        """Return the missing force at each port alone, searched from that in thinned records.
+        """Return the missing force at each port alone, beginning at that in thinned records.
 
-        The trials are linear about the parameters that the thinned records gave, and the search for
-        the most probable process needs no grid.
+        The trials are linear about the unknowns of the best estimate in thinned records, and the
+        search for the most probable process needs no grid.
         """
         trials = self.ported.trial_set.trials_about(
             thinned.ported.point_of(thinned.best_port_estimate)
@@ -214,17 +215,8 @@ class ForceSearch:
     ) -> Estimate:
         """Return the most probable missing forces along the motion that first forces give.
 
-        Parameters
-        ----------
-        trials : tuple of PortedTrial
-            The trials, linear about other unknowns than before.
-        first_processes : mapping of int to Process
-            The missing forces with which the motion is estimated first.
-        prior_medians : dict of int to Process
-            Their prior medians.
-        skip_grid : bool
-            Whether the search begins at the first forces, as they are nearly the most probable
-            ones; else at the best point of a grid.
+        The search begins at the best point of a grid around the first forces or, with `skip_grid`,
+        at these forces.
         """
         linearisation = plain_linearisation(trials, self.ported.shared_priors)
         solution, smoothed_trials = linearisation.solve_and_smooth(first_processes)
@@ -245,11 +237,6 @@ class ForceSearch:
 
         Its unit is N, N m or the port's flow. It is the prior median if no force was estimated
         there.
-
-        Parameters
-        ----------
-        port : int
-            The number of the port.
         """
         process = self.estimate_without_effects.processes.get(port)
         if process is None:
@@ -285,14 +272,16 @@ class ForceSearch:
     ) -> Estimate | None:
         """Return a set of effects at its most probable values, estimated with the motion.
 
+        It is estimated along the motion of its laws first. If that explains the motion, and
+        converges or leaves no force, it is the result. Otherwise the estimate also begins at the
+        motion of the base, with missing forces at least as large as without any effect, so that the
+        motion follows the readings even if the values of the effects are still wrong. The more
+        probable of the two estimates is returned.
+
         Parameters
         ----------
         base : Estimate
-            The estimate whose motion and missing forces are those to begin with. The missing forces
-            begin at least as large as without any effect, so that the motion follows the readings
-            even if the values of the effects are still wrong.
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
+            The estimate whose unknowns, motion and missing forces are those to begin with.
         effect : (E,) array
             The scaled effect parameters to begin with.
 
@@ -312,7 +301,7 @@ class ForceSearch:
         }
         laws = self.ported.laws(candidate, trials)
         estimator = self.estimator(trials)
-        # without effects, the shared unknowns have taken the place of laws
+        # without effects, the shared unknowns may have compensated for the missing laws
         first_shared = base.shared if base.candidate.terms else np.zeros_like(base.shared)
         along_laws = self._estimate_along_laws(estimator, laws, replace(start, shared=first_shared))
         if along_laws is not None and (along_laws.leaves_no_force or along_laws.converged):
@@ -326,37 +315,21 @@ class ForceSearch:
     def _estimate_along_laws(
         self, estimator: MotionEstimator, laws: EffectLaws, start: EstimatorStart
     ) -> Estimate | None:
-        """Return an estimate that begins along the motion of the laws alone, if they make it.
+        """Return an estimate that begins along the motion of the laws alone.
 
-        Parameters
-        ----------
-        estimator : MotionEstimator
-            The estimator of the trials.
-        laws : EffectLaws
-            The laws and sensor errors of the hypothesis.
-        start : EstimatorStart
-            The values to begin with.
+        None if the laws do not explain the motion: they are not possible, or the missing force
+        beside them is more than `LARGEST_RATIO_BESIDE_LAWS` of that without effects.
         """
         estimate = estimator.follow_laws(laws, replace(start, processes=estimator.small_processes))
-        if (
-            estimate is None
-            or estimator.share_of_missing_force(estimate) > LARGEST_SHARE_BESIDE_LAWS
-        ):
+        if estimate is None or estimator.missing_force_ratio(estimate) > LARGEST_RATIO_BESIDE_LAWS:
             return None
         return self.estimate_about_own_values(estimate)
 
     def estimate_of_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
         """Return the estimate of a hypothesis whose simulation was fitted to the readings.
 
-        If the laws leave no force along the motion that they have with the values of the fit, these
-        are its values. Otherwise it is estimated with the missing force, from the same effects.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
-        point : Point
-            The values of all unknowns of the fit.
+        It is estimated along its simulated motion. If that leaves a force, it is estimated together
+        with the missing force instead, from the same effects. `point` has the unknowns of the fit.
         """
         explained = self.estimate_along_simulation(candidate, point)
         if explained is not None and explained.leaves_no_force:
@@ -366,14 +339,8 @@ class ForceSearch:
     def estimate_along_simulation(self, candidate: Candidate, point: Point) -> Estimate | None:
         """Return the estimate of a hypothesis along its simulated motion, with small forces.
 
-        The result is None if the laws are not possible.
-
-        Parameters
-        ----------
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
-        point : Point
-            The values of all unknowns, as a simulation was fitted to the readings.
+        `point` has the unknowns of a simulation that was fitted to the readings. The result is None
+        if the laws are not possible.
         """
         trials = self.ported.trial_set.trials_about(point)
         estimator = self.estimator(trials)
@@ -389,14 +356,10 @@ class ForceSearch:
     def begin_along_simulation(self, point: Point) -> None:
         """Estimate the model without effects along its simulation, as effects are estimated.
 
-        The first estimate is linear about other parameters than its own, and along a smoothed
-        motion in which a body that friction of the model holds still creeps. The more probable of
-        the two estimates replaces `estimate_without_effects`, at which hypotheses begin.
-
-        Parameters
-        ----------
-        point : Point
-            The values of all unknowns, as the model without effects was fitted to the readings.
+        The present `estimate_without_effects` is linear about other parameters than its own. It is
+        also linear along a smoothed motion, in which a body creeps that is held by friction of the
+        model. So the more probable of both estimates replaces it. `point` has the unknowns of the
+        model without effects as fitted to the readings.
         """
         if self.thinned is not None:
             self.thinned.begin_along_simulation(point)
@@ -416,8 +379,6 @@ class ForceSearch:
         ----------
         base : Estimate
             The estimate without the last of the effects.
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters to begin with.
         processes : mapping of int to Process
@@ -442,8 +403,6 @@ class ForceSearch:
         ----------
         base : Estimate
             The estimate whose motion and missing forces are those to begin with.
-        candidate : Candidate
-            The effects of the hypothesis, each at its place.
         effect : (E,) array
             The scaled effect parameters to begin with.
 
@@ -461,17 +420,13 @@ class ForceSearch:
         )
 
     def estimate_about_own_values(self, estimate: Estimate) -> Estimate:
-        """Return an estimate in trials that are linear about its own unknowns.
+        """Return the estimate repeated in trials that are linear about its own unknowns.
 
-        The first estimate is made in trials that are linear about the unknowns without any effect.
-        The response of the model is not linear in a parameter: a mass that is wrong by a tenth
-        leaves a hundredth of the forces, which would then be missing.
-
-        Parameters
-        ----------
-        estimate : Estimate
-            The estimate of the motion and of all unknowns. It is returned if no estimate can be
-            made in the other trials.
+        A first estimate is made in trials that are linear about the unknowns without any effect.
+        But the response of the model is not linear in a parameter: if a mass is wrong by a tenth, a
+        hundredth of its forces would be missing. The trials are linearised until the unknowns
+        hardly change, at most `MOST_LINEARISATIONS` times. The last estimate that could be made is
+        returned.
         """
         for number in range(MOST_LINEARISATIONS):
             trials = estimate.ported_trials

@@ -86,7 +86,7 @@ class ForceStateSpace(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceStates:
-    """The states of a trial with missing forces at ports, scaled so that they are of size one.
+    """The states of a trial with missing forces at ports, scaled to magnitudes of about one.
 
     Attributes
     ----------
@@ -101,16 +101,16 @@ class ForceStates:
 
     @cached_property
     def state_units(self) -> FloatArray:
-        """The typical size (n,) of each state of the structure; the filter divides the state by it.
+        """The typical magnitude (n,) of each state of the structure, by which the filter divides.
 
         Let the missing force vary at the highest natural frequency omega with an amplitude of one
-        standard deviation, and let it cause the acceleration a. The size of a speed is then
-        a / omega, and the size of a position is a / omega^2.
+        standard deviation, and let it cause the acceleration a. A speed is then of the magnitude
+        a / omega, and a position of a / omega^2.
 
         The system does not say which of its states are positions. An even number of states is taken
-        for positions and then as many speeds, as of a structure; an odd number, as of a system of
-        first order, for speeds alone. If that is wrong, the states are scaled less well, but the
-        estimates stay the same up to rounding.
+        as positions followed by as many speeds, as in a structure, and an odd number as speeds
+        alone, as in a system of first order. If that is wrong, the states are scaled less well, but
+        the estimates stay the same up to rounding.
         """
         system = self.trial.system
         state_count = len(system.generator)
@@ -146,10 +146,9 @@ class ForceStates:
 
     @cached_property
     def white_noise_scale(self) -> FloatArray:
-        """The standard deviation (C,) of each channel's noise over the deviation of its white part.
+        """The standard deviation (C,) of each channel's noise over that of its white part.
 
-        The filter counts readings in deviations of the white part, while `PortedTrial` counts them
-        in deviations of the whole noise: this is the factor between both.
+        Readings are divided by the first in `PortedTrial`, and by the second in the filter.
         """
         ratios = np.ones(len(self.trial.deviation))
         for noise in self.trial.coloured_noises:
@@ -191,18 +190,9 @@ class ForceStates:
     def _fill_missing_force(
         self, state_space: ForceStateSpace, port: int, process: Process, index: int
     ) -> None:
-        """Fill the states of a missing force, which drives the structure.
+        """Fill the states of a missing force at a port, after those of the structure.
 
-        Parameters
-        ----------
-        state_space : ForceStateSpace
-            The state space, whose structure is filled already.
-        port : int
-            The number of the port of the force.
-        process : Process
-            The statistics of the force.
-        index : int
-            The index of the force in the state.
+        `index` is that of the force in the state.
         """
         trial = self.trial
         generator = state_space.generator
@@ -230,15 +220,7 @@ class ForceStates:
             covariance[index, structure] = state_at_rest
 
     def _fill_coloured_noises(self, state_space: ForceStateSpace, first_state: int) -> None:
-        """Fill the correlated parts of noises: first-order processes of variance one.
-
-        Parameters
-        ----------
-        state_space : ForceStateSpace
-            The state space.
-        first_state : int
-            The index of the first of them in the state.
-        """
+        """Fill the correlated parts of noises, processes of first order with variance one."""
         for index, noise in enumerate(self.trial.coloured_noises, first_state):
             state_space.generator[index, index] = -noise.decay_rate
             state_space.intensity[index, index] = 2.0 * noise.decay_rate

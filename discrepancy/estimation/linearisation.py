@@ -120,12 +120,12 @@ class Linearisation:
         Parameters
         ----------
         median_processes : mapping of int to Process
-            The prior medians of size and time of each missing force, by the number of its port.
+            The prior medians of the missing forces, by the number of the port.
         initial_processes : mapping of int to Process
             The missing forces to begin with.
         skip_grid : bool
             Whether Newton's method begins at `initial_processes` itself. Otherwise it begins at the
-            best point of a grid of sizes and times around `initial_processes`.
+            best point of a grid of amplitudes and times around `initial_processes`.
         most_steps : int
             The largest number of steps of Newton's method.
         """
@@ -176,15 +176,7 @@ def trajectory_of_model(trial: PortedTrial) -> Trajectory:
 
 
 def plain_linearisation(trials: Sequence[PortedTrial], shared_priors: Priors) -> Linearisation:
-    """Return trials along the motion of the linear model, without any law or error of a sensor.
-
-    Parameters
-    ----------
-    trials : sequence of PortedTrial
-        The trials as linear systems with ports.
-    shared_priors : Priors
-        The priors of the K shared unknowns.
-    """
+    """Return trials along the motion of the linear model, without any law or error of a sensor."""
     no_effect = np.zeros(0)
     linear_trials = []
     for trial in trials:

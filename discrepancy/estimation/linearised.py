@@ -91,13 +91,10 @@ class LinearisedTrial:
         return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
 
     def weight_index(self, unknown_index: int) -> int:
-        """Return where an unknown that is no effect parameter stands among the weights.
+        """Return the index among the weights of an unknown that is no effect parameter.
 
-        Parameters
-        ----------
-        unknown_index : int
-            The number of the unknown in `PortedTrial.linearisation_point`, where those of the trial
-            alone follow the shared ones. In the weights, those of effects stand between both.
+        Its given index is that in `PortedTrial.linearisation_point`, where the unknowns of the
+        trial alone follow the shared ones. In the weights, those of effects are between both.
         """
         shared_count = len(self.shared)
         return 1 + unknown_index + (len(self.effect) if unknown_index >= shared_count else 0)

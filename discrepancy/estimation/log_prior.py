@@ -12,13 +12,11 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
     """Return the log prior probability of a candidate [nat].
 
     The prior of a set of effects is proportional to the product of their prior weights, and the
-    same at all places of an effect. An effect with a free shape has the smaller prior that the
-    shape test asks for.
+    same at all places of an effect. For each free shape it is smaller by `LEAST_SHAPE_GAIN`, the
+    gain that the test of shape requires.
 
     Parameters
     ----------
-    candidate : Candidate
-        The effects at their places.
     effect_count : int
         The number of effects that are compared.
     setting : Setting

@@ -25,7 +25,8 @@ from .regression import Priors
 from .trial_set import TrialSet
 
 WIDE_WINDOW = 0.1
-"""Half width of the window of speeds where the model's own laws are linear along a first motion."""
+"""Half width of the window of speeds with which the model's own laws are linearised along a first
+motion, see `LawArguments`."""
 
 
 def can_estimate_forces(problem: Problem) -> bool:
@@ -102,16 +103,13 @@ class PortedProblem:
     ) -> Linearisation:
         """Return trials along trajectories with the model's own laws, without effects.
 
-        If the laws are not possible there, they are left out.
+        If the laws are not possible there, they are left out, and the trials are linear along the
+        motion of the linear model.
 
         Parameters
         ----------
-        trials : tuple of PortedTrial
-            The trials as linear systems with ports.
         trajectories : tuple of Trajectory
             The motion of each trial.
-        shared_values : (K,) array
-            The values of the shared unknowns.
         """
         no_local_values = tuple(np.zeros(0) for _ in trials)
         start = EstimatorStart(NO_EFFECT_VALUES, shared_values, no_local_values, trajectories, {})
@@ -125,11 +123,6 @@ class PortedProblem:
         The median standard deviation is 5 % of the elastic force at the port. The median
         correlation time is the time in which the vibration advances by one radian, or the duration
         of the trials if the port has no frequency.
-
-        Parameters
-        ----------
-        ports : iterable of int
-            The numbers of the ports.
         """
         scales = self.problem.setting.scales
         processes = {}
@@ -165,7 +158,9 @@ class PortedProblem:
     def point_of_unknowns(
         self, shared_values: FloatArray, local_of_trials: Iterable[FloatArray]
     ) -> Point:
-        """Return values of the unknowns as a point of the problem, clipped to their ranges.
+        """Return values of the unknowns as a point of the problem, without effects.
+
+        Shared unknowns are clipped to their ranges, and to two prior standard deviations.
 
         Parameters
         ----------
@@ -178,12 +173,11 @@ class PortedProblem:
         for number, values in zip(self.trial_indices, local_of_trials, strict=True):
             local_values[number] = values
         low, high = self.problem.shared.bounds
-        # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
-        # within two prior standard deviations
+        # a margin of one step, so that difference quotients stay in the ranges
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
         return Point(np.clip(shared_values, low, high), tuple(local_values), np.zeros(0))
 
     def point_of(self, estimate: Estimate) -> Point:
-        """Return the unknowns of an estimate without its effects, clipped to their ranges."""
+        """Return `point_of_unknowns` of an estimate, without its effects."""
         return self.point_of_unknowns(estimate.shared, estimate.local)

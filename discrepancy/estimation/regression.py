@@ -79,8 +79,8 @@ class Solution:
     def within(self, priors: Priors) -> "Solution":
         """Return the solution at the most probable values within the ranges of the unknowns.
 
-        The log evidence is that of the whole posterior, less its decrease from the mean to these
-        values: beyond an end of a range the readings ask for what cannot be.
+        The log evidence is reduced by the decrease of the log posterior from the mean to these
+        values, since values beyond a range are impossible. The covariance is not changed.
         """
         if np.all((priors.low <= self.mean) & (self.mean <= priors.high)):
             return self
@@ -115,12 +115,8 @@ class Regression:
     def solve(self, unknowns: Sequence[int], priors: Priors) -> Solution:
         """Solve the linear model for some of its unknowns, with all other unknowns at zero.
 
-        Parameters
-        ----------
-        unknowns : sequence of int
-            The numbers of these unknowns.
-        priors : Priors
-            The priors of these unknowns.
+        `unknowns` are their numbers, and `priors` are theirs. The solution is within their ranges.
+        The log evidence is -inf if rounding errors exceed `LARGEST_ROUNDING`.
         """
         # the row and column of the residual come first, then those of the chosen unknowns
         rows = np.array([0, *(1 + unknown for unknown in unknowns)])
@@ -141,9 +137,9 @@ class Regression:
         misfit = float(
             residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
         )
-        # columns that are far larger than what they leave lose the misfit to rounding
-        size_of_terms = np.abs(residual_weights) @ np.abs(products) @ np.abs(residual_weights)
-        if ROUNDING_OF_SUM * size_of_terms > LARGEST_ROUNDING:
+        # the misfit is lost to rounding if it is a small difference of large terms
+        sum_of_magnitudes = np.abs(residual_weights) @ np.abs(products) @ np.abs(residual_weights)
+        if ROUNDING_OF_SUM * sum_of_magnitudes > LARGEST_ROUNDING:
             return Solution(-np.inf, mean, covariance)
         half_log_det_of_normal_matrix = np.sum(np.log(np.diag(cholesky) / column_scale))
         half_log_det_of_prior = 0.5 * np.sum(np.log(prior_precision))

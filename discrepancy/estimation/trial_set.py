@@ -1,6 +1,7 @@
-"""The trials in motion of a problem as linear systems, and an estimate carried from some to others.
+"""The trials in motion of a problem as linear systems, and estimates transferred between them.
 
-The others are linear about other unknowns, or have all samples of thinned trials.
+An estimate is transferred to trials that are linear about other unknowns, or from thinned trials to
+all samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -77,15 +78,9 @@ def start_in_other_trials(
 ) -> EstimatorStart:
     """Return the start of an estimate in trials that are linear about other unknowns.
 
-    The motion of the ports stays the same. The model moves them differently about other unknowns,
-    so that the added state changes by what moves the ports back.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        The estimate of the motion and of all unknowns.
-    other_trials : sequence of PortedTrial
-        The trials in which the next estimate is made, with the same fine stamps.
+    The motion of the ports stays the same. In the other trials, which must have the same fine
+    stamps, the linear model moves the ports differently. The added state is changed so that it
+    compensates for this difference.
     """
     trajectories = []
     for smoothed_trial, other_trial in zip(estimate.trials, other_trials, strict=True):
@@ -105,8 +100,8 @@ def trajectory_in_all_samples(
 ) -> Trajectory:
     """Return the motion of a thinned trial at all fine stamps of the record.
 
-    The added state and the forces are interpolated. The motion of the ports is that of the model,
-    which is known at all stamps, and what the added state adds to it.
+    The added state and the forces are interpolated. The motion of the ports is that of the linear
+    model, which is known at all stamps, plus that by the added state.
 
     Parameters
     ----------
